@@ -136,7 +136,7 @@ def test_variables_that_change_how_programs_run(
     recover(robot, gate)
 
 
-def test_an_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) -> None:
+def test_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) -> None:
     path = f"environments/{held}/versions/latest/manifest?formats=tmap2"
     gate_open = robot(server=gate.url)
     assert gate_open.good
@@ -178,20 +178,20 @@ def test_an_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gat
         ({"files": 7}, "cannot be read"),
     ],
 )  # fmt: skip
-def test_a_manifest_that_does_not_fit_is_refused(
+def test_manifest_of_other_environment_or_channel_is_refused(
     held: str, robot: Start, gate: Gate, keys: Keys, members: dict[str, Any], word: str
 ) -> None:
     gate.change = signed(keys, **members)
     attacked(robot, gate, word=word)
 
 
-def test_after_an_attack_all_is_well(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
+def test_agent_recovers_after_attack(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
     gate.change = signed(keys, expires="2020-01-01T00:00:00Z")
     attacked(robot, gate, word="expired")
     recover(robot, gate)
 
 
-def test_a_minute_between_clocks_is_no_attack(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
+def test_manifest_is_accepted_with_clock_skew_below_a_minute(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
     gate.change = signed(keys, expires=(datetime.now(timezone.utc) - timedelta(seconds=20)).isoformat())
     assert robot(server=gate.url).good
 
@@ -204,7 +204,7 @@ def test_a_minute_between_clocks_is_no_attack(held: str, robot: Start, gate: Gat
         (lambda p, s, h, b: (s, {k: v for k, v in h.items() if k != SIGNATURE}, b), "no valid signature"),
     ],
 )
-def test_what_is_not_signed_is_refused(held: str, robot: Start, gate: Gate, change: Change, word: str) -> None:
+def test_unsigned_manifest_is_refused(held: str, robot: Start, gate: Gate, change: Change, word: str) -> None:
     gate.change = change
     attacked(robot, gate, word=word)
     recover(robot, gate)
@@ -236,7 +236,7 @@ def test_poisoned_delta_is_replaced_by_the_complete_file(held: str, robot: Start
     assert "1 deltas could not be decoded" in switched["detail"]
 
 
-def test_a_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path: Path) -> None:
+def test_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path: Path) -> None:
     foreign = Keys(tmp_path / "foreign")
     sign = signed(foreign)
 
@@ -254,9 +254,7 @@ def test_a_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path:
     recover(robot, gate)
 
 
-def test_a_rotated_key_is_followed_and_the_old_one_forgotten(
-    api: Api, held: str, robot: Start, gate: Gate, keys: Keys
-) -> None:
+def test_rotated_key_replaces_old_key(api: Api, held: str, robot: Start, gate: Gate, keys: Keys) -> None:
     old = api.get(f"environments/{held}/versions/latest/manifest?formats=tmap2")
     api.post("keys")
     api.post("keys")
@@ -268,7 +266,7 @@ def test_a_rotated_key_is_followed_and_the_old_one_forgotten(
     attacked(robot, gate, word="does not endorse", holds=2)
 
 
-def test_the_key_can_be_given(api: Api, place: str, robot: Start, gate: Gate) -> None:
+def test_trusted_key_can_be_set(api: Api, place: str, robot: Start, gate: Gate) -> None:
     key = api.get("keys").json()[0]
     attacked(robot, gate, key="0" * 16, word="does not endorse", holds=None)
     other = base64.b64encode(bytes(range(32))).decode()
@@ -279,7 +277,7 @@ def test_the_key_can_be_given(api: Api, place: str, robot: Start, gate: Gate) ->
         robot(key="nonsense", name="wrong")
 
 
-def test_it_asks_anew_where_its_manifest_has_expired(api: Api, place: str, robot: Start, gate: Gate) -> None:
+def test_expired_manifest_is_fetched_again(api: Api, place: str, robot: Start, gate: Gate) -> None:
     one = robot(server=gate.url)
     assert one.good
 
@@ -294,7 +292,7 @@ def test_it_asks_anew_where_its_manifest_has_expired(api: Api, place: str, robot
     assert conditional_requests() == [False], "else a 304 for ever would hold back all changes"
 
 
-def test_the_token_is_not_told(place: str, robot: Start, gate: Gate) -> None:
+def test_token_is_not_logged(place: str, robot: Start, gate: Gate) -> None:
     one = robot(server=gate.url)
     assert one.good
     for path in one.into.rglob("*"):

@@ -115,7 +115,7 @@ def current(tmp_path: Path) -> Path:
     return link
 
 
-def test_they_are_found_by_name() -> None:
+def test_bundled_hooks_are_found_by_name() -> None:
     assert set(hooks.bundled_hooks()) == {"nav2", "topological"}
     for path in hooks.bundled_hooks().values():
         subprocess.run(["sh", "-n", path], check=True)
@@ -143,7 +143,9 @@ def test_each_step_is_reported(ros: Path, current: Path) -> None:
     assert steps(ros) == [("map", "done"), ("route graph", "done")]
 
 
-def test_a_grid_or_graph_that_is_gone_is_a_failure(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_fails_when_grid_or_graph_is_missing(
+    ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (current / "occupancy_grid" / "map.yaml").unlink()
     (current / "nav2_route" / "graph.geojson").unlink()
     hook_variables = variables(
@@ -159,7 +161,7 @@ def test_a_grid_or_graph_that_is_gone_is_a_failure(ros: Path, current: Path, mon
     assert hooks.run("nav2", hook_variables) is None
 
 
-def test_a_mask_without_a_mask_server_is_no_failure(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_skips_mask_without_mask_server(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ABSENT", "/keepout_filter_mask_server/load_map /speed_filter_mask_server/load_map")
     changed = variables(current, "occupancy_grid/map.yaml", "occupancy_grid/keepout.yaml", "occupancy_grid/speed.yaml")
     assert hooks.run("nav2", changed) is None
@@ -170,7 +172,7 @@ def test_a_mask_without_a_mask_server_is_no_failure(ros: Path, current: Path, mo
     assert "service /keepout_filter_mask_server/load_map not found" in problem
 
 
-def test_a_mask_that_is_gone_gives_way_to_an_empty_one(ros: Path, current: Path) -> None:
+def test_nav2_hook_replaces_missing_mask_by_empty_one(ros: Path, current: Path) -> None:
     assert hooks.run("nav2", variables(current, "occupancy_grid/keepout.yaml")) is None
     called(ros)
     (current / "occupancy_grid" / "keepout.yaml").unlink()
@@ -186,14 +188,14 @@ def test_a_mask_that_is_gone_gives_way_to_an_empty_one(ros: Path, current: Path)
     assert called(ros) == [], "only once"
 
 
-def test_the_map_server_must_be_there(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_fails_without_map_server(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ABSENT", "/map_server/load_map")
     problem = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
     assert problem is not None
     assert "service /map_server/load_map not found: start Nav2, or set FLEETMAP_NAV2_MAP_SERVER" in problem
 
 
-def test_a_grid_of_any_name(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_selects_grid_by_name(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (current / "occupancy_grid" / "map.yaml").rename(current / "occupancy_grid" / "hall.yaml")
     put(current, "occupancy_grid/keepout_filter_info.yaml")
     assert hooks.run("nav2", variables(current, "occupancy_grid/hall.pgm")) is None
@@ -211,7 +213,7 @@ def test_a_grid_of_any_name(ros: Path, current: Path, monkeypatch: pytest.Monkey
     assert "unknown grid cellar: set FLEETMAP_NAV2_GRID to one of annex, hall" in problem
 
 
-def test_another_level(ros: Path, current: Path) -> None:
+def test_align_onto_another_level(ros: Path, current: Path) -> None:
     put(current, "occupancy_grid/L2/map.yaml")
     levels = [
         {"name": "ground", "elevation": 0.0, "files": {"occupancy_grid": ["map.yaml", "keepout.yaml"]}},
@@ -278,7 +280,7 @@ def test_closed_edges_are_closed_and_opened_again(ros: Path, current: Path, monk
     assert not any("set_route_graph" in line for line in called(ros)), "an edge that cannot be closed is not set open"
 
 
-def test_nav2_reports_what_was_refused(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_reports_rejected_files(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     changed = variables(current, "occupancy_grid/map.yaml")
     for result, reason in (("1", "does not exist"), ("255", "undefined failure"), ("10", "no result")):
         monkeypatch.setenv("RESULT", result)
@@ -297,7 +299,7 @@ def test_nav2_reports_what_was_refused(ros: Path, current: Path, monkeypatch: py
     assert "/r1/map_server/load_map" in ros.read_text()
 
 
-def test_a_service_that_hangs_is_given_up(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_gives_up_hanging_service(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HANG", "1")
     changed = variables(current, "occupancy_grid/map.yaml", "occupancy_grid/keepout.yaml")
     problem = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "1"})
@@ -321,7 +323,7 @@ def tmap2(*nodes: str, edges: tuple[str, ...] = ("A_B",), name: str = "network")
     return {"name": name, "pointset": "network", "nodes": rows}
 
 
-def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_topological_hook_switches_map(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert hooks.run("topological", variables(current, "occupancy_grid/map.yaml")) is None
     assert ros.read_text() == "", "the network did not change"
     changed = variables(current, "tmap2/network.tmap2.yaml")
@@ -343,7 +345,7 @@ def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "switch_topological_map rejected tmap2/network.tmap2.yaml" in problem
 
 
-def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> None:
+def test_topological_hook_checks_published_map(ros: Path, current: Path) -> None:
     changed = variables(current, "tmap2/network.tmap2.yaml")
     expected_network = loading.read_network(current / "tmap2" / "network.tmap2.yaml")
     right = {**tmap2("A", "B"), "name": expected_network.name, "pointset": expected_network.pointset}
@@ -394,14 +396,14 @@ def edge_of(source: str, target: str) -> dict[str, Any]:
     return {"edge_id": f"{source}_{target}", "node": target, "action": "NavigateToPose", "action_type": "t"}
 
 
-def test_without_ros_it_fails_and_says_so(current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hook_without_ros_fails_with_reason(current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEETMAP_PYTHON", sys.executable)
     problem = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
     assert problem is not None
     assert "source the setup.bash of ROS 2" in problem
 
 
-def test_a_hanging_hook_is_ended(tmp_path: Path) -> None:
+def test_hanging_hook_is_killed(tmp_path: Path) -> None:
     problem = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, seconds=0.5)
     assert problem is not None
     assert "exceeded 0.5 seconds" in problem
@@ -409,7 +411,7 @@ def test_a_hanging_hook_is_ended(tmp_path: Path) -> None:
     eventually(lambda: _ended(pid))  # what was killed takes a moment to end on a busy machine
 
 
-def test_a_hook_that_prints_without_end_fills_nothing() -> None:
+def test_hook_with_endless_output_fills_no_memory() -> None:
     before = tracemalloc_peak(lambda: None)
     problems: list[str | None] = []
     peak = tracemalloc_peak(
@@ -430,14 +432,14 @@ def tracemalloc_peak(do: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def test_what_a_hook_leaves_in_the_background_lives_on(tmp_path: Path) -> None:
+def test_background_process_of_hook_survives(tmp_path: Path) -> None:
     background = f"(while [ ! -e {tmp_path}/end ]; do echo x; sleep 0.05; done; touch {tmp_path}/lived) & exit 0"
     assert hooks.run(background, {}, seconds=30) is None
     (tmp_path / "end").touch()
     eventually((tmp_path / "lived").exists)
 
 
-def test_a_hook_ends_with_the_agent(tmp_path: Path) -> None:
+def test_hook_is_killed_when_agent_stops(tmp_path: Path) -> None:
     stopping = threading.Event()
     threading.Timer(0.2, stopping.set).start()
     problem = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, stopping=stopping)
@@ -454,7 +456,7 @@ def _ended(pid: int) -> bool:
         return True
 
 
-def test_an_agent_switches_nav2(api: Api, place: str, robot: Start, ros: Path) -> None:
+def test_agent_loads_map_into_nav2(api: Api, place: str, robot: Start, ros: Path) -> None:
     api.upload(place, samples.grid())
     formats = "tmap2,occupancy_grid"
     published(ros, yaml.safe_load(network()))

@@ -33,7 +33,7 @@ def post_status(server: str, robot: str, body: dict[str, Any]) -> None:
         assert answer.status == 200
 
 
-def test_environment_life(fleetmap: Fleetmap) -> None:
+def test_environment_create_rename_delete_and_purge(fleetmap: Fleetmap) -> None:
     result = fleetmap("environment", "create", "life", "--datum", "53.25,-0.5", "--title", "A life", "--tag", "x")
     assert (result.status, result.out) == (0, "life: created, version 1\n"), result.err
     assert fleetmap("environment", "create", "life").status == 1
@@ -84,7 +84,7 @@ def test_channels_and_robots(fleetmap: Fleetmap, server: str, network: Path) -> 
     assert fleetmap("robots", "-e", "manned", "--json").json == []
 
 
-def test_overlays(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_overlays_are_reported_and_decided(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "blocked").status == 0
     overlay = fleetmap("overlays", "create", "blocked", "--edge", "A_B", "--detail", "fallen tree", "--json").json
     assert (overlay["state"], overlay["edge"]) == ("pending", "A_B")
@@ -128,7 +128,7 @@ def test_jobs_and_keys(fleetmap: Fleetmap) -> None:
     assert fleetmap("keys", "show", "nonsense").status == 1
 
 
-def test_json_stands_before_or_after_the_command(fleetmap: Fleetmap, network: Path) -> None:
+def test_json_option_is_accepted_before_or_after_command(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "either").status == 0
     expected = fleetmap("channels", "list", "either", "--json").json
     for arguments in (

@@ -38,7 +38,7 @@ def network(tmp_path: Path) -> Path:
         ("barn", None),
     ],
 )
-def test_slip_is_told_from_sibling(name: str, meant: str | None) -> None:
+def test_slip_distinguishes_misspelling_from_sibling(name: str, meant: str | None) -> None:
     assert slip(name, EXISTING) == meant
 
 
@@ -87,7 +87,7 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         assert proposal in " ".join(result.err.split()), (arguments, result.err)
 
 
-def test_environment_that_looks_like_a_slip_needs_create(fleetmap: Fleetmap, network: Path) -> None:
+def test_misspelled_environment_requires_create(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "meadow-7").status == 0
     for command in (("import", network), ("generate", "cave")):
         refused = fleetmap(*command, "-e", "medaow-7")
@@ -101,7 +101,7 @@ def test_environment_that_looks_like_a_slip_needs_create(fleetmap: Fleetmap, net
     assert fleetmap("import", network, "-e", "medaow-7", "--create").status == 0
 
 
-def test_failed_work_leaves_no_environment_behind(fleetmap: Fleetmap, tmp_path: Path) -> None:
+def test_failed_command_removes_new_environment(fleetmap: Fleetmap, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
     for command in (("import", bad), ("generate", "no-such-site"), ("generate", "orchard", "-O", "rows=-1")):
@@ -111,7 +111,7 @@ def test_failed_work_leaves_no_environment_behind(fleetmap: Fleetmap, tmp_path: 
     assert fleetmap("environment", "create", "stillborn").status == 0, "the name is free"
 
 
-def test_failed_work_takes_a_new_datum_back(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_failed_command_resets_new_datum(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
     assert fleetmap("import", network, "-e", "moved").status == 0

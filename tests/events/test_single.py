@@ -38,7 +38,7 @@ class Rounds(LeaderThread):
         self.shut += 1
 
 
-def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_state_of_killed_process_is_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "app.events.leader")
     (tmp_path / "some.json").write_text('{"state": "connected"}')
     slow = threading.Event()
@@ -58,7 +58,7 @@ def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pyte
     assert one.shut == 1
 
 
-def test_the_next_one_goes_on_where_one_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_next_process_takes_over_after_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.05)
     hold = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.flock(f, fcntl.LOCK_EX); print('held', flush=True)"
     other = subprocess.Popen(
@@ -88,7 +88,7 @@ def test_the_next_one_goes_on_where_one_is_killed(tmp_path: Path, monkeypatch: p
         second.close()
 
 
-def test_trouble_is_told_once_and_ends(
+def test_leader_logs_outage_and_recovery_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -113,7 +113,7 @@ def test_trouble_is_told_once_and_ends(
         one.close()
 
 
-def test_a_full_disk_stops_nothing(
+def test_leader_keeps_running_when_state_file_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: object, **__: object) -> int:
