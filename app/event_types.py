@@ -1,7 +1,7 @@
-"""What an event can tell of: one dataclass for each type. The store writes these events and robots read them.
+"""Event types: one dataclass per type. The store writes these events, robots and clients read them.
 
-Its docstring says when it happens; its fields are the members that it has beside those of all events. ``member`` gives
-each an example for the documentation, which is made from here; a member without one is not in every event of the type.
+The docstring of a class describes when the event happens; its fields are the members besides those of all events.
+``member`` adds an example for the generated documentation; members without an example are optional.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeVar
 
 EventType = str
-"""The name of an event type, such as ``version.created``."""
+"""Name of an event type, such as ``version.created``."""
 
 RobotState = Literal["downloading", "ready", "active", "failed"]
 """State of the map that a robot reports."""
@@ -23,7 +23,7 @@ _examples: dict[str, Mapping[str, Any]] = {}
 
 
 def event(name: EventType, **examples: Any) -> Callable[[type[T]], type[T]]:
-    """Declare a class as an event type. examples: of members of all events, where it is special."""
+    """Declare a class as an event type. examples: values of common members that are specific to this type."""
 
     def declare(cls: type[T]) -> type[T]:
         _registry[name], _examples[name] = dataclass(frozen=True)(cls), examples
@@ -33,21 +33,21 @@ def event(name: EventType, **examples: Any) -> Callable[[type[T]], type[T]]:
 
 
 def member(example: Any = None) -> Any:
-    """A member of an event, with an example of it."""
+    """Declare a member of an event, with an example value."""
     return field(default=None, metadata={"example": example})
 
 
 def check_members(name: EventType, members: Iterable[str]) -> None:
-    """Raise ValueError for an event that is not declared, or has a member that its type does not have."""
+    """Raise ValueError if the event type or one of its members is not declared."""
     if name not in _registry:
-        raise ValueError(f"no event type {name!r}")
+        raise ValueError(f"unknown event type {name!r}")
     unknown = sorted(set(members) - {f.name for f in fields(_registry[name])})
     if unknown:
-        raise ValueError(f"an event {name} has no member {', '.join(unknown)}")
+        raise ValueError(f"unknown members of event {name}: {', '.join(unknown)}")
 
 
 def describe(name: EventType) -> tuple[str, dict[str, Any]]:
-    """When an event happens, and an example of its members beside those that all events have in the same way."""
+    """Return the description of an event type, and examples of its specific members."""
     examples = {f.name: f.metadata["example"] for f in fields(_registry[name])}
     doc = " ".join((_registry[name].__doc__ or "").split())
     return doc, {**_examples[name], **{member: example for member, example in examples.items() if example is not None}}
@@ -76,24 +76,24 @@ _DIGEST = "4f53cda18c2baa0c0354bb5f9a3ecbe5ed12ab4d8e11ba873c2f11161202b945"
 
 @event("environment.created", version=0, previous=None, layers=[], message="")
 class EnvironmentCreated:
-    """An environment is created, restored, or renamed: then this is the first event under its new name."""
+    """An environment is created, restored or renamed. After a rename, this is the first event under the new name."""
 
 
 @event("environment.deleted", layers=[], message="deleted")
 class EnvironmentDeleted:
-    """An environment is deleted, or renamed: then this is the last event under its old name. A stream of that name ends
-    with it."""
+    """An environment is deleted or renamed. After a rename, this is the last event under the old name. It ends event
+    streams of that name."""
 
 
 @event("version.created")
 class VersionCreated:
-    """An upload, an edit, a derivation, a generation, a template or a revert makes a version."""
+    """An upload, an edit, a derivation, a generation, a template change or a revert creates a version."""
 
 
 @event("channel.planned")
 class ChannelPlanned:
-    """A channel is to move later: robots fetch the version in advance. Either `rollout` or `activate_at` says when it
-    moves."""
+    """A later channel move is planned, and robots fetch the version in advance. `rollout` or `activate_at` contains the
+    condition of the move."""
 
     channel: str = member("production")
     rollback: bool = member(False)
@@ -103,8 +103,8 @@ class ChannelPlanned:
 
 @event("channel.cancelled", layers=[])
 class ChannelCancelled:
-    """A plan ends without a move. `reason` says why: it was cancelled, or its robots failed or were not ready in
-    time."""
+    """A planned move ends without moving the channel. `reason` contains the cause: it was cancelled, too many robots
+    failed, or too few were ready in time."""
 
     channel: str = member("production")
     rollback: bool = member(False)
@@ -113,8 +113,8 @@ class ChannelCancelled:
 
 @event("channel.moved")
 class ChannelMoved:
-    """A channel points to another version. Robots that follow the channel install it. A move back has `rollback: true`;
-    one that the server makes by itself after failures also has a `reason`."""
+    """A channel points to another version, which its robots install. A move to an older version has `rollback: true`;
+    an automatic rollback after failures also has a `reason`."""
 
     channel: str = member("production")
     rollback: bool = member(False)
@@ -123,14 +123,14 @@ class ChannelMoved:
 
 @event("overlay.created", previous=None, layers=[], message=_MESSAGE)
 class OverlayCreated:
-    """A robot or an editor reports an obstruction. It is pending, and no map shows it."""
+    """A robot or an editor reports an obstruction. It is pending and not part of any map."""
 
     overlay: Mapping[str, Any] = member(_overlay("pending"))
 
 
 @event("overlay.accepted", previous=None, layers=[], message=_MESSAGE)
 class OverlayAccepted:
-    """An editor accepts an obstruction. From now on it is a closure that maps show, whatever the channel."""
+    """An editor accepts an obstruction. It is then a closure in force and part of maps on all channels."""
 
     overlay: Mapping[str, Any] = member(_overlay("accepted", decided_by="administrator", decided=_TIME))
     overlays_digest: str = member(_DIGEST)
@@ -145,18 +145,18 @@ class OverlayRejected:
 
 @event("overlay.expired", previous=None, layers=[], message=_MESSAGE)
 class OverlayExpired:
-    """Nobody decides on an obstruction before its time is over."""
+    """An obstruction reaches its expiry without a decision."""
 
     overlay: Mapping[str, Any] = member(_overlay("expired", decided=_TIME))
 
 
 @event("overlay.ended", previous=None, layers=[], message=_MESSAGE)
 class OverlayEnded:
-    """A closure ends, by its time or by an editor. Maps no longer show it."""
+    """A closure ends at its expiry or by an editor. It is no longer part of maps."""
 
     overlay: Mapping[str, Any] = member(_overlay("ended", decided_by="administrator", decided=_TIME))
     overlays_digest: str = member(_DIGEST)
 
 
 EVENT_TYPES: tuple[EventType, ...] = tuple(_registry)
-"""The names of all event types."""
+"""Names of all event types."""

@@ -1,4 +1,4 @@
-"""The server: one application made of the store, the pool, the services and the API, and how uvicorn runs it."""
+"""Create the server application from store, worker pools, services and API, and configure uvicorn."""
 
 from __future__ import annotations
 
@@ -61,21 +61,21 @@ from app.store.store import Store
 log = logging.getLogger(__name__)
 
 TICK_SECONDS = 1.0
-"""How late a planned move of a channel may come."""
+"""Interval of housekeeping, and so the maximum delay of a planned channel move."""
 
 CLOCK_TOLERANCE = timedelta(seconds=60)
-"""How far the clock may go back without a word in the log."""
+"""Maximum backward step of the clock that is not logged."""
 
 COLLECT_EVERY = timedelta(hours=24)
 COLLECT_GRACE = timedelta(hours=6)
-"""Data that nothing refers to is removed once a day, unless it is younger than this (an upload may be using it)."""
+"""Minimum age of unreferenced data that the daily garbage collection removes; uploads may still use younger data."""
 
 CACHE_SHARE = 0.1
-"""Of the cached maps a scrub hashes so many: each is hashed anyway when a process first meets it."""
+"""Share of the cached maps that a scrub hashes: each process also hashes a map at its first use."""
 
 
 def create_app(settings: Settings) -> FleetMapApp:
-    """The application. Its lifespan opens the store and starts the workers, and closes both."""
+    """Create the application. Its lifespan opens the store and starts the workers, and closes both."""
     app = FleetMapApp(
         title="Fleet Map Server",
         version=__version__,
@@ -122,14 +122,15 @@ async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]
 
 
 def from_environment() -> FleetMapApp:
-    """For ``uvicorn --factory app.main:from_environment``."""
+    """Create the application with settings from the environment, for uvicorn's ``--factory``."""
     return create_app(Settings())
 
 
 def server_config(settings: Settings, app: Any = "app.main:from_environment", **more: Any) -> uvicorn.Config:
-    """uvicorn as this server needs it: fast loop and parser, bounded connections, no access log, no version in headers.
+    """Configure uvicorn: fast loop and parser, limited connections, no access log, no version in headers.
 
-    app: an application; for several workers a factory that can be pickled, or its import string.
+    Args:
+        app: an application; for several workers a factory that can be pickled, or its import string.
     """
     if settings.workers > 1:
         folder = settings.data_dir / "metrics"
@@ -146,7 +147,7 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
     tls = None
     if settings.tls_certificate is not None and settings.tls_key is not None:
         tls = settings.tls_certificate, settings.tls_key
-        tls_context(*tls)  # a file that cannot be used is reported at the start
+        tls_context(*tls)  # report unusable files at start
     options: dict[str, Any] = {
         "factory": isinstance(app, str | partial),
         "host": settings.host,
@@ -161,7 +162,7 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         "server_header": False,
         "timeout_keep_alive": 30,
         "timeout_graceful_shutdown": 20,
-        # Uvicorn's 5 s end workers that are still starting on a busy machine, again and again.
+        # Uvicorn's default of 5 s kills workers that start slowly on a busy machine.
         "timeout_worker_healthcheck": 120,
     }
     return uvicorn.Config(app, **{**options, **more})
@@ -176,7 +177,7 @@ def _has_uvloop() -> bool:
 
 
 def open_services(settings: Settings) -> Services:
-    """Open the store and start the workers. Blocks. Raises Unavailable where the database is not this release's."""
+    """Open the store and start the workers. Blocks. Raises Unavailable if the schema is not that of this release."""
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     settings.blob_dir.mkdir(parents=True, exist_ok=True)
     store = Store(settings.database, settings.blob_dir)
@@ -189,18 +190,18 @@ def open_services(settings: Settings) -> Services:
                 store.check()
             except Unavailable as error:
                 hint = (
-                    "" if settings.database.startswith("sqlite") else " (`fleetmap migrate` makes the schema current)"
+                    "" if settings.database.startswith("sqlite") else " (run `fleetmap migrate` to update the schema)"
                 )
                 raise Unavailable(error.detail + hint) from error
             try:
                 store.check_writable()
                 store.recover()
-            except NoRoom as error:  # maps are served all the same
+            except NoRoom as error:  # reading still works
                 log.error("%s", error.detail)  # noqa: TRY400  a trace shows paths
             if not settings.insecure_no_auth:
                 _ensure_first_token(store, settings)
             intake = UploadSpool(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
-        # One more worker, started when it is needed: coverage tables do not wait for maps in the making.
+        # One spare worker, started on demand, so that coverage tables do not wait for conversions.
         pool, spare = pools = [_worker_pool(settings, workers) for workers in (settings.conversion_workers, 1)]
         return _services(settings, store, pool, spare, intake)
     except BaseException:
@@ -223,7 +224,7 @@ def _worker_pool(settings: Settings, workers: int) -> Pool:
 
 
 def _model_variables(settings: Settings) -> dict[str, str]:
-    """Where derivations in workers find models: as variables, since they run without settings, too."""
+    """Return the environment variables with the model folder for derivations in workers, which have no settings."""
     if settings.models_dir is None:
         return {}
     folder, max_bytes = str(settings.models_dir.resolve()), str(settings.models_max_bytes)
@@ -231,10 +232,10 @@ def _model_variables(settings: Settings) -> dict[str, str]:
 
 
 def sandbox_policy(settings: Settings) -> SandboxPolicy:
-    """What worker processes may do: read the database, and nothing else that anybody would notice."""
+    """Return the sandbox policy of worker processes: access to the database only."""
     if settings.database.startswith("sqlite"):
         file = make_url(settings.database).database
-        # Readers of a write-ahead log share memory through a file beside the database.
+        # Readers of SQLite's write-ahead log write to a shared-memory file beside the database.
         return SandboxPolicy(overwrite=(Path(file).resolve().parent,) if file else ())
     return SandboxPolicy(ports=(make_url(settings.database).port or 5432,))
 
@@ -243,7 +244,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     def run(function: Callable[..., Any], *args: Any, by: Pool = pool, **more: Any) -> Any:
         try:
             return by.run(function, *args, **more)
-        except DatabaseDamaged as error:  # a worker met it
+        except DatabaseDamaged as error:  # found by a worker
             store.note_damage(error)
             raise
 
@@ -258,7 +259,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     access = Authenticator(store.tokens.find, failures=settings.token_failures, insecure=settings.insecure_no_auth)
 
     keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
-    with contextlib.suppress(OSError):  # created now, since later the disk may be full
+    with contextlib.suppress(OSError):  # create now: later the disk may be full
         keys.public()
         secrets.newest()
 
@@ -299,15 +300,15 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
 
 
 def _bus_vouches(settings: Settings) -> bool:
-    """Whether only known users reach the router, so that a robot's report on it is the robot's own.
+    """Whether reports from Zenoh count as authenticated, because the router requires users.
 
-    Of another router all that is known is that the server itself had to log in. Without tokens everybody counts.
+    For an external router this is assumed if the server itself has to log in. With ``insecure_no_auth`` all count.
     """
     return settings.insecure_no_auth or settings.zenoh_users is not None or settings.zenoh_user is not None
 
 
 def imagery_provider(settings: Settings) -> Provider | None:
-    """Where pictures of sites are fetched; None where the operator has set up none."""
+    """Return the imagery provider; None if none is configured."""
     if settings.imagery_url is None:
         return None
     return Provider(
@@ -326,7 +327,7 @@ def imagery_provider(settings: Settings) -> Provider | None:
 
 
 def start_scrub(settings: Settings, services: Services) -> Scrub | None:
-    """The background check of stored data, begun; None where it is off."""
+    """Start the background check of stored data; None if it is off."""
     if not settings.scrub_hours:
         return None
     sample = partial(services.maps.cache.sample, CACHE_SHARE)
@@ -337,11 +338,14 @@ def start_scrub(settings: Settings, services: Services) -> Scrub | None:
 
 
 def start_relay(settings: Settings, services: Services) -> Relay | None:
-    """Events to the fleet, begun; None where they are off."""
+    """Start the event relay; None if Zenoh is off."""
     if settings.zenoh_mode == "off":
         return None
     if settings.zenoh_users is not None and "tcp/" in settings.zenoh_listen:
-        log.warning("users of the router come in without TLS: what is said can be read and changed on the way")
+        log.warning(
+            "Zenoh router: FLEETMAP_ZENOH_USERS is set but the router listens without TLS; passwords and messages are "
+            "sent in clear text"
+        )
     options = _bus_options(settings)
     zenoh_bus = Bus(
         options,
@@ -356,7 +360,7 @@ def start_relay(settings: Settings, services: Services) -> Relay | None:
 
 
 def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
-    """Topics for ROS 2, begun; None where no environment is chosen."""
+    """Start the ROS 2 publisher; None if no environment is selected or Zenoh is off."""
     chosen = parse_selectors(settings.ros2_environments)
     if not chosen or settings.zenoh_mode == "off":
         return None
@@ -373,7 +377,7 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
 
 
 def check_bus(settings: Settings) -> None:
-    """Whether the settings of Zenoh can be used: files are there, users are such. Raises FleetMapError."""
+    """Check the Zenoh settings, including their files and users. Raises FleetMapError."""
     if settings.zenoh_mode != "off":
         bus.check(_bus_options(settings))
 
@@ -402,7 +406,7 @@ def _bus_options(settings: Settings) -> BusOptions:
 
 
 def close_services(services: Services) -> None:
-    """End workers, remove the spool, close the store. Blocks."""
+    """Stop the workers, remove the spool and close the store. Blocks."""
     services.fleet.close()
     services.pool.close()
     services.spare.close()
@@ -412,9 +416,9 @@ def close_services(services: Services) -> None:
 
 
 def _prepare(services: Services) -> None:
-    """Do beside the start what the first request would wait for."""
+    """Import formats and derivations and start the workers in the background, so that no request waits for that."""
     try:
-        every_format.all_formats()  # before the workers, which import theirs meanwhile
+        every_format.all_formats()
         derive.all_derivations()
         services.pool.start()
     finally:
@@ -423,38 +427,38 @@ def _prepare(services: Services) -> None:
 
 @contextlib.contextmanager
 def startup_lock(data_dir: Path) -> Iterator[None]:
-    """One process at a time starts on a data folder: migrations, leftovers and the first token are done once."""
+    """Lock a data folder for the start of one process at a time, so that migration and recovery run once."""
     with (data_dir / "start.lock").open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield
 
 
 def _ensure_first_token(store: Store, settings: Settings) -> None:
-    """Make sure that somebody can come in."""
+    """Create an administrator's token if there is none."""
     if settings.admin_token is not None:
         text = settings.admin_token.get_secret_value()
         if len(text) < 22:
-            log.warning("FLEETMAP_ADMIN_TOKEN is short: anybody could guess it. Use 32 random characters")
+            log.warning("FLEETMAP_ADMIN_TOKEN is short and can be guessed: use 32 random characters")
         if store.tokens.find(text) is None:
-            with contextlib.suppress(Conflict):  # a server that starts at the same time was quicker
+            with contextlib.suppress(Conflict):  # another server has created it at the same time
                 store.tokens.create("administrator", "admin", token=text)
     elif (token := store.tokens.create_administrator()) is not None:
-        print(f"administrator's token, shown only this once: {token}", file=sys.stdout, flush=True)
+        print(f"administrator's token, shown only once: {token}", file=sys.stdout, flush=True)
 
 
 def _note_time(newest: datetime) -> datetime:
-    """The present; a clock that was set back is reported."""
+    """Return the current time; log a warning if the clock was set back."""
     now = datetime.now(UTC)
     if newest - now > CLOCK_TOLERANCE:
         log.warning(
-            "clock: set back by %d s; expired tokens and links stay expired: replace those that expired too early",
+            "clock: set back by %d s; expired tokens and links stay expired, replace those that expired too early",
             (newest - now).total_seconds(),
         )
     return now
 
 
 async def _run_housekeeping(services: Services) -> None:
-    """Ends of tokens and overlays, planned moves and roll-outs, signs of life of jobs, and the daily clean-up."""
+    """Run periodic tasks: expiry of tokens and overlays, channel moves, rollouts, heartbeats, garbage collection."""
     beat = 0.0
     newest = datetime.now(UTC)
     collect = newest + COLLECT_EVERY
@@ -475,6 +479,6 @@ async def _run_housekeeping(services: Services) -> None:
                 collect = datetime.now(UTC) + COLLECT_EVERY
                 await run_in_threadpool(services.store.garbage.collect, COLLECT_GRACE)
         except FleetMapError as error:
-            log.warning("housekeeping waits: %s", error.detail)
-        except Exception as error:  # noqa: BLE001  the ticker must outlive a database that is away for a while
-            log.error("housekeeping failed: %s", problems.describe(error))  # noqa: TRY400  a trace shows paths
+            log.warning("housekeeping: skipped, will retry: %s", error.detail)
+        except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
+            log.error("housekeeping: failed, will retry: %s", problems.describe(error))  # noqa: TRY400  a trace shows paths

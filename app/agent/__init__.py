@@ -1,10 +1,10 @@
 """The robot's side: a directory that always holds one complete, verified map of an environment.
 
-``agent`` the loop · ``manifests`` fetches manifests, which ``signed_manifest`` verifies with ``freshness`` for time ·
-``download``
-fetches files over ``http_client`` (HTTP) · ``map_directory`` what is on the disk · ``activation`` switches, with
-``hooks`` and
-``levels`` · ``status`` reports · ``state`` survives a restart · ``zenoh_client`` Zenoh · ``options``, ``requests``. It
-imports
-nothing of the server but ``app.events.messages`` and ``app.errors``, so that it installs without the server's packages.
+Modules: ``agent`` sync loop · ``manifests`` fetches manifests, ``signed_manifest`` verifies them, ``freshness`` judges
+their time · ``download`` fetches files with ``http_client`` · ``map_directory`` the files on disk · ``activation``
+switches versions and runs ``hooks``, with ``levels`` · ``status`` reports · ``state`` persistent state ·
+``zenoh_client`` Zenoh session · ``options`` and ``requests`` parameters.
+
+Of the server it imports only ``app.errors``, ``app.events.messages`` and ``app.events.credentials``, so that it
+installs without the server's packages.
 """

@@ -1,8 +1,7 @@
-"""Switching to a map and having the robot load it.
+"""Switch to a map and run the hooks that load it.
 
-Before a switch the ``--before-switch`` commands decide when; after it the ``--on-change`` commands load the map. If
-they fail, ``current`` goes back to the version that the robot loaded last: what ``current`` says is what the robot
-drives by.
+``--before-switch`` commands decide when to switch; ``--on-change`` commands load the map after it. If they fail,
+``current`` is switched back to the version that the robot loaded last, so ``current`` is always the map in use.
 """
 
 from __future__ import annotations
@@ -43,42 +42,47 @@ LAYERS = ("imagery", "location", "objects", "occupancy", "topology", "voxels", "
 """Layers that may have changed if the server is too old to list them."""
 
 LogEvent = Callable[..., None]
-"""log(event, **members): one line of what happens."""
+"""Log function: ``log(event, **members)`` writes one line."""
 
 
 class Retries:
-    """Growing pauses between attempts at what failed, by subject."""
+    """Exponential backoff between attempts, per subject."""
 
     def __init__(self, longest: float, first: Callable[[], float]) -> None:
         self._longest, self._first = longest, first
         self._failures: dict[str, tuple[int, float, str]] = {}
 
     def note_failure(self, subject: str, reason: str) -> None:
-        """Note a failure: the next attempt is due later than after the one before."""
+        """Record a failure; the pause before the next attempt doubles with each one."""
         count = self._failures.get(subject, (0, 0.0, ""))[0] + 1
         pause = min(self._longest, self._first() * 2 ** min(20, count - 1))
         due = time.monotonic() + pause * random.uniform(0.5, 1.5)  # noqa: S311  jitter is no secret
         self._failures[subject] = (count, due, reason)
 
     def reason(self, subject: str) -> str | None:
-        """Return why a subject failed if its next attempt is not due yet."""
+        """Return the reason of the last failure if the next attempt is not due yet."""
         _, due, reason = self._failures.get(subject, (0, 0.0, None))
         return reason if due > time.monotonic() else None
 
     def forget_others(self, *subjects: str | None) -> None:
-        """Forget the failures of all other subjects: each may be tried at once."""
+        """Clear the failures of all other subjects, so that they can be tried at once."""
         self._failures = {name: failure for name, failure in self._failures.items() if name in subjects}
 
     @property
     def next_due(self) -> float | None:
-        """Monotonic time of the next attempt, None if no subject waits for one."""
+        """Monotonic time of the next attempt; None if none is due."""
         now = time.monotonic()
         return min((due for _, due, _ in self._failures.values() if due > now), default=None)
 
 
 @dataclass(frozen=True, slots=True)
 class Pending:
-    """A map that waits for ``--before-switch``. since: RFC 3339. members: of the log line ``switched``."""
+    """A map whose switch ``--before-switch`` delays.
+
+    Attributes:
+        since: RFC 3339 time from which the version is ready.
+        members: of the log line ``switched``.
+    """
 
     name: str
     manifest: Manifest
@@ -88,7 +92,11 @@ class Pending:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a map. manifest: the map that ``detail`` is about; None for the one that ``current`` points to."""
+    """Outcome of an installation.
+
+    Attributes:
+        manifest: map that ``detail`` is about; None for the map that ``current`` points to.
+    """
 
     state: Literal["active", "waiting", "failed"]
     detail: str | None = None
@@ -99,7 +107,7 @@ ACTIVE = Outcome("active")
 
 
 class Activation:
-    """The switch of one map directory. Not thread-safe."""
+    """Switches versions of one map directory and runs its hooks. Not thread-safe."""
 
     def __init__(
         self,
@@ -119,11 +127,11 @@ class Activation:
         self._replacement: str | None = None
 
     def switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
-        """Switch to a built version if ``--before-switch`` agrees. The hooks run with ``load``.
+        """Switch to a built version if ``--before-switch`` allows it. ``load`` runs the hooks afterwards.
 
         Args:
             members: of the log line ``switched``.
-            since: RFC 3339 time from which the version lies ready.
+            since: RFC 3339 time from which the version is ready.
         """
         with self._folder.hooks_lock(self._stopping):
             problem = level_problem(manifest, read_level(self._folder))
@@ -144,9 +152,9 @@ class Activation:
         return ACTIVE
 
     def replace(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
-        """Switch to the current version with other closures and run the hooks; a newer map goes on waiting.
+        """Switch to the current version with other closures and run the hooks; a newer pending map stays pending.
 
-        A failure is tried again ever later, and the robot goes back to the closures that it has loaded.
+        After a failure the robot returns to the closures that it has loaded; the agent retries with backoff.
         """
         self._replacement = identity(manifest)
         if (reason := self.retries.reason(self._replacement)) is not None:
@@ -163,7 +171,7 @@ class Activation:
         return self.load() if outcome.state == "active" else outcome
 
     def refusal(self, manifest: Manifest) -> Outcome | None:
-        """Return the failure of this very manifest if it is not to be tried again yet."""
+        """Return the failure of this manifest if its next attempt is not due yet."""
         self.retries.forget_others(identity(manifest), self._folder.current_version, self._replacement)
         reason = self.retries.reason(identity(manifest))
         return None if reason is None else Outcome("failed", reason, manifest)
@@ -173,12 +181,12 @@ class Activation:
         return self.pending is not None
 
     def protect(self) -> None:
-        """Keep the folders of versions that may still be switched to."""
+        """Protect the folders of the working and the pending version from removal."""
         names = {self._store.value.working, self.pending.name if self.pending else None}
         self._folder.protected = frozenset(name for name in names if name is not None)
 
     def _before_switch(self, name: str, manifest: Manifest, since: str) -> Outcome | None:
-        """Run the commands: None if all agree to the switch."""
+        """Run the ``--before-switch`` commands; return None if all allow the switch."""
         installed = self._folder.manifest(self._store.value.activated)
         variables = self._variables(manifest, installed)
         ready = self._folder.versions / name
@@ -207,7 +215,7 @@ class Activation:
         return name is not None and self._store.value.activated != name and self.retries.reason(name) is None
 
     def load(self) -> Outcome:
-        """Run the hooks for the current version if they have not run yet; go back to the last good one if they fail."""
+        """Run the hooks of the current version if they have not run yet; if they fail, restore the working version."""
         name = self._folder.current_version
         manifest = self._folder.manifest(name)
         if name is None or manifest is None or self._store.value.activated == name:
@@ -220,27 +228,27 @@ class Activation:
             return self._roll_back(name, manifest, problem)
 
     def _roll_back(self, name: str, manifest: Manifest, problem: str) -> Outcome:
-        """Put the version whose hooks succeeded last in place of one whose hooks failed."""
+        """Restore the version whose hooks succeeded last."""
         back = self._store.value.working
         previous = self._folder.manifest(back)
         if back is None or back == name or previous is None or self._folder.damaged_files(back, previous):
-            reason = f"version {manifest.version} is in place, but its robot has not taken it: {problem}"
+            reason = f"version {manifest.version} is current, but the robot could not load it: {problem}"
             self.retries.note_failure(name, reason)
             return Outcome("failed", reason)
         reason = (
-            f"version {manifest.version} is replaced by {previous.version}, since its robot has not taken it: {problem}"
+            f"the robot could not load version {manifest.version}; version {previous.version} is restored: {problem}"
         )
         self.retries.note_failure(identity(manifest), reason)
         self._folder.switch(back)
         self._log("restored", version=previous.version, root=previous.root, detail=problem)
         is_loaded = self._store.value.activated == back  # no hook of the newer version has run
         if not is_loaded and (second := self._run_hooks(back, previous)) is not None:
-            reason = f"{reason}; nor has it taken version {previous.version} again: {second}"
+            reason = f"{reason}; version {previous.version} could not be loaded again either: {second}"
             self.retries.note_failure(back, reason)
         return Outcome("failed", reason, manifest)
 
     def _run_hooks(self, name: str, manifest: Manifest) -> str | None:
-        """Run the ``--on-change`` commands: None if all succeeded, and the version counts as loaded."""
+        """Run the ``--on-change`` commands; return None if all succeeded, and mark the version as loaded."""
         level = read_level(self._folder)
         if (problem := level_problem(manifest, level)) is not None:
             return problem
@@ -249,8 +257,8 @@ class Activation:
             variables = self._variables(manifest, before)
             self._folder.hook_status.unlink(missing_ok=True)
         except OSError as error:
-            return f"the hooks cannot be run: {error.filename or self._folder.path}: {error.strerror or error}"
-        if self._options.on_change:  # cut off in the middle, or taken back: what the robot has loaded is unknown
+            return f"could not run the hooks: {error.filename or self._folder.path}: {error.strerror or error}"
+        if self._options.on_change:  # after an interruption it is unknown which version the robot has loaded
             self._store.set(activated=None)
         for command in self._options.on_change:
             problem = hooks.run(command, variables, stopping=self._stopping)
@@ -264,12 +272,12 @@ class Activation:
         return None
 
     def hook_remark(self) -> str | None:
-        """Return the steps that the hooks of the current version did not do, as they wrote them."""
+        """Return the steps that hooks of the current version reported as not done."""
         steps = [s for s in read_hook_status(self._folder.hook_status) if s["result"] not in HOOK_SUCCESS]
         return "; ".join(f"{s['step']}: {s['result']}: {s['detail']}" for s in steps[:MAX_HOOK_STEPS]) or None
 
     def _variables(self, manifest: Manifest, before: Manifest | None) -> dict[str, str]:
-        """Return the environment variables of a command. before: what the robot has loaded."""
+        """Return the environment variables of a command. before: manifest that the robot has loaded."""
         files, layers = changed_files(before, manifest), changed_layers(before, manifest)
         return hook_variables(self._folder, manifest, files, layers, read_level(self._folder), self._robot)
 
@@ -280,8 +288,8 @@ def hook_variables(
     """Return the environment variables of a command.
 
     Args:
-        files, layers: changed ones.
-        level: the one that the robot is on.
+        files, layers: changed files and layers.
+        level: current level of the robot.
     """
     return {
         "FLEETMAP_ENVIRONMENT": manifest.environment,
@@ -313,19 +321,19 @@ def read_hook_status(path: Path) -> list[dict[str, str]]:
             body = json.loads(line)
             steps.append({name: str(body[name])[:300] for name in ("step", "result", "detail")})
         except (ValueError, KeyError, TypeError, RecursionError):
-            continue  # a line of something else, or cut off
+            continue  # other output, or a truncated line
     return steps
 
 
 def identity(manifest: Manifest) -> str:
-    """Return the subject under which a failure of this manifest is noted: a newer sequence is another one."""
+    """Return the key under which failures of this manifest are recorded; a newer sequence has another key."""
     return f"{manifest.epoch} {manifest.sequence} {manifest.root} {manifest.closures_key}"
 
 
 def _file_variables(path: Path, names: Sequence[str]) -> dict[str, str]:
-    """List changed files in variables, and completely in the file ``path``.
+    """Return changed files as hook variables, and write the complete list to ``path``.
 
-    A variable's size is limited (128 KiB on Linux): what does not fit is skipped from the deepest folders up.
+    The size of a variable is limited (128 KiB on Linux): names in the deepest folders are skipped first.
     """
     write_durably(path, "".join(f"{name}\n" for name in names).encode())
     remaining, fit = MAX_VARIABLE_BYTES, set()

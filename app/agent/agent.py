@@ -36,20 +36,24 @@ __all__ = ["Agent", "AgentOptions", "robot_name"]
 
 PRODUCTION = "production"
 FIRST_PAUSE_SECONDS = 1.0
-"""After the first failure; doubled each time up to the pause between polls."""
+"""Pause after the first failure; doubles with each further one up to the poll interval."""
 
 RECHECK_AFTER_SECONDS = 5.0
-"""After a longer download the channel is looked at again before the switch."""
+"""Duration of a download after which the agent checks the channel again before it switches."""
 
 MAX_CLOSURE_CHANGES = 5
-"""Maximum number of times that a manifest is fetched again in one sync because closures have changed."""
+"""Maximum number of times that one sync fetches a manifest again because closures have changed."""
 
 CLOSURES_SECONDS = 0.1
-"""First pause if a server's files have other closures than its newest manifest; doubled each time."""
+"""First pause if the server's files have other closures than its newest manifest; doubles each time."""
 
 
 class Agent:
-    """One environment's map in one folder. clock: seconds since 1970; it may be a minute off."""
+    """The agent: keeps the map of one environment in one directory up to date.
+
+    Args:
+        clock: seconds since 1970; may be wrong by one minute.
+    """
 
     def __init__(self, options: AgentOptions, log: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
@@ -59,7 +63,7 @@ class Agent:
         self._login = options.zenoh_login
         if self._login.password is not None and self._login.user is None:
             self._login = dataclasses.replace(self._login, user=self._robot)
-        self._login.values()  # Invalid comes now, not in the session's thread
+        self._login.values()  # raises Invalid here rather than in the session's thread
         self._stopping = threading.Event()
         self._wake = Alarm(self._stopping)
         self._folder = MapDirectory(options.into)
@@ -105,12 +109,15 @@ class Agent:
         return self._store.value
 
     def open(self) -> None:
-        """Take the folder and look at what is in it. Raises Conflict or Invalid where it is not ours."""
+        """Lock the map directory, load the state and check the installed files.
+
+        Raises Conflict if another agent uses the directory, Invalid if its state cannot be used.
+        """
         self._folder.open()
         self._store.load()
         state = signed_manifest.pin_key(self._state, self.options.key)
         if state.key is None and self._state.key is not None:
-            self._log_event("trusting", key=state.given, detail="the key that was pinned before is forgotten")
+            self._log_event("trusting", key=state.given, detail="the key pinned before is no longer trusted")
         installed = self._folder.manifest(self._folder.current_version)
         name = self._folder.current_version
         if installed is not None and name is not None and (bad := self._folder.damaged_files(name, installed)):
@@ -123,20 +130,20 @@ class Agent:
             self._folder.refresh(name, installed)
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Close the connections and unlock the map directory."""
         if self._zenoh is not None:
             self._zenoh.close()
         self._web.close()
         self._folder.close()
 
     def stop(self) -> None:
-        """End soon; may be called from a signal's handler or another thread."""
+        """Request the end of ``run``. Safe to call from a signal handler or another thread."""
         self._stopping.set()
         self._wake.set()
         self._web.interrupt()
 
     def run_once(self) -> bool:
-        """Sync once: whether the folder now holds the channel's map and all hooks succeeded."""
+        """Sync once; return whether the channel's map is installed and all hooks succeeded."""
         self._retries.forget_others()
         try:
             return self._attempt(self._sync)
@@ -144,7 +151,7 @@ class Agent:
             return False
 
     def run(self) -> None:
-        """Keep the folder up to date until ``stop``."""
+        """Keep the map directory up to date until ``stop`` is called."""
         self._zenoh = ZenohClient(
             self.options.environment,
             self._robot,
@@ -156,10 +163,8 @@ class Agent:
         )
         self._status.bus = self._zenoh
         if self._login.user not in (None, self._robot):
-            reason = (
-                f"a fleet map server's router lets the user {self._login.user} be seen as the robot of that name alone"
-            )
-            self._log_event("user", detail=f"{reason}: use --robot {self._login.user}, or its own user")
+            reason = f"the router accepts a status from user {self._login.user} only for the robot of that name"
+            self._log_event("user", detail=f"{reason}: use --robot {self._login.user}, or the robot's own user")
         if (installed := self._folder.manifest(self._folder.current_version)) is not None:
             self._log_event("holding", version=installed.version, root=installed.root)
         failures = 0
@@ -173,7 +178,7 @@ class Agent:
                     self._find_router()
                 good = self._attempt(self._sync) or self._activation.is_waiting()
                 failures = 0 if good else failures + 1
-                # A server of several hosts may know for a moment less than its events say: look again, ever later.
+                # With several server hosts, a response may lag behind an event: poll again, with growing pauses.
                 self._stale_replies = (
                     self._stale_replies + 1 if good and self._accepted_sequence < self._announced_sequence else 0
                 )
@@ -189,7 +194,7 @@ class Agent:
                 break
 
     def _sleep_or_switch(self, seconds: float) -> bool:
-        """Rest for so long, running ``--before-switch`` now and then if it delays a switch: whether an event came."""
+        """Sleep, and repeat ``--before-switch`` if it delays a switch. Return whether to sync at once."""
         end = time.monotonic() + seconds
         while self._activation.is_waiting():
             remaining = end - time.monotonic()
@@ -198,11 +203,11 @@ class Agent:
                 return woken
             self._attempt(self._switch_pending)
             if not self._activation.is_waiting():
-                return True  # switched, or refused: sync at once
+                return True  # switched or refused
         return self._wake.sleep(max(0.0, end - time.monotonic()), self._status)
 
     def _on_event(self, event: messages.Event) -> None:
-        """In a thread of Zenoh's: wake the loop if it is of our concern."""
+        """Wake the sync loop if the event may change this robot's map. Called in a Zenoh thread."""
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
@@ -211,13 +216,13 @@ class Agent:
         if is_relevant(event, channel, {self.options.channel} if self.options.channel else {PRODUCTION, channel}):
             is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
             if is_move or (event.type in CLOSURE_EVENTS and self._manifests.has_closures):
-                self._announced_sequence = event.sequence  # so far the manifest of the followed channel has moved
+                self._announced_sequence = event.sequence  # the channel's manifest has at least this sequence
                 self._freshness.announce(event.sequence)
             self._wake.set()
 
     @property
     def _accepted_sequence(self) -> int:
-        """The sequence that the channel is known to have reached."""
+        """Highest accepted sequence of the followed channel; -1 before the first manifest."""
         mark = self._state.marks.get(self._state.channel or "")
         return -1 if mark is None else mark.sequence
 
@@ -229,7 +234,7 @@ class Agent:
 
     def _on_router_lost(self, problem: str) -> None:
         self._log_event(
-            "polling", detail=f"{problem}; changes are noticed within {self.options.poll_seconds:g} seconds or so"
+            "polling", detail=f"{problem}; the agent polls about every {self.options.poll_seconds:g} seconds"
         )
 
     def _find_router(self) -> None:
@@ -244,7 +249,7 @@ class Agent:
             self._zenoh.set_endpoint(*router)
 
     def _attempt(self, action: Callable[[], bool]) -> bool:
-        """Run a step and report its errors: whether it succeeded."""
+        """Run a step and report its errors. Return whether it succeeded."""
         self._after = 0.0
         self._about = None
         try:
@@ -257,7 +262,7 @@ class Agent:
             good = False
         except AgentStopped:
             raise
-        except Exception as error:  # noqa: BLE001  a mistake of ours; who ends here is of no use to a robot
+        except Exception as error:  # noqa: BLE001  an internal error must not end the agent
             frame = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{Path(frame.filename).name}:{frame.lineno}"
             self._fail("failed", f"internal error in the agent ({type(error).__name__} at {place}): {error}")
@@ -267,7 +272,7 @@ class Agent:
 
     _after = 0.0
     _about: Manifest | None = None
-    """The map that an error is about; None for the current one."""
+    """Manifest of the map that an error is about; None for the current map."""
 
     def _sync(self) -> bool:
         self._store.save(self._state)
@@ -275,7 +280,7 @@ class Agent:
         try:
             plans = self._fetch_channels()
         except FleetMapError:
-            if self._activation.is_load_due:  # hooks that were cut off run without a server, too
+            if self._activation.is_load_due:  # interrupted hooks do not need the server
                 self._report(self._activation.load())
             raise
         channel = self._channel(plans)
@@ -300,11 +305,11 @@ class Agent:
     def _write_hooks(self) -> None:
         try:
             write_hooks(self._folder, self.options.on_change, self._robot)
-        except OSError as error:  # a full disk stops agent-level, and not the agent
+        except OSError as error:  # only `fleetmap agent-level` needs this file
             self._log_once("hooks", detail=f"{self._folder.path}/hooks.json cannot be written: {error.strerror}")
 
     def _follow(self, channel: str) -> Outcome:
-        """Bring ``current`` to the channel's map and have the robot load it."""
+        """Switch ``current`` to the channel's map and run the hooks."""
         manifest = self._manifests.fetch_latest(channel)
         outcome = self._install_latest(channel, manifest) if manifest is not None else None
         self._about = None
@@ -312,7 +317,7 @@ class Agent:
         return loaded if outcome is None or outcome.state == "active" else outcome
 
     def _refresh_closures(self) -> None:
-        """Bring the newest closures to the current version while the robot cannot have the channel's one."""
+        """Apply the newest closures to the current version if the channel's version is not active."""
         name = self._folder.current_version
         current, digest = self._folder.manifest(name), self._manifests.overlays_digest
         if name is None or current is None or digest is None or self._state.working != name:
@@ -324,7 +329,9 @@ class Agent:
             begun = time.monotonic()
             manifest, sources = self._fetch_version(current.version, keep)
             if manifest.root != current.root:
-                raise Untrusted(f"version {manifest.version} has the root {manifest.root[:8]}, not {current.root[:8]}")
+                raise Untrusted(
+                    f"version {manifest.version} has root {manifest.root[:8]} instead of {current.root[:8]}"
+                )
             if manifest.map_key == current.map_key:
                 self._refreshed = (name, digest)  # these closures do not concern this version
                 return
@@ -346,7 +353,10 @@ class Agent:
             self._log_event("failed", detail=outcome.detail)
 
     def _fetch_version(self, version: int, keep: Sequence[ManifestFile]) -> tuple[Manifest, dict[str, Path]]:
-        """Fetch a version by its number, again if closures change meanwhile: its manifest, path -> verified file."""
+        """Fetch a version by number; repeat if closures change during the download.
+
+        Returns its manifest, and path -> verified file.
+        """
         for attempt in range(MAX_CLOSURE_CHANGES):
             manifest = self._manifests.fetch_planned(version)
             self._fetched = manifest
@@ -362,7 +372,7 @@ class Agent:
         raise ClosuresChanged(problem)
 
     def _switch_pending(self) -> bool:
-        """Ask ``--before-switch`` again for the map that waits for it."""
+        """Run ``--before-switch`` again for the pending map. Return whether the map is active."""
         pending, self._activation.pending = self._activation.pending, None
         if pending is None or pending.manifest.expires.timestamp() < self._signed_clock.now():
             return False
@@ -377,12 +387,15 @@ class Agent:
             return self._web.channels(self.options.environment)
         except (NotFound, Invalid) as error:
             if self.options.channel is None and PRODUCTION not in self._state.marks:
-                raise  # which channel to follow is not known then
+                raise  # without the list, the channel to follow is unknown
             self._log_once("channels", detail=error.detail)
             return None
 
     def _channel(self, plans: Sequence[Mapping[str, Any]] | None) -> str:
-        """Which channel to follow. One that was followed by default stays so, also where the server says it is gone."""
+        """Return the channel to follow.
+
+        After ``production`` was once followed by default, it stays the default even if the server no longer lists it.
+        """
         if self.options.channel is not None:
             return self.options.channel
         stands = any(p.get("channel") == PRODUCTION and p.get("version") is not None for p in plans or ())
@@ -401,12 +414,12 @@ class Agent:
                 if newer is None or (newer.map_key == manifest.map_key and not isinstance(error, ClosuresChanged)):
                     raise
                 if newer.map_key == manifest.map_key and self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
-                    raise AgentStopped from None  # the server's manifest is older than its files for a moment
+                    raise AgentStopped from None
                 manifest = newer
         return self._install(manifest)
 
     def _install(self, manifest: Manifest) -> Outcome:
-        """Fetch what is missing, build the version, and switch to it."""
+        """Fetch missing files, build the version folder and switch to it."""
         name = self._folder.current_version
         installed = self._folder.manifest(name)
         bad = self._folder.damaged_files(name, installed) if name is not None and installed is not None else []
@@ -445,7 +458,7 @@ class Agent:
             "seconds": round(time.monotonic() - begun, 3),
         }
         if (count := web.failed_deltas - failed_deltas) > 0:
-            members["detail"] = f"{count} deltas could not be decoded: fetched the complete files instead"
+            members["detail"] = f"{count} deltas could not be decoded; the complete files were fetched"
         return self._switch(self._folder.build(manifest, sources), manifest, members, self._time_text()[:19] + "Z")
 
     def _switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
@@ -457,13 +470,15 @@ class Agent:
         return outcome
 
     def _note_installed(self, manifest: Manifest) -> None:
-        """Note the ETag of the manifest that is now the current one, and remove what is no longer needed."""
+        """Store the ETag of the installed manifest and remove files that are no longer needed."""
         self._manifests.note_installed(manifest)
         self._folder.prune(self._preloaded.files if self._preloaded else ())
 
     def _superseding_manifest(self, manifest: Manifest, seconds: float) -> Manifest | None:
-        """The channel's newer manifest, where it moved on while this map was fetched, to one that is here already: what
-        was taken back meanwhile is not put in place. Where the newer one is still to be fetched it has its turn.
+        """Return the channel's newer manifest if the channel has moved during the download and its files are present.
+
+        So a map that was rolled back during its download is not installed. None if the newer map must still be fetched:
+        the next sync does that.
         """
         if manifest.channel is None or (
             self._announced_sequence <= manifest.sequence and seconds < RECHECK_AFTER_SECONDS
@@ -479,12 +494,13 @@ class Agent:
         try:
             return self._manifests.fetch_latest(manifest.channel, is_present)
         except FleetMapError:
-            return None  # the next look tells of it
+            return None  # the next sync reports it
 
     def _preload(self, planned: Any, outcome: Outcome) -> bool:
-        """Fetch what a channel is planned to move to, so that the switch itself takes no time: whether it is here.
+        """Fetch the version that the channel is planned to move to. Return whether it is complete.
 
-        outcome: of the map that the channel points to now; a failure is part of the status ``ready``.
+        Args:
+            outcome: of the map that the channel points to now; its failure is reported in the status ``ready``.
         """
         version = planned.get("version") if isinstance(planned, dict) else None
         if type(version) is not int:
@@ -505,7 +521,7 @@ class Agent:
         return True
 
     def _report_preload_error(self, error: FleetMapError, version: int, root: Any) -> None:
-        """Report why a planned version is not here. What may end by itself is no failure of the version."""
+        """Report why a planned version was not fetched: ``downloading`` for temporary errors, else ``failed``."""
         detail = f"planned version {version}: {error.detail}"
         subject: Subject | None = self._fetched
         if subject is None and isinstance(root, str) and signed_manifest.is_hash(root):
@@ -516,14 +532,15 @@ class Agent:
             if subject is not None:
                 self._set_status("downloading", detail, subject)
         elif subject is None:
-            self._log_once("failed", detail=detail)  # an older server: which root would fail is not known
+            self._log_once("failed", detail=detail)  # an older server does not list the planned root
         elif self._set_status("failed", detail, subject):
             self._log_event("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
 
     def _report(self, outcome: Outcome, *, is_planned: bool = False) -> None:
-        """Report what became of the channel's map.
+        """Report the outcome of the channel's map.
 
-        is_planned: a planned version is reported as well; this status is then sent only if it is new.
+        Args:
+            is_planned: a planned version is reported too, so repeat this status only if it has changed.
         """
         report_key = (outcome.state, outcome.detail, self._folder.current_version, self._accepted_sequence)
         if is_planned and report_key == self._reported:
@@ -538,7 +555,7 @@ class Agent:
             self._set_status("ready", outcome.detail, outcome.manifest)
 
     def _remark(self) -> str | None:
-        """Return what a robot with an active map lacks: optional formats, or news that the bus announced."""
+        """Return remarks about an active map: missing optional formats, server behind its events, failed hook steps."""
         current = self._folder.manifest(self._folder.current_version)
         if current is None:
             return None
@@ -559,7 +576,11 @@ class Agent:
         self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
 
     def _set_status(self, state: RobotState, detail: str | None = None, about: Subject | None = None) -> bool:
-        """Note the status and send it: whether it is new. about: the map that it is about; default: the current one."""
+        """Set the status and send it. Return whether it is new.
+
+        Args:
+            about: map that the status is about; default: the current one.
+        """
         current = self._folder.manifest(self._folder.current_version)
         is_loaded = self._state.activated == self._folder.current_version
         status = describe_status(

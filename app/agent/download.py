@@ -1,4 +1,4 @@
-"""Fetching the files of a manifest that are not on the disk yet."""
+"""Download of the files of a manifest that are not on disk yet."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.agent.signed_manifest import Manifest, ManifestFile
 
 
 class Downloads:
-    """Fetch files into a map directory."""
+    """Downloads into a map directory."""
 
     def __init__(self, folder: MapDirectory, web: ServerClient, requests: Sequence[FormatRequest]) -> None:
         self._folder, self._web = folder, web
@@ -26,12 +26,12 @@ class Downloads:
         keep: Sequence[ManifestFile],
         begin: Callable[[], object] = lambda: None,
     ) -> dict[str, Path]:
-        """Fetch what is missing: path -> verified local copy.
+        """Fetch missing files. Return path -> verified local copy.
 
         Args:
             begin: called before the first download.
             installed: manifest of the current version, whose files serve as dictionaries for deltas.
-            keep: files that lie ready for a later version; removed only if the disk is too small.
+            keep: fetched files of a planned version; removed only if disk space is short.
         """
         index = self._folder.index()
         old = {file.path: file for file in installed.files} if installed else {}
@@ -62,7 +62,7 @@ class Downloads:
         return sources
 
     def _query(self, file: ManifestFile, manifest: Manifest) -> str:
-        """Return the parameters of a file's address: those of its format, and that closures are applied."""
+        """Return the query string of a file: the parameters of its format and ``closures``."""
         parameters = dict(self._parameters.get(file.format, ()))
         if manifest.overlays_digest is not None:
             parameters.setdefault("closures", "apply")

@@ -1,9 +1,9 @@
-"""Trust in time: by which clock a manifest expires, and whether the server's answers are still fresh.
+"""Clock for manifest expiry, and freshness of the server's responses.
 
 A robot's clock may be wrong, set back by an attacker, or unset after a power cut. So expiry is judged by the newer of
-the clock and the newest signed time. A signed time far ahead of a plausible clock is not believed: a server whose
-clock was wrong for a while would else make all later manifests look expired. Freshness is judged by the monotonic clock
-alone, which nobody can set.
+the clock and the newest signed time. A signed time far ahead of a plausible clock is ignored: otherwise a server whose
+clock was wrong for a while would make all later manifests look expired. Freshness is judged by the monotonic clock
+alone, which cannot be set.
 """
 
 from __future__ import annotations
@@ -14,40 +14,40 @@ from collections.abc import Callable
 from app.agent.signed_manifest import MAX_CLOCK_SKEW, Manifest
 
 MIN_PLAUSIBLE_TIME = 1767225600.0
-"""2026-01-01: an earlier clock is unset, in seconds since 1970."""
+"""2026-01-01 in seconds since 1970; a clock before it counts as unset."""
 
 MAX_PLAUSIBLE_TIME = MIN_PLAUSIBLE_TIME + 10 * 365 * 86400.0
-"""Latest signed time that a robot with an unset clock believes at first contact, in seconds since 1970."""
+"""Latest signed time that a robot with an unset clock accepts at first contact, in seconds since 1970."""
 
 MAX_AHEAD_SECONDS = 12 * 3600.0
-"""Maximum distance of a believed signed time from a plausible clock. Manifests are valid for longer (a day): a server
-whose clock was this far ahead blocks no robot after it was put right.
+"""Maximum lead of an accepted signed time over a plausible clock. Manifests are valid for longer (one day), so a
+server whose clock was this far ahead blocks no robot after it is corrected.
 """
 
 MAX_JUMP_SECONDS = 30 * 86400.0
-"""Maximum distance of a believed signed time from the newest one if the clock is unset."""
+"""Maximum lead of an accepted signed time over the newest one if the clock is unset."""
 
 STALE_SECONDS = 1800.0
-"""Time without a newer signed answer after which the server counts as frozen; at least three polls. Manifests are
+"""Time without a newer signed response after which the server counts as frozen; at least three polls. Manifests are
 signed again every 600 seconds.
 """
 
 BEHIND_SECONDS = 60.0
-"""Time after which a server that gives less than the bus announced is reported."""
+"""Time after which a server behind its announced events is reported."""
 
 FORGET_SECONDS = 900.0
-"""Time after which an announcement that never came true is forgotten: on an open router anybody can put events."""
+"""Time after which an unconfirmed announcement is dropped: on an open router anyone can publish events."""
 
 
 class SignedClock:
-    """The newer of the robot's clock and the newest signed time. floor: the latter, in seconds since 1970."""
+    """The newer of the robot's clock and the newest signed time (``floor``), in seconds since 1970."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self.floor = 0.0
 
     def now(self) -> float:
-        """Return the time by which manifests expire."""
+        """Return the time for checks of expiry."""
         return max(self._clock(), self.floor)
 
     @property
@@ -56,7 +56,7 @@ class SignedClock:
         return self._clock()
 
     def is_plausible(self, manifest: Manifest) -> bool:
-        """Whether the signed time of a manifest is believed; one of an older server has none."""
+        """Whether the signed time of a manifest is accepted; True if an older server sends none."""
         if manifest.time is None:
             return True
         clock = self._clock()
@@ -67,13 +67,13 @@ class SignedClock:
         return manifest.time.timestamp() <= limit
 
     def observe(self, manifest: Manifest) -> None:
-        """Take the time of a verified manifest into account."""
+        """Advance the floor to the time of a verified manifest."""
         if manifest.time is not None and self.is_plausible(manifest):
             self.floor = max(self.floor, manifest.time.timestamp())
 
 
 class Freshness:
-    """Whether signed answers still become newer, and keep up with what the bus announces."""
+    """Check that signed responses become newer and keep up with announced events."""
 
     def __init__(self, poll_seconds: float, time_text: Callable[[], str]) -> None:
         self._stale_after = max(STALE_SECONDS, 3 * poll_seconds)
@@ -83,9 +83,10 @@ class Freshness:
         self._announced: tuple[int, float, str] | None = None
 
     def observe(self, manifest: Manifest, clock: float) -> None:
-        """Note a channel's verified manifest. One of an older server has no time: its expiry moves likewise.
+        """Record a channel's verified manifest. Without a signed time (older server) its expiry is used.
 
-        Times ahead of the robot's clock are compared among themselves: a single one does not outdate all later ones.
+        Times ahead of the robot's clock are compared only with each other, so a single one does not outdate all
+        later ones.
         """
         signed = (manifest.time or manifest.expires).timestamp()
         is_ahead = signed > clock + MAX_CLOCK_SKEW.total_seconds()
@@ -98,24 +99,25 @@ class Freshness:
         self._newest_at = (time.monotonic(), self._time_text())
 
     def stale_problem(self) -> str | None:
-        """Return why the server counts as frozen, None if it does not."""
+        """Return the problem if the server counts as frozen, else None."""
         at, text = self._newest_at
         if time.monotonic() - at <= self._stale_after:
             return None
         return (
-            f"no fresh signed answer since {text}: the server, or a proxy in front of it, repeats old answers. "
-            "Check the server's clock and the path to it"
+            f"no new signed response since {text}: the server or a proxy repeats old responses. "
+            "Check the server's clock and the proxies in front of it"
         )
 
     def announce(self, sequence: int) -> None:
-        """Note the newest sequence that the bus announced for the channel."""
+        """Record a sequence of the channel that an event has announced."""
         if self._announced is None or sequence > self._announced[0]:
             self._announced = (sequence, time.monotonic(), self._time_text())
 
     def behind_remark(self, accepted: int) -> str | None:
-        """Return that the server gives less than the bus announced, None if it keeps up.
+        """Return a remark if the server is behind its announced events, else None.
 
-        accepted: the channel's newest accepted sequence.
+        Args:
+            accepted: highest accepted sequence of the channel.
         """
         if self._announced is None:
             return None
@@ -126,4 +128,4 @@ class Freshness:
             return None
         if age < BEHIND_SECONDS:
             return None
-        return f"the bus announced sequence {sequence} at {text}, and the server's signed answers end at {accepted}"
+        return f"the server is behind its events: sequence {sequence} was announced at {text}, it returns {accepted}"

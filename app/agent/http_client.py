@@ -1,4 +1,4 @@
-"""HTTP to the server: the manifest, the keys, files with ranges and deltas (RFC 9110, RFC 9842), and the status."""
+"""HTTP client of the agent: manifest, keys, files with ranges (RFC 9110) and deltas (RFC 9842), status."""
 
 from __future__ import annotations
 
@@ -29,56 +29,57 @@ else:
 
 API = "/api/v1"
 SIGNATURE = "fleetmap-signature"
+CHECK_ADDRESS = "check the address of the Fleet Map Server"
 OVERLAYS = "fleetmap-overlays"
-"""Header of a map: digest of the closures that were applied to it."""
+"""Response header of a map: digest of the closures that were applied to it."""
 
 TIMEOUT = httpx.Timeout(10.0, read=60.0)
-"""Seconds. A map that takes its server longer is answered with a job."""
+"""Timeouts in seconds. For longer conversions the server returns a job."""
 
 HEAD_SECONDS = 90.0
-"""Until an answer has begun: whoever sends its head byte by byte keeps nobody waiting."""
+"""Time limit for the header of a response; also ends connections that send it byte by byte."""
 
 WATCH_SECONDS = 0.5
 RESPONSE_SECONDS = 300.0
-"""Until a manifest or another small answer has come."""
+"""Time limit for a manifest or another small response."""
 
 PACE_SECONDS = 60.0
 MIN_BYTES_PER_SECOND = 4096
-"""Minimum pace of a response, averaged over each PACE_SECONDS and over the whole. A slower one counts as failed; the
-next attempt continues with what came.
+"""Minimum rate of a response, averaged over each PACE_SECONDS and over the whole response. A slower one counts as
+failed; the next attempt resumes the download.
 """
 
 MAX_MANIFEST_BYTES = 32 * 2**20
 MAX_JSON_BYTES = 4 * 2**20
 MAX_DICTIONARY_BYTES = 64 * 2**20
-"""A larger file is fetched whole: it would be held in memory twice."""
+"""Maximum file size for deltas: decoding holds the file in memory twice."""
 
 MIN_DICTIONARY_BYTES = 8
-"""Zstandard takes no shorter one."""
+"""Minimum dictionary size of Zstandard."""
 
 WINDOW_LOG = 27
-"""The largest window that a delta may ask for: 128 MiB."""
+"""Maximum window of a delta, as a power of two: 128 MiB."""
 
 DCZ_MAGIC = bytes.fromhex("5e2a4d1820000000")
 JOB_SECONDS = 600.0
 MAX_JOBS = 1000
-"""One for each map of a manifest, and then the server loses what it makes."""
+"""Maximum number of conversion jobs for one manifest. More means that the server discards finished maps."""
 
 
 class AgentStopped(Exception):
-    """The agent was told to end."""
+    """Control flow: ``stop`` was called."""
 
 
 class ClosuresChanged(Unavailable):
-    """A file belongs to other closures than its manifest: the manifest is to be fetched again."""
+    """A file has other closures than its manifest: fetch the manifest again."""
 
 
 class UnreadableDelta(Untrusted):
-    """A delta that does not give a file: the complete file is to be fetched."""
+    """A delta that cannot be decoded: fetch the complete file."""
 
 
 class RetryLater(Unavailable):
-    """The server asks to come again after so many seconds."""
+    """The server is busy: retry after ``seconds``."""
 
     def __init__(self, detail: str, seconds: float = 0.0) -> None:
         super().__init__(detail)
@@ -86,7 +87,7 @@ class RetryLater(Unavailable):
 
 
 class _RequestWatchdog:
-    """One thread for all requests of the process: a timer for each would cost more than the request."""
+    """Time limits of all requests, enforced by one thread: a timer per request would cost more than the request."""
 
     def __init__(self) -> None:
         self._due: dict[object, tuple[float, Callable[[], None]]] = {}
@@ -95,7 +96,7 @@ class _RequestWatchdog:
 
     @contextlib.contextmanager
     def within(self, seconds: float, late: Callable[[], None]) -> Iterator[None]:
-        """``late`` is called, in another thread, where the body takes longer than this, by a second at most."""
+        """Call ``late`` in another thread if the ``with`` body takes longer than this, at most one second late."""
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._interrupt_overdue, name="fleetmap-watch", daemon=True)
@@ -120,9 +121,10 @@ _watch = _RequestWatchdog()
 
 
 class ServerClient:
-    """A server, with one token. Methods raise FleetMapError where it says no, or nothing.
+    """HTTP client of one server. Methods raise FleetMapError for error responses and failed connections.
 
-    ca: who signs the server's certificate (PEM); without it, public certification authorities.
+    Args:
+        ca: certification authority of the server (PEM); default: public ones.
     """
 
     def __init__(self, server: str, token: str | None, stopping: threading.Event, ca: Path | None = None) -> None:
@@ -145,39 +147,40 @@ class ServerClient:
         self.failed_deltas = 0
 
     def close(self) -> None:
-        """Let go of the connections."""
+        """Close the connections."""
         self._http.close()
 
     def interrupt(self) -> None:
-        """Whoever waits for an answer waits no longer. From any thread, or a signal's handler."""
+        """Abort requests that wait for a response. Safe to call from any thread or a signal handler."""
         for connection in self._sockets:
             with contextlib.suppress(OSError):
                 socket.socket.shutdown(connection, socket.SHUT_RDWR)
 
-    # --- what is asked ---
+    # --- requests ---
 
     def readyz(self) -> Any:
-        """What the server says of itself; members of ``events`` say where its router is."""
+        """Get the server's readiness document; its member ``events`` has the address of the router."""
         return self._json("/readyz")
 
     def keys(self) -> list[Mapping[str, Any]]:
-        """The keys that sign, the newest first."""
+        """List the signing keys, newest first."""
         body = self._json(f"{API}/keys")
         return [line for line in body if isinstance(line, dict)] if isinstance(body, list) else []
 
     def channels(self, environment: str) -> list[Mapping[str, Any]]:
-        """The channels with what is planned for them, without how the fleet stands."""
+        """List the channels with their planned moves, without the fleet's status."""
         body = self._json(f"{API}/environments/{quote(environment, safe='')}/channels?robots=false")
         if not isinstance(body, list):
-            raise Unavailable(f"{self.server} does not answer as a Fleet Map Server: these are no channels")
+            raise Unavailable(f"unexpected response from {self.server} (channels are not a list): {CHECK_ADDRESS}")
         return [line for line in body if isinstance(line, dict)]
 
     def manifest(
         self, environment: str, ref: str, query: str, etag: str | None = None
     ) -> tuple[bytes, str, str | None] | None:
-        """The signed bytes, the signature, the ETag; None where it is still the one with ``etag``.
+        """Get a manifest: the signed bytes, the signature and the ETag; None if its ETag is still ``etag``.
 
-        query: the encoded parameters of the address.
+        Args:
+            query: encoded query string.
         """
         path = f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?{query}"
         headers = {"If-None-Match": etag} if etag else {}
@@ -192,10 +195,12 @@ class ServerClient:
                     raise self._response_error(answer)
                 location = answer.headers.get("location", "")
             self._wait(path, location)
-        raise Unavailable(f"{self.server} makes the maps again and again, and does not hand them out")
+        raise Unavailable(
+            f"{self.server} did not return the manifest after {MAX_JOBS} conversion jobs: check the server's log"
+        )
 
     def put_status(self, robot: str, body: Mapping[str, Any]) -> None:
-        """Tell the robot's status. What is answered is not read, but where the server does not take it."""
+        """Report the robot's status. The body of a successful response is not read."""
         path = f"{API}/robots/{quote(robot, safe='')}/status"
         with self._stream(path, {"Prefer": "return=minimal"}, dict(body)) as answer:
             if answer.status_code >= 300:
@@ -212,11 +217,11 @@ class ServerClient:
         query: str = "",
         overlays: str | None = None,
     ) -> None:
-        """A file into ``target``, whole and verified. What a break leaves in ``<target>.part`` is gone on from.
+        """Download a file to ``target`` and verify it. Resumes an interrupted download in ``<target>.part``.
 
         Args:
-            old: a file that is here, with its SHA-256, that the server may answer with the difference to.
-            query: encoded parameters of the address.
+            old: installed file with its SHA-256, offered as the dictionary for a delta.
+            query: encoded query string.
             overlays: digest of the closures in the manifest.
 
         Raises:
@@ -244,16 +249,16 @@ class ServerClient:
                 return
             part.unlink(missing_ok=True)
             if overlays is not None and self._overlays not in (None, overlays):
-                raise ClosuresChanged(f"{file.path} has other closures than the manifest")
+                raise ClosuresChanged(f"{file.path} has other closures than its manifest")
             if fresh and complete:
                 break
-            old = None  # a delta, or a part of before, that did not fit: once more from the start
-        raise Untrusted(f"{file.path} has other bytes than the manifest says: it was changed on its way")
+            old = None  # an unusable delta or partial file: once more from the start
+        raise Untrusted(f"hash of {file.path} differs from the manifest: the file was changed in transit")
 
-    # --- inside ---
+    # --- internals ---
 
     def _receive(self, path: str, part: Path, file: ManifestFile, old: tuple[Path, str] | None) -> bool:
-        """Write or go on writing ``part``: whether the server sent the whole file."""
+        """Write or resume ``part``. Return whether the server sent the complete file."""
         start = part.stat().st_size if part.exists() else 0
         if start == file.size and start:
             return False
@@ -266,7 +271,7 @@ class ServerClient:
             if answer.status_code == 416:
                 return False
             if answer.status_code == 202:
-                raise RetryLater(f"the server is still making {file.path}", 2.0)
+                raise RetryLater(f"the server is still converting {file.path}", 2.0)
             if answer.status_code not in (200, 206):
                 raise self._response_error(answer)
             coding = answer.headers.get("content-encoding", "identity").lower()
@@ -276,7 +281,7 @@ class ServerClient:
                 self.deltas += 1
                 return False
             if coding != "identity":
-                raise Unavailable(f"{file.path} came with Content-Encoding {coding}, which was not asked for")
+                raise Unavailable(f"{file.path} has the Content-Encoding {coding!r}, which was not requested")
             going_on = answer.status_code == 206
             self._write(part, "ab" if going_on else "wb", start if going_on else 0, chunks, file, keep=True)
             return not going_on
@@ -285,25 +290,28 @@ class ServerClient:
     def _write(part: Path, mode: str, start: int, chunks: Iterable[bytes], file: ManifestFile, *, keep: bool) -> None:
         written = start
         if not start:
-            part.unlink(missing_ok=True)  # a link that somebody has put here is not followed
+            part.unlink(missing_ok=True)  # never follow a link planted here
         try:
             with part.open(mode) as stream:
                 for chunk in chunks:
                     written += len(chunk)
                     if written > file.size:
-                        break  # more than the manifest says: the size no longer fits, which the caller finds
+                        break  # larger than in the manifest; the caller checks the size
                     stream.write(chunk)
                 stream.flush()
                 os.fsync(stream.fileno())
         except BaseException as error:
-            if not keep or isinstance(error, OSError):  # on a full disk it would only be in the way
+            if not keep or isinstance(error, OSError):  # frees space on a full disk
                 part.unlink(missing_ok=True)
             raise
         if written > file.size:
             part.unlink(missing_ok=True)
 
     def _chunks(self, answer: httpx.Response) -> Iterator[bytes]:
-        """What came, as it came: larger pieces would be lost where the line breaks before they are full."""
+        """Iterate over the body as received: a larger buffer would be lost if the connection breaks.
+
+        Raises Unavailable if the response is slower than MIN_BYTES_PER_SECOND.
+        """
         begun = window = time.monotonic()
         total = since = 0
         for chunk in answer.iter_raw():
@@ -315,8 +323,8 @@ class ServerClient:
                 for count, seconds in ((since, now - window), (total, now - begun)):
                     if count < MIN_BYTES_PER_SECOND * seconds:
                         raise Unavailable(
-                            f"{self.server} has sent {count} bytes in {seconds:.0f} seconds, less than "
-                            f"{MIN_BYTES_PER_SECOND} a second: the download goes on later"
+                            f"{self.server} sent {count} bytes in {seconds:.0f} seconds, less than "
+                            f"{MIN_BYTES_PER_SECOND} bytes per second: the agent resumes the download later"
                         )
                 window, since = now, 0
             yield chunk
@@ -326,9 +334,9 @@ class ServerClient:
         for chunk in self._chunks(answer):
             data += chunk
             if time.monotonic() > end:
-                raise Unavailable(f"{self.server} has not answered within {RESPONSE_SECONDS:g} seconds")
+                raise Unavailable(f"{self.server} did not complete its response within {RESPONSE_SECONDS:g} seconds")
             if len(data) > limit:
-                raise Untrusted(f"the answer has more than {limit} bytes")
+                raise Untrusted(f"response from {self.server} exceeds {limit} bytes")
         return bytes(data)
 
     def _json(self, path: str) -> Any:
@@ -339,16 +347,16 @@ class ServerClient:
         try:
             return json.loads(data)
         except (ValueError, RecursionError):
-            raise Unavailable(f"{self.server} does not answer as a Fleet Map Server: its answer is no JSON") from None
+            raise Unavailable(f"unexpected response from {self.server} (not JSON): {CHECK_ADDRESS}") from None
 
     def _wait(self, path: str, location: str) -> None:
-        """Until the job is done to which ``path`` was answered; its problem where it fails."""
+        """Wait for the job at ``location``, a reference relative to ``path``. Raises Invalid if the job failed."""
         try:
             address = urljoin(path, location)
         except ValueError:
             address = ""
         if not address.startswith("/") or address.startswith("//"):
-            raise Unavailable(f"{self.server} names a job that is not its own")
+            raise Unavailable(f"unexpected response from {self.server} (job on another host): {CHECK_ADDRESS}")
         pause, waited = 0.3, 0.0
         while True:
             job = self._json(address)
@@ -358,9 +366,9 @@ class ServerClient:
             if state not in ("queued", "running"):
                 problem = job.get("problem") if isinstance(job, dict) else None
                 detail = problem.get("detail") if isinstance(problem, dict) else state
-                raise Invalid(f"the server cannot make the maps: {plain(str(detail)[:1000])}")
+                raise Invalid(f"the server cannot convert the maps: {plain(str(detail)[:1000])}")
             if waited > JOB_SECONDS:
-                raise Unavailable(f"the server has not made the maps within {JOB_SECONDS:g} seconds")
+                raise Unavailable(f"the server did not convert the maps within {JOB_SECONDS:g} seconds")
             if self._stopping.wait(pause):
                 raise AgentStopped
             waited += pause
@@ -368,7 +376,7 @@ class ServerClient:
 
     @contextlib.contextmanager
     def _stream(self, path: str, headers: Mapping[str, str], body: Any = None) -> Iterator[httpx.Response]:
-        """GET, or PUT where there is a JSON body."""
+        """Send a GET request, or PUT if there is a JSON body."""
         method = "GET" if body is None else "PUT"
         request = self._http.build_request(
             method, path, headers=dict(headers), json=body, extensions={"trace": self._note}
@@ -380,7 +388,7 @@ class ServerClient:
                 yield answer
 
     def _note(self, event: str, details: Mapping[str, Any]) -> None:
-        """Remember the connections, to be able to interrupt them."""
+        """Store the sockets of open connections for ``interrupt``."""
         if event in ("connection.connect_tcp.complete", "connection.start_tls.complete"):
             connection = details["return_value"].get_extra_info("socket")
             if isinstance(connection, socket.socket):
@@ -395,19 +403,19 @@ class ServerClient:
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             if self._stopping.is_set():
                 raise AgentStopped from None
-            raise Unavailable(f"no answer from {self.server}: {error or type(error).__name__}") from None
+            raise Unavailable(f"no response from {self.server}: {error or type(error).__name__}") from None
 
     def _response_error(self, answer: httpx.Response) -> FleetMapError:
-        """The server's problem as an error of ours."""
+        """Return the error for an error response."""
         status, detail = answer.status_code, ""
         try:
             problem = json.loads(self._read_all(answer, MAX_JSON_BYTES))
             detail = str(problem.get("detail") or problem.get("title") or "") if isinstance(problem, dict) else ""
         except (ValueError, RecursionError, httpx.HTTPError, FleetMapError):
             detail = ""
-        detail = plain(detail[:1000]) or f"{self.server} answered {status}"
+        detail = plain(detail[:1000]) or f"{self.server} returned status {status}"
         if 300 <= status < 400 and (elsewhere := answer.headers.get("location")):
-            detail = f"{self.server} sends to {elsewhere[:300]}: if the server has moved, name it so with --server"
+            detail = f"{self.server} redirects to {elsewhere[:300]}: if the server has moved, change --server"
         if status in (429, 503):
             try:
                 seconds = float(answer.headers.get("retry-after", "0"))
@@ -422,7 +430,7 @@ class ServerClient:
 
 
 def plain(text: str) -> str:
-    """Replace what UTF-8 cannot encode: JSON of a server may hold half a surrogate pair."""
+    """Replace lone surrogates, which JSON may contain and UTF-8 cannot encode."""
     return text.encode("utf-8", "replace").decode()
 
 
@@ -436,12 +444,12 @@ def _complete(part: Path, file: ManifestFile) -> bool:
 
 
 def _fits(old: int, new: int) -> bool:
-    """Whether a file of so many bytes is asked for as the difference to one of so many."""
+    """Whether to request a delta, by the sizes of the old and the new file in bytes."""
     return old >= MIN_DICTIONARY_BYTES and max(old, new) <= MAX_DICTIONARY_BYTES
 
 
 def _decode(chunks: Iterator[bytes], old: tuple[Path, str], file: ManifestFile) -> Iterator[bytes]:
-    """The new file of a ``dcz`` body, in pieces; never much more than the manifest's size."""
+    """Decode a ``dcz`` body chunk by chunk. Raises UnreadableDelta, also if it exceeds the size in the manifest."""
     old_path, sha256 = old
     want = DCZ_MAGIC + bytes.fromhex(sha256)
     head = b""
@@ -450,7 +458,7 @@ def _decode(chunks: Iterator[bytes], old: tuple[Path, str], file: ManifestFile) 
         if len(head) >= len(want):
             break
     if head[: len(want)] != want:
-        raise UnreadableDelta(f"{file.path}: the delta is not one to the file that is here")
+        raise UnreadableDelta(f"{file.path}: the delta does not apply to the installed file")
     decoder = zstd.ZstdDecompressor(
         zstd.ZstdDict(old_path.read_bytes(), is_raw=True).as_prefix,
         options={zstd.DecompressionParameter.window_log_max: WINDOW_LOG},
@@ -462,9 +470,9 @@ def _decode(chunks: Iterator[bytes], old: tuple[Path, str], file: ManifestFile) 
             out = decoder.decompress(data, max_length=1 << 20)
             size += len(out)
             if size > file.size:
-                raise UnreadableDelta(f"{file.path}: the delta unfolds to more bytes than the manifest says")
+                raise UnreadableDelta(f"{file.path}: the decoded delta exceeds the size in the manifest")
             if out:
                 yield out
             data = b"" if not decoder.needs_input else next(chunks, None)
     except zstd.ZstdError as error:
-        raise UnreadableDelta(f"{file.path}: the delta cannot be read: {error}") from None
+        raise UnreadableDelta(f"{file.path}: invalid delta: {error}") from None

@@ -1,4 +1,4 @@
-"""Levels of the installed map: ``levels.json``, the level that the robot is on, and loading another one."""
+"""Levels of the installed map: read and store the robot's level, and load another one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_LEVEL_BYTES = 4096
 
 
 def level_names(manifest: Manifest) -> list[str]:
-    """Return the names of a map's levels, lowest first."""
+    """Return the level names of a map, lowest first."""
     return [level.name for level in manifest.levels]
 
 
@@ -28,7 +28,7 @@ def level_files(manifest: Manifest, level: str) -> list[str]:
 
 
 def read_level(folder: MapDirectory) -> str | None:
-    """Return the level that the robot is on, None if none was ever chosen."""
+    """Return the robot's level; None if it was never set."""
     try:
         return (folder.path / "level").read_bytes()[:MAX_LEVEL_BYTES].decode(errors="replace").strip("\n") or None
     except FileNotFoundError:
@@ -36,12 +36,12 @@ def read_level(folder: MapDirectory) -> str | None:
 
 
 def level_problem(manifest: Manifest, level: str | None) -> str | None:
-    """Return why a robot on this level cannot load a map, None if it can."""
+    """Return the problem of a robot on this level with a map, None if it can load the map."""
     if level is None or level in level_names(manifest):
         return None
     names = ", ".join(level_names(manifest)) or "none"
     return (
-        f"the robot is on level {level!r}, which version {manifest.version} does not have (levels: {names}): "
+        f"version {manifest.version} has no level {level!r}, which the robot is on (levels: {names}): "
         "choose another with fleetmap agent-level"
     )
 
@@ -77,15 +77,15 @@ def load_level(
     variables: Callable[[MapDirectory, Manifest, Sequence[str], Sequence[str], str | None, str], Mapping[str, str]],
     log: Callable[..., None],
 ) -> None:
-    """Run the agent's hooks for one level of the current map, and remember the level.
+    """Run the agent's hooks for one level of the current map, and store the level.
 
-    The agent may run meanwhile: its hooks and these wait for each other.
+    The agent may be running: a lock keeps its hooks and these apart.
 
     Args:
         variables: builds the hook variables from directory, manifest, changed files and layers, level and robot.
 
     Raises:
-        NotFound: there is no map, or it has no such level; names those it has.
+        NotFound: no map is installed, or it has no such level.
         Conflict: no agent has run in the directory, or it belongs to another user.
         Unavailable: a hook failed; the level stays as it was.
     """
@@ -94,16 +94,16 @@ def load_level(
     with folder.hooks_lock():
         manifest = folder.manifest(folder.current_version)
         if manifest is None:
-            raise NotFound(f"{directory} holds no map yet: wait for the agent's first sync")
+            raise NotFound(f"no map in {directory} yet: wait for the agent's first sync")
         names = level_names(manifest)
         if level not in names:
-            choice = f"choose one of {', '.join(names)}" if names else "the server lists no levels"
+            choice = f"choose one of {', '.join(names)}" if names else "the map has no levels"
             raise NotFound(f"unknown level {level[:80]!r}: {choice}")
         folder.hook_status.unlink(missing_ok=True)
         values = variables(folder, manifest, level_files(manifest, level), sorted(manifest.layers), level, robot)
         for command in commands:
             if (problem := hooks.run(command, values)) is not None:
-                raise Unavailable(f"level {level} is not loaded: {problem}")
+                raise Unavailable(f"could not load level {level}: {problem}")
             log("hook", command=command, version=manifest.version, level=level)
         write_durably(folder.path / "level", level.encode() + b"\n")
         log("level", level=level, version=manifest.version)
@@ -116,11 +116,11 @@ def _read_hooks(path: Path) -> tuple[list[str], str]:
             body: Any = json.loads(stream.read())
         commands, robot = body["on_change"], body["robot"]
         if not isinstance(robot, str) or not all(isinstance(command, str) for command in commands):
-            raise TypeError("a command is not a text")
+            raise TypeError("a command is not a string")
     except FileNotFoundError:
         raise Conflict(f"no agent has run in {path.parent}: start fleetmap agent --into {path.parent} first") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise Invalid(f"{path} cannot be read ({error}): restart the agent, which writes it again") from None
+        raise Invalid(f"could not read {path} ({error}): restart the agent, which writes it again") from None
     if owner not in (0, os.geteuid()):
-        raise Conflict(f"{path} belongs to user {owner}, and its commands would run as you: run this as that user")
+        raise Conflict(f"{path} belongs to user id {owner}: run this command as that user")
     return commands, robot

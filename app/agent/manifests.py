@@ -1,4 +1,4 @@
-"""Signed manifests: fetched, verified, and compared with what was accepted before."""
+"""Fetch signed manifests, verify them and compare them with those accepted before."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class Manifests:
         self._latest: tuple[str, str | None, Manifest] | None = None
 
     def fetch_latest(self, channel: str, accept: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
-        """Fetch the channel's manifest: None if the installed one is still it, or it is not accepted.
+        """Fetch the channel's manifest; None if it has not changed or ``accept`` returns False.
 
         Raises:
-            Untrusted: it must not be used.
+            Untrusted: the manifest must not be used.
         """
         request_key = f"{channel}?{self._query}"
         state, now = self._store.value, self._clock.now()
@@ -55,7 +55,7 @@ class Manifests:
         installed = self._folder.manifest(self._folder.current_version)
         etag, cached = None, None
         if state.asked == request_key and state.expires > now and installed is not None and installed.mark == mark:
-            etag = state.etag  # else "not modified" would be said of a map that is not installed
+            etag = state.etag  # only then: 304 must mean that this map is installed
         elif self._latest is not None and self._latest[0] == request_key:
             _, latest_etag, manifest = self._latest
             if manifest.mark == mark and manifest.expires.timestamp() > now:
@@ -68,7 +68,7 @@ class Manifests:
             self._freshness.observe(manifest, self._clock.local)
         if not accept(manifest):
             return None
-        if state.key is not None and state.key != key:  # endorsed: what an old key signed is no measure any more
+        if state.key is not None and state.key != key:  # an endorsed new key: positions of the old one do not count
             state = dataclasses.replace(state, marks={})
             self._clock.floor = 0.0
         self._clock.observe(manifest)
@@ -93,11 +93,11 @@ class Manifests:
             raise Unavailable(f"the server did not return the manifest of version {version}")
         manifest, _ = self._verify(response[0], response[1], None, None)
         if manifest.version != version:
-            raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
+            raise Untrusted(f"the server returned the manifest of version {manifest.version} instead of {version}")
         return manifest
 
     def note_installed(self, manifest: Manifest) -> None:
-        """Note the ETag of the manifest that is now the current one."""
+        """Store the ETag of the installed manifest."""
         request_key, etag, latest = self._latest or ("", None, None)
         if latest is not None and latest.data == manifest.data:
             self._store.set(etag=etag, asked=request_key, expires=manifest.expires.timestamp())
@@ -109,24 +109,24 @@ class Manifests:
 
     @property
     def overlays_digest(self) -> str | None:
-        """Digest of the closures of the newest manifest, None if there is none or the server applies none."""
+        """Digest of the closures of the newest manifest; None without a manifest or if the server applies none."""
         return self._latest[2].overlays_digest if self._latest else None
 
     @property
     def has_closures(self) -> bool:
-        """Whether the server applies closures, by the newest manifest."""
+        """Whether the server applies closures, according to the newest manifest."""
         manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.current_version)
         return manifest is not None and manifest.overlays_digest is not None
 
     def missing_remark(self, manifest: Manifest) -> str | None:
-        """Return which optional formats a map lacks and why, None if it has all."""
+        """Return a remark about missing optional formats with their reasons; None if none is missing."""
         present = {file.format for file in manifest.files}
         lacking = [name for name in self._optional if name not in present]
         reasons = [f"{name} ({manifest.missing[name]})" if name in manifest.missing else name for name in lacking]
-        return f"without optional {', '.join(reasons)}" if reasons else None
+        return f"missing optional formats: {', '.join(reasons)}" if reasons else None
 
     def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
-        """Return a manifest and the key that signed it. Raises Untrusted."""
+        """Verify a manifest; return it and the key that signed it. Raises Untrusted."""
         state = self._store.value
         key = signed_manifest.verify_signature(data, signature, state.key, state.given, self._web.keys)
         manifest = signed_manifest.parse(data, signature)
@@ -138,7 +138,7 @@ class Manifests:
             optional=self._optional,
             parameters=self._parameters,
             mark=mark if state.key in (None, key) else None,
-            # What an old key signed is no measure for a new one.
+            # Positions and times that an old key signed do not apply to a new key.
             now=datetime.fromtimestamp(
                 self._clock.now() if state.key in (None, key) else self._clock.local, timezone.utc
             ),

@@ -1,17 +1,18 @@
-"""What stands on the robot's disk.
+"""Map directory on the robot's disk.
 
 ::
 
-    DIR/current -> versions/7-9f3c21aa       switched by one rename: what it names is always whole and verified
+    DIR/current -> versions/7-9f3c21aa       switched by one rename: always a complete, verified version
     DIR/versions/7-9f3c21aa/<format>/<file>  with manifest.json, manifest.sig, environment.sh, closures.json
                                              and levels.json
     DIR/versions/7-9f3c21aa-0b12cd34         the same root with closures of this digest in force
-    DIR/partial/<sha256>[.part]              what was fetched, whole or not yet
-    DIR/state.json, DIR/lock, DIR/changed    the last: what the hooks were told that changed
-    DIR/hooks.json, DIR/hooks.lock           the hooks, for agent-level; held while they run
-    DIR/hook-status, DIR/level               what the hooks did; the level that the robot is on
+    DIR/partial/<sha256>[.part]              complete and partial downloads
+    DIR/state.json, DIR/lock                 persistent state; lock of the running agent
+    DIR/changed                              changed files, as listed for the hooks
+    DIR/hooks.json, DIR/hooks.lock           hooks for `fleetmap agent-level`; lock while hooks run
+    DIR/hook-status, DIR/level               results of the hooks' steps; the robot's level
 
-Files that did not change are hard links to those of the version before, so they are read-only.
+Unchanged files are hard links to those of the previous version, so they are read-only.
 """
 
 from __future__ import annotations
@@ -35,20 +36,20 @@ from app.agent.state import digest, sync_folder, write_atomically
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
 OLD_VERSIONS_KEPT = 2
-"""Old versions that stay, beside the current one."""
+"""Number of old versions to keep besides the current one."""
 
 LOCK_SECONDS = 1.0
-"""How long the lock is waited for: a child that a killed agent was about to start holds it until it has started."""
+"""Maximum time to wait for the lock: a child process that a killed agent was starting may hold it until it runs."""
 
 HOOKS_LOCK_SECONDS = 0.1
-"""Interval between two attempts to get the lock for hooks."""
+"""Interval between two attempts to get a lock."""
 
 READ_ONLY = 0o444
 CHUNK = 1 << 20
 
 
 class MapDirectory:
-    """One robot's folder of one environment. Only one agent has it at a time."""
+    """Installed maps of one environment. Locked by one agent at a time."""
 
     def __init__(self, path: Path) -> None:
         self.path = path.absolute()
@@ -58,7 +59,7 @@ class MapDirectory:
         self.state = self.path / "state.json"
         self.hook_status = self.path / "hook-status"
         self.protected: frozenset[str] = frozenset()
-        """Names of versions that are never removed: they may be switched to again."""
+        """Version folders that must not be removed, because the agent may still switch to them."""
         self._lock: IO[str] | None = None
 
     def _wait_for_lock(self, handle: IO[str]) -> None:
@@ -68,15 +69,18 @@ class MapDirectory:
                 return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 if time.monotonic() > deadline:
-                    raise Conflict(f"another agent keeps {self.path}") from None
+                    raise Conflict(f"another agent uses {self.path}: use another directory") from None
                 time.sleep(HOOKS_LOCK_SECONDS)
 
     def open(self) -> None:
-        """Make what is absent and take the lock; Conflict where another agent has it."""
+        """Create missing folders and take the lock.
+
+        Raises Conflict if another agent holds it or ``current`` is not a link, Invalid if the disk has no locks.
+        """
         for folder in (self.path, self.versions, self.partial):
             folder.mkdir(parents=True, exist_ok=True)
         if self.current.exists() and not self.current.is_symlink():
-            raise Conflict(f"{self.current} is there and is not an agent's link: use another folder")
+            raise Conflict(f"{self.current} already exists and is not a link: use another directory")
         handle = (self.path / "lock").open("a")
         try:
             self._wait_for_lock(handle)
@@ -85,14 +89,14 @@ class MapDirectory:
             raise
         except OSError as error:
             handle.close()
-            raise Invalid(f"{self.path} cannot be locked ({error.strerror}): use a folder on another disk") from None
+            raise Invalid(f"could not lock {self.path} ({error.strerror}): use a directory on another disk") from None
         self._lock = handle
         for left in self.versions.glob(".*"):
             shutil.rmtree(left, ignore_errors=True)
 
     @contextlib.contextmanager
     def hooks_lock(self, stopping: threading.Event | None = None) -> Iterator[None]:
-        """Wait until no other process runs hooks of this directory, and hold that. Raises Stopped."""
+        """Hold the lock for running hooks; wait for other processes. Raises AgentStopped."""
         with (self.path / "hooks.lock").open("a") as handle:
             while True:
                 try:
@@ -106,16 +110,16 @@ class MapDirectory:
             yield
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Release the lock."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
-    # --- what is there ---
+    # --- reading ---
 
     @property
     def current_version(self) -> str | None:
-        """The name of the version that ``current`` points to."""
+        """Name of the version folder that ``current`` points to."""
         try:
             target = self.current.readlink()
         except OSError:
@@ -123,7 +127,7 @@ class MapDirectory:
         return target.name if target == Path("versions") / target.name else None
 
     def manifest(self, name: str | None) -> Manifest | None:
-        """The manifest of a version that is there."""
+        """Return the manifest of a version folder; None if it is absent or invalid."""
         if name is None:
             return None
         path = self.versions / name
@@ -133,15 +137,15 @@ class MapDirectory:
             return None
 
     def damaged_files(self, name: str, manifest: Manifest) -> list[str]:
-        """Files of a version that are absent or have other bytes than their manifest says."""
+        """Return the files of a version that are missing or differ from their hash."""
         return [file.path for file in manifest.files if not _has_content(self.versions / name / file.path, file)]
 
     def is_complete(self, file: ManifestFile) -> Path:
-        """Where a fetched file lies once it is whole and verified."""
+        """Return the path of a file once it is completely downloaded and verified."""
         return self.partial / file.sha256
 
     def index(self) -> dict[str, list[Path]]:
-        """SHA-256 -> files of the versions that are there, as their manifests tell; not verified yet."""
+        """Return SHA-256 -> files of all versions on disk, from their manifests. Not verified."""
         paths: dict[str, list[Path]] = {}
         for name in self._names():
             manifest = self.manifest(name)
@@ -150,15 +154,15 @@ class MapDirectory:
         return paths
 
     def find_local_copy(self, file: ManifestFile, index: Mapping[str, Sequence[Path]]) -> Path | None:
-        """A file with these bytes, fetched or of a version that is there; its hash is verified now."""
+        """Return a downloaded or installed file with this content, after verifying its hash; None if there is none."""
         fetched = self.is_complete(file)
         if _has_content(fetched, file):
             return fetched
-        fetched.unlink(missing_ok=True)  # damaged while it lay here
+        fetched.unlink(missing_ok=True)  # damaged on disk
         return next((path for path in index.get(file.sha256, ()) if _has_content(path, file)), None)
 
     def delta_base(self, file: ManifestFile, installed: Mapping[str, ManifestFile]) -> tuple[Path, str] | None:
-        """The file of this name that is installed, with its hash: a dictionary for a delta."""
+        """Return the installed file of this path with its hash, as the dictionary of a delta."""
         old = installed.get(file.path)
         standing = self.current_version
         if old is None or standing is None:
@@ -167,10 +171,10 @@ class MapDirectory:
         return (path, old.sha256) if _has_content(path, old) else None
 
     def make_room(self, manifest: Manifest, sources: Mapping[str, Path], keep: Sequence[ManifestFile] = ()) -> None:
-        """See that those of a manifest's files fit that are not among ``sources``, less what was fetched of them.
+        """Free disk space for the files of a manifest that are not in ``sources``.
 
-        Where they do not: without parts of other maps, then without old versions, then without what lies ready for a
-        later map (``keep``). Unavailable where that is not enough.
+        If needed, removes partial downloads of other maps, then old versions, then the files of a planned map
+        (``keep``). Raises Unavailable if that is not enough.
         """
         new_files = {file.sha256: file for file in manifest.files if file.path not in sources}.values()
         count = sum(file.size - min(file.size, self._partial_size(file)) for file in new_files) + CHUNK
@@ -183,7 +187,7 @@ class MapDirectory:
             if self._free() < count:
                 step()
         if (free := self._free()) < count:
-            raise Unavailable(f"the new map needs {count} bytes more and {self.path} has {free} left")
+            raise Unavailable(f"not enough disk space in {self.path}: the new map needs {count} bytes, {free} are free")
 
     def _free(self) -> int:
         return shutil.disk_usage(self.path).free
@@ -194,20 +198,24 @@ class MapDirectory:
         except OSError:
             return 0
 
-    # --- what changes ---
+    # --- changing ---
 
     def describe(self, name: str, manifest: Manifest) -> None:
-        """A newer manifest of a version that is there: the same files under a later sequence or expiry."""
+        """Store a newer manifest of an existing version: the same files with a later sequence or expiry."""
         self._describe(self.versions / name, manifest)
 
     def refresh(self, name: str, manifest: Manifest) -> None:
-        """Write what describes a version again if the directory was moved, or an older agent wrote it."""
+        """Rewrite the descriptive files of a version if the directory was moved or an older agent wrote them."""
         for path, data in self._descriptions(self.versions / name, manifest):
             if not path.exists() or path.read_bytes() != data:
                 write_atomically(path, data)
 
     def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
-        """A version's folder, whole and on the disk, not yet current: its name. sources: path -> verified file."""
+        """Build a complete version folder, synced to disk, and return its name. ``current`` does not change.
+
+        Args:
+            sources: path -> verified file.
+        """
         base = f"{manifest.version}-{manifest.root[:8]}"
         if manifest.closures_key:
             base += f"-{manifest.closures_key[:8]}"
@@ -230,7 +238,7 @@ class MapDirectory:
                 name = f"{base}.{count}"
             staging.rename(self.versions / name)
         except OSError:
-            shutil.rmtree(staging, ignore_errors=True)  # on a full disk it would only be in the way
+            shutil.rmtree(staging, ignore_errors=True)  # frees space on a full disk
             raise
         sync_folder(self.versions)
         return name
@@ -244,7 +252,8 @@ class MapDirectory:
             folders |= {parent for parent in target.parents if staging in parent.parents}
             if os.path.lexists(target):
                 raise Conflict(
-                    f"{file.path} and another file of the map have one name on the file system of {self.path}"
+                    f"{file.path} and another file of the map have the same name on the file system of {self.path}: "
+                    "use a case-sensitive file system"
                 )
             _link(sources[file.path], target)
         self._describe(staging, manifest)
@@ -252,7 +261,7 @@ class MapDirectory:
             sync_folder(folder)
 
     def switch(self, name: str) -> None:
-        """Make a built version the current one, at once."""
+        """Switch ``current`` to a built version atomically."""
         now = time.time()
         os.utime(self.versions / name, (now, now))
         link = self.path / ".current.new"
@@ -262,23 +271,23 @@ class MapDirectory:
         sync_folder(self.path)
 
     def prune(self, keep: Iterable[ManifestFile] = ()) -> None:
-        """Remove versions beyond the kept ones, and fetched files but those to keep."""
+        """Remove old versions beyond OLD_VERSIONS_KEPT, and downloads not in ``keep``."""
         self._drop(OLD_VERSIONS_KEPT)
         self._forget(keep)
 
     def free_space(self) -> None:
-        """Keep nothing but what stands: for a disk that is full."""
+        """Remove all old versions and downloads, for a full disk."""
         self._drop(0)
         self._forget(())
 
     def _drop(self, keep_count: int, needed: Iterable[Path] = ()) -> None:
-        """Remove versions beside the current one but so many, the last used ones, and those of needed files."""
+        """Remove old versions except the ``keep_count`` last used ones, protected ones and those of needed files."""
         spared = {self.current_version} | {
             p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents
         }
         old = [name for name in self._names() if name not in spared]
         removable = [name for name in old if name not in self.protected]
-        # Folders that differ in closures alone share a root: they do not push out the version before.
+        # Folders that differ only in closures share a root and count once.
         roots = {_root_name(name) for name in old if name in self.protected}
         standing = _root_name(self.current_version or "")
         roots.discard(standing)
@@ -299,26 +308,26 @@ class MapDirectory:
             shutil.rmtree(trash, ignore_errors=True)
 
     def _forget(self, keep: Iterable[ManifestFile]) -> None:
-        """Remove fetched files, and parts, but those to keep."""
+        """Remove complete and partial downloads, except those in ``keep``."""
         hashes = {file.sha256 for file in keep}
         for path in self.partial.iterdir():
             if path.name.removesuffix(".part") not in hashes:
                 path.unlink(missing_ok=True)
 
     def _names(self) -> list[str]:
-        """Versions that are there, the last used first."""
+        """Return the names of version folders, last used first."""
         folders = [p for p in self.versions.iterdir() if p.is_dir() and not p.name.startswith(".")]
         return [p.name for p in sorted(folders, key=lambda p: (-p.stat().st_mtime, p.name))]
 
     def _describe(self, folder: Path, manifest: Manifest) -> None:
-        """Write the manifest, and what follows from it, into a version's folder."""
+        """Write the manifest and the descriptive files into a version folder."""
         write_atomically(folder / "manifest.sig", manifest.signature.encode() + b"\n")
         for path, data in self._descriptions(folder, manifest):
             write_atomically(path, data)
         write_atomically(folder / "manifest.json", manifest.data)
 
     def _descriptions(self, folder: Path, manifest: Manifest) -> list[tuple[Path, bytes]]:
-        """Return the files that describe a version to others than the agent."""
+        """Return path and content of the files that describe a version to other programs."""
         return [
             (folder / "environment.sh", environment_sh(manifest, self.current).encode()),
             (folder / "closures.json", closures_json(manifest)),
@@ -327,7 +336,7 @@ class MapDirectory:
 
 
 def _root_name(name: str) -> str:
-    """Return the part of a folder's name that says version and root."""
+    """Return the part of a folder name with version and root."""
     return "-".join(name.partition(".")[0].split("-")[:2])
 
 
@@ -341,7 +350,7 @@ def _has_content(path: Path, file: ManifestFile) -> bool:
 def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
-    except OSError:  # a file system without links, or with too many to this file
+    except OSError:  # no hard links on this file system, or too many to this file
         shutil.copyfile(source, target)
         with target.open("rb+") as stream:
             os.fsync(stream.fileno())
@@ -355,7 +364,7 @@ TEMPLATE: Sequence[tuple[str, str, Sequence[str]]] = (
     ("NOGO_COSTMAP_YAML_FILE", "occupancy_grid", ("nogo.yaml", "keepout.yaml")),
     ("GAZEBO_WORLD_FILE", "gazebo", ("world.sdf",)),
 )
-"""environment_template's variables: name, format, file names in the order of preference."""
+"""Variables of environment_template: name, format, file names in order of preference."""
 
 
 PLACE: Sequence[str] = (
@@ -366,14 +375,14 @@ PLACE: Sequence[str] = (
     "FIELD_ID",
     "FIELD_TYPE",
 )
-"""What the template calls the place by."""
+"""Variables of environment_template that name the environment."""
 
 
 def environment_sh(manifest: Manifest, current: Path) -> str:
-    """``environment.sh``: the environment_template's variables for the files that are there, and the place's own ones.
+    """Return ``environment.sh``: variables of environment_template for the installed files, and the environment's own.
 
-    As in the template a variable is empty where its file is absent, so that sourcing it again leaves nothing stale. All
-    values are literals in single quotes: whoever names a file does not run anything.
+    As in the template, the variable of an absent file is empty, so that sourcing it again leaves no stale values. All
+    values are quoted literals, so that file names cannot run commands.
     """
     names_by_format: dict[str, list[str]] = {}
     for file in manifest.files:
@@ -410,7 +419,7 @@ def environment_sh(manifest: Manifest, current: Path) -> str:
 
 
 def _level_variables(manifest: Manifest, current: Path) -> dict[str, str]:
-    """Return the template's variables for each level with files of its own, as ``COSTMAP_YAML_FILE_L2``."""
+    """Return the template's variables of each level with separate files, such as ``COSTMAP_YAML_FILE_L2``."""
     values: dict[str, str] = {}
     for level in manifest.levels:
         suffix = re.sub(r"[^A-Z0-9]", "_", level.name.upper())

@@ -16,16 +16,16 @@ POLL_SECONDS = 60.0
 
 @dataclass(frozen=True, slots=True)
 class AgentOptions:
-    """How to run.
+    """Options of one agent.
 
     Attributes:
         channel: None follows ``production`` if it exists, else ``latest``.
-        formats, optional: entries as ``occupancy_grid?level=L2``; optional ones are installed if the server has them.
+        formats, optional: entries such as ``occupancy_grid?level=L2``; optional ones are installed if available.
         before_switch: commands that decide when the robot may switch to a new map.
         on_change: commands that load a map after the switch.
         key: server key to trust at first contact.
-        zenoh_login: at the router; a password without a user is the robot's.
-        ca: authority that signed the server's certificate.
+        zenoh_login: credentials for the router; the default user of a password is the robot's name.
+        ca: certification authority of the server (PEM).
     """
 
     server: str
@@ -48,8 +48,8 @@ class AgentOptions:
 
 
 def robot_name(text: str | None = None) -> str:
-    """Return a robot name that can be part of a key; default: the host's name. Raises Invalid."""
+    """Return a valid robot name; default: derived from the host name. Raises Invalid."""
     name = text or re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-") or "robot"
     if not messages.ROBOT_NAME.fullmatch(name):
-        raise Invalid(f"a robot's name is of letters, digits, dots, - and _, got {name!r}")
+        raise Invalid(f"invalid robot name {name[:80]!r}: use letters, digits, dots, - and _")
     return name

@@ -1,4 +1,4 @@
-"""Formats that an agent requests, each with its own parameters: ``occupancy_grid?level=L2&grid=map,tmap2``."""
+"""Format requests of the agent, each with its parameters: ``occupancy_grid?level=L2&grid=map,tmap2``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class FormatRequest:
 
     @property
     def entry(self) -> str:
-        """Its text in the list of a manifest request, not yet encoded for the address."""
+        """Entry in the format list of a manifest request, not yet percent-encoded."""
         query = "&".join(f"{quote(name, safe='')}={quote(value, safe='')}" for name, value in self.parameters)
         return f"{self.name}?{query}" if query else self.name
 
@@ -32,24 +32,24 @@ def parse_formats(text: str) -> tuple[str, ...]:
 
 
 def parse_requests(required: Sequence[str], optional: Sequence[str]) -> tuple[FormatRequest, ...]:
-    """Parse the entries of ``--formats`` and ``--optional``. Raises Invalid if a format is invalid or named twice."""
+    """Parse the entries of ``--formats`` and ``--optional``. Raises Invalid if a format is invalid or a duplicate."""
     requests: dict[str, FormatRequest] = {}
     for entry in (*required, *optional):
         name, _, query = entry.partition("?")
         if not _FORMAT.fullmatch(name):
             raise Invalid(
-                f"invalid format {entry[:80]!r}: write NAME or NAME?PARAMETER=VALUE, as occupancy_grid?level=L2"
+                f"invalid format {entry[:80]!r}: use NAME or NAME?PARAMETER=VALUE, such as occupancy_grid?level=L2"
             )
         if name in requests:
             raise Invalid(f"duplicate format {name}: name each format once, in --formats or in --optional")
         try:
             parameters = tuple(parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query)))
         except ValueError:
-            raise Invalid(f"invalid parameters {query[:80]!r}: write PARAMETER=VALUE, joined by &") from None
+            raise Invalid(f"invalid parameters {query[:80]!r}: use PARAMETER=VALUE, separated by &") from None
         requests[name] = FormatRequest(name, parameters)
     return tuple(requests.values())
 
 
 def encode_entries(requests: Sequence[FormatRequest]) -> str:
-    """Return the value of the address parameter ``formats`` or ``optional``."""
+    """Return the value of the query parameter ``formats`` or ``optional``."""
     return ",".join(quote(request.entry, safe="") for request in requests)

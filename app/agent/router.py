@@ -1,4 +1,4 @@
-"""The Zenoh router that the agent connects to: given by its options, or by the server."""
+"""Address of the Zenoh router: from the agent's options, else from the server."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from app.errors import FleetMapError, Invalid
 from app.events import messages
 
 ROUTER = re.compile(r"(tcp|tls|quic|udp|ws|wss)/[A-Za-z0-9_.:%\[\]-]+")
-"""A router as a server may name it: no device, no local socket, nothing (``#…``) that would weaken the robot's TLS."""
+"""Router address accepted from a server: no device, no local socket, no ``#…`` that could weaken the robot's TLS."""
 
 
 def find_router(options: AgentOptions, web: ServerClient, *, has_endpoint: bool) -> tuple[str, str] | None:
-    """Return the router's addresses and the start of its keys; None to stay with those of before.
+    """Return the router addresses and the key prefix; None to keep the present ones.
 
-    has_endpoint: whether there are such. Raises Invalid if the server names no router, or by no plain address.
+    Args:
+        has_endpoint: whether addresses are already set.
+
+    Raises Invalid if the server announces no router or an unsupported address.
     """
     connect, prefix = options.zenoh_connect, options.zenoh_prefix
     if connect is None or prefix is None:
@@ -30,8 +33,7 @@ def find_router(options: AgentOptions, web: ServerClient, *, has_endpoint: bool)
                 return None
             prefix = prefix or messages.PREFIX
     if connect is None:
-        raise Invalid("the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
+        raise Invalid("the server announces no Zenoh router: set FLEETMAP_ZENOH_CONNECT, or rely on polling")
     if options.zenoh_connect is None and not all(ROUTER.fullmatch(part.strip()) for part in connect.split(",")):
-        detail = f"the server tells a router by what is no plain address ({connect[:300]}): FLEETMAP_ZENOH_CONNECT"
-        raise Invalid(f"{detail} can name it")
+        raise Invalid(f"unsupported router address from the server {connect[:300]!r}: set FLEETMAP_ZENOH_CONNECT")
     return connect, prefix

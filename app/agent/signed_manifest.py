@@ -1,8 +1,11 @@
-"""What a robot believes: a manifest signed by the pinned key, of its environment and channel, fresh, never older.
+"""Parse and verify signed manifests.
 
-Attacks that this refuses, in the words of The Update Framework: rollback (a lower sequence), freeze (an expired
-manifest), mix-and-match (files of different versions: all hashes stand in one signed list), arbitrary bytes, and a
-foreign key. A new key is taken only with the endorsement of the pinned one.
+A manifest is accepted if it is signed by the pinned key, belongs to the robot's environment and channel, has not
+expired and is not older than the newest accepted one. A new key is accepted only if the pinned one endorses it.
+
+Attacks that this prevents, as named by The Update Framework: rollback (a lower sequence), freeze (an expired manifest),
+mix-and-match (files of different versions; prevented by one signed list of all hashes), arbitrary software (other
+bytes, or a foreign key).
 """
 
 from __future__ import annotations
@@ -25,15 +28,15 @@ from app.agent.state import AgentState, Mark
 from app.errors import Untrusted
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
-"""How far a robot's clock may be from the server's."""
+"""Maximum difference between the robot's clock and the server's."""
 
 MAX_SEQUENCE_AHEAD = 10**9
-"""Maximum distance of a manifest's sequence from the highest accepted one: a stolen key cannot make all later ones look
-old with a single manifest.
+"""Maximum lead of a manifest's sequence over the highest accepted one: one manifest signed with a stolen key must not
+make all later manifests look old.
 """
 
 MAX_EPOCH_AHEAD = 2**32
-"""The same for epochs, with room for those that are a time in seconds."""
+"""Maximum lead of an epoch; large enough for epochs that are a time in seconds."""
 
 MAX_ELEVATION_METRES = 1e6
 MAX_FILES = 100_000
@@ -51,12 +54,17 @@ _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 _FORBIDDEN = re.compile(
     r"PATH|ENV|IFS|HOME|SHELL|(LD|DYLD|BASH|GIT|SSH|FLEETMAP)_\w*|PYTHON\w*|\w*_PRELOAD|\w*LIBRARY_PATH"
 )
-"""The server leaves these out, and more; a robot does not even believe a signature on them."""
+"""Variables that the robot refuses even if they are signed; the server never sends them."""
 
 
 @dataclass(frozen=True, slots=True)
 class ManifestFile:
-    """A file of a map. name: relative, with ``/`` between folders. level: name of the level that it belongs to."""
+    """A file of a map.
+
+    Attributes:
+        name: relative path, with ``/`` as separator.
+        level: name of the level that the file belongs to.
+    """
 
     format: str
     name: str
@@ -66,13 +74,13 @@ class ManifestFile:
 
     @property
     def path(self) -> str:
-        """Where it lies below ``current``."""
+        """Path below ``current``."""
         return f"{self.format}/{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A storey. elevation: metres."""
+    """A level. elevation: metres."""
 
     name: str
     elevation: float
@@ -80,12 +88,18 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """A signed list of a version's files. data, signature: the signed bytes and the header, as they came.
+    """Signed list of a version's files.
 
-    variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``. layers: layer -> a hash
-    of its content. time: when it was signed. levels: lowest first. missing: optional format -> why it cannot be given.
-    overlays: closures in force, as the server lists them; overlays_digest is None if the server applies none.
-    closures, parameters: of the request that it answers: how closures are shown, and format -> its parameters.
+    Attributes:
+        data, signature: signed bytes and signature header as received.
+        variables: shell variables of the environment (``FARM_NAME`` …), for ``environment.sh``.
+        layers: layer -> hash of its content.
+        time: time of signing.
+        levels: lowest first.
+        missing: optional format -> reason why it is not available.
+        overlays: closures in force, as the server lists them.
+        overlays_digest: None if the server applies no closures.
+        closures, parameters: echo of the request: how closures are shown, and format -> its parameters.
     """
 
     environment: str
@@ -110,27 +124,27 @@ class Manifest:
 
     @property
     def mark(self) -> Mark:
-        """Its position in the channel's history."""
+        """Position in the channel's history."""
         return Mark(self.epoch, self.sequence, self.root, self.overlays_digest)
 
     @property
     def map_key(self) -> tuple[Any, ...]:
-        """Equal for manifests whose version folders are the same."""
+        """Key that is equal for manifests with equal version folders."""
         return self.root, self.closures_key, self.content
 
     @property
     def closures_key(self) -> str:
-        """The digest of the closures in force, empty if there are none."""
+        """Digest of the closures in force; empty if there are none."""
         return self.overlays_digest if self.overlays and self.overlays_digest else ""
 
     @property
     def content(self) -> dict[str, str]:
-        """Path -> SHA-256: equal for equal maps."""
+        """Path -> SHA-256 of all files."""
         return {file.path: file.sha256 for file in self.files}
 
 
 def parse(data: bytes, signature: str) -> Manifest:
-    """The members of a manifest, each checked; Untrusted where they are not what a manifest has."""
+    """Parse a manifest and check each member. Raises Untrusted if one is invalid."""
     try:
         body = json.loads(data)
         files = tuple(
@@ -160,7 +174,7 @@ def parse(data: bytes, signature: str) -> Manifest:
             {format_: dict(values) for format_, values in body.get("parameters", {}).items()},
         )
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
+        raise Untrusted(f"invalid manifest from the server: {type(error).__name__}: {error}") from None
     valid_numbers = all(
         type(n) is int and 0 <= n < 2**63
         for n in (manifest.sequence, manifest.version, manifest.epoch, *(f.size for f in files))
@@ -170,19 +184,19 @@ def parse(data: bytes, signature: str) -> Manifest:
         isinstance(h, str) and _HASH.fullmatch(h) for h in (manifest.root, *(f.sha256 for f in files))
     )
     if not (valid_numbers and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
-        raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
+        raise Untrusted("invalid manifest from the server: invalid number, hash or time of expiry, or too many files")
     _check_paths(files)
     _check_variables(manifest.variables)
     _check_site(manifest)
     if not all(isinstance(t, str) for t in manifest.layers.values()) or not all(map(_LAYER.fullmatch, manifest.layers)):
-        raise Untrusted("the server's manifest cannot be read: a layer's name or hash is none")
+        raise Untrusted("invalid manifest from the server: invalid name or hash of a layer")
     return manifest
 
 
 def read_time(text: str) -> datetime:
     """Read an RFC 3339 time. Raises ValueError.
 
-    Python 3.10's own ``fromisoformat`` reads neither ``Z`` nor a fraction of other than 3 or 6 digits.
+    ``fromisoformat`` of Python 3.10 reads neither ``Z`` nor fractions with other than 3 or 6 digits.
     """
     match = _TIME.fullmatch(text)
     if match is None:
@@ -193,27 +207,27 @@ def read_time(text: str) -> datetime:
     try:
         return moment.astimezone(timezone.utc)
     except OverflowError:
-        raise ValueError(f"a time before year 1 or after 9999: {text[:80]!r}") from None
+        raise ValueError(f"time outside years 1 to 9999: {text[:80]!r}") from None
 
 
 def _check_site(manifest: Manifest) -> None:
     """Check levels, missing formats, closures and the time of signing."""
     names = [level.name for level in manifest.levels]
     problems = (
-        (manifest.time is not None and manifest.time.tzinfo is None, "the time of signing has no zone"),
+        (manifest.time is not None and manifest.time.tzinfo is None, "the time of signing has no time zone"),
         (not all(map(_is_name, names)) or len(set(names)) != len(names), "a level's name is invalid or a duplicate"),
         (not all(_is_number(level.elevation) for level in manifest.levels), "a level's elevation is not a number"),
         (not all(f.level is None or f.level in names for f in manifest.files), "a file belongs to an unknown level"),
         (not all(_is_name(format_) for format_ in manifest.missing), "a missing format has no name"),
         (not all(isinstance(why, str) for why in manifest.missing.values()), "a missing format has no reason"),
         (not all(_is_closure(closure) for closure in manifest.overlays), "a closure has no id"),
-        (bool(manifest.overlays) and manifest.overlays_digest is None, "its closures have no digest"),
-        (not _is_digest(manifest.overlays_digest), "the digest of its closures is invalid"),
-        (not isinstance(manifest.closures, str), "how it shows closures is not a text"),
+        (bool(manifest.overlays) and manifest.overlays_digest is None, "the closures have no digest"),
+        (not _is_digest(manifest.overlays_digest), "the digest of the closures is invalid"),
+        (not isinstance(manifest.closures, str), "the member closures is not a string"),
     )
     for is_wrong, problem in problems:
         if is_wrong:
-            raise Untrusted(f"the server's manifest cannot be read: {problem}")
+            raise Untrusted(f"invalid manifest from the server: {problem}")
 
 
 def _is_name(value: object) -> bool:
@@ -240,17 +254,17 @@ def is_hash(text: str) -> bool:
 
 
 def _check_variables(variables: Mapping[str, str]) -> None:
-    """Names that a shell takes, texts in one line, and nothing that changes how the robot's own programs run."""
+    """Check for valid shell names and one-line values; refuse variables that affect the robot's programs."""
     if len(variables) > MAX_VARIABLES:
-        raise Untrusted(f"the manifest has {len(variables)} variables, more than {MAX_VARIABLES}")
+        raise Untrusted(f"manifest has {len(variables)} variables, more than {MAX_VARIABLES}")
     for name, value in variables.items():
         fine = _VARIABLE.fullmatch(name) and isinstance(value, str) and (value.isprintable() or not value)
         if not fine or _FORBIDDEN.fullmatch(name):
-            raise Untrusted(f"the manifest has a variable that is not handed on to a robot: {name[:80]!r}")
+            raise Untrusted(f"manifest contains the forbidden or invalid variable {name[:80]!r}")
 
 
 def _check_paths(files: Sequence[ManifestFile]) -> None:
-    """No file leaves its folder, none is told twice, none is also a folder."""
+    """Check that paths are relative, stay in their folder, are unique and are not folders as well."""
     seen: set[str] = set()
     folders: set[str] = set()
     for file in files:
@@ -262,37 +276,42 @@ def _check_paths(files: Sequence[ManifestFile]) -> None:
             and all(p not in ("", ".", "..") and len(p.encode("utf-8", "replace")) <= 255 for p in pieces)
         )
         if not fine or "\\" in file.name or not file.name.isprintable() or file.path in seen:
-            raise Untrusted(f"the manifest names a file that cannot be: {file.format!r}/{file.name!r}")
+            raise Untrusted(f"manifest contains an invalid or duplicate file path: {file.format!r}/{file.name!r}")
         seen.add(file.path)
         parts = file.path.split("/")
         folders |= {"/".join(parts[:n]) for n in range(1, len(parts))}
     if both := sorted(seen & folders):
-        raise Untrusted(f"the manifest names a file that is a folder as well: {both[0]}")
+        raise Untrusted(f"manifest lists a file that is also a folder: {both[0]}")
 
 
 def key_id(public: bytes) -> str:
-    """The id of a raw public key."""
+    """Return the id of a raw public key: the first 16 hexadecimal digits of its SHA-256."""
     return hashlib.sha256(public).hexdigest()[:16]
 
 
 def verify_signature(
     data: bytes, signature: str, pinned: bytes | None, given: str | None, keys: Callable[[], list[Mapping[str, Any]]]
 ) -> bytes:
-    """The raw public key that signed ``data``, if the robot may believe it: the pinned one, or one that it vouches for.
+    """Verify a signature and return the raw public key that signed ``data``: the pinned one or one that it endorses.
 
-    signature: ``<key id>:<base64>``. given: what the operator said to trust at first contact (id or raw key in base64).
-    keys: asks the server for its keys, the newest first; called only where the pinned key is not the one. Untrusted.
+    Args:
+        signature: ``<key id>:<base64>``.
+        given: key to trust at first contact, set by the operator (id, or raw key in base64).
+        keys: fetches the server's keys, newest first; called only if another key than the pinned one signed.
+
+    Raises:
+        Untrusted: the signature or the key is not valid.
     """
     name, _, text = signature.partition(":")
     signed = _bytes(text)
     if not name or signed is None or len(signed) != 64:
-        raise Untrusted("the server's manifest is not signed")
+        raise Untrusted("manifest has no valid signature")
     if pinned is None and given is not None:
         pinned = _bytes(given) if not _KEY_ID.fullmatch(given) else None
     is_pinned = pinned is not None and key_id(pinned) == name
     key = pinned if pinned is not None and is_pinned else _from_server(name, pinned, given, keys())
     if not _verifies(key, signed, data):
-        raise Untrusted(f"the manifest's signature is not that of the key {name}: it was changed on its way")
+        raise Untrusted(f"signature of the manifest does not match key {name}: the manifest was changed in transit")
     return key
 
 
@@ -303,10 +322,10 @@ def _from_server(name: str, pinned: bytes | None, given: str | None, keys: Seque
         if public is not None and len(public) == 32 and line.get("id") == key_id(public):
             server_keys[key_id(public)] = (public, line)
     if name not in server_keys:
-        raise Untrusted(f"the manifest is signed with the key {name}, which the server does not tell")
+        raise Untrusted(f"manifest is signed with key {name}, which the server does not list")
     trusted = key_id(pinned) if pinned is not None else given
     if trusted is None:
-        return server_keys[name][0]  # first contact: whoever answers is believed, and only he from now on
+        return server_keys[name][0]  # trust on first use
     at = name
     for _ in range(len(server_keys) + 1):
         if at == trusted:
@@ -323,18 +342,18 @@ def _from_server(name: str, pinned: bytes | None, given: str | None, keys: Seque
             break
         at = by
     raise Untrusted(
-        f"the manifest is signed with the key {name}, for which the trusted key {trusted} does not vouch. Is this "
-        "another server? If it is meant to be, say its key with --key and remove state.json"
+        f"manifest is signed with key {name}, which the trusted key {trusted} does not endorse: possibly another "
+        "server. If this is intended, set --key to its key and delete state.json"
     )
 
 
 def check_key(text: str) -> str:
-    """A key as an operator writes it: its id (16 hexadecimal digits) or the raw public key in base64; Untrusted."""
+    """Check a key of an operator: its id (16 hexadecimal digits) or the raw public key in base64. Raises Untrusted."""
     text = text.strip()
     raw = _bytes(text)
     if _KEY_ID.fullmatch(text) or (raw is not None and len(raw) == 32):
         return text
-    raise Untrusted("--key takes a key's id (16 hexadecimal digits) or its public_key in base64, as GET /api/v1/keys")
+    raise Untrusted("invalid --key: use the id (16 hexadecimal digits) or the public_key (base64) of GET /api/v1/keys")
 
 
 def check_manifest(
@@ -348,29 +367,35 @@ def check_manifest(
     mark: Mark | None,
     now: datetime | None = None,
 ) -> None:
-    """Whether a signed manifest is the one that was asked for. mark: that of the newest one ever believed.
+    """Check that a signed manifest matches the request and is not older than an accepted one.
 
-    parameters: format -> the parameters that it was requested with, of formats that have any.
+    Args:
+        parameters: format -> requested parameters, of formats that have any.
+        mark: position of the newest accepted manifest of the channel.
 
-    Raises Untrusted, with what an operator can do.
+    Raises:
+        Untrusted: the manifest must not be used; the text says how an operator can solve it.
     """
     if manifest.environment != environment:
-        raise Untrusted(f"the manifest is of the environment {manifest.environment!r}, not of {environment!r}")
+        raise Untrusted(f"manifest belongs to environment {manifest.environment!r}, expected {environment!r}")
     if manifest.channel != channel:
-        raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
+        raise Untrusted(f"manifest belongs to channel {manifest.channel!r}, expected {channel!r}")
     if manifest.expires < (now or datetime.now(timezone.utc)) - MAX_CLOCK_SKEW:
         raise Untrusted(
-            f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC, and it is "
-            f"{now or datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} by the newer of this robot's clock and the newest "
-            "signed time: possible replay of an old one. Check both clocks"
+            f"manifest expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC; the time is "
+            f"{now or datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} UTC (newer of the robot's clock and the newest "
+            "signed time): possible replay of an old manifest. Check the clocks of the robot and the server"
         )
     got = {file.format for file in manifest.files}
     for format_, why in manifest.missing.items():
         if format_ in formats:
-            raise Untrusted(f"the server cannot give the required format {format_}: {why}")
+            raise Untrusted(f"required format {format_} is not available: {why}")
     if not set(formats) <= got <= {*formats, *optional}:
         missing, more = sorted(set(formats) - got), sorted(got - set(formats) - set(optional))
-        raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
+        raise Untrusted(
+            f"formats of the manifest differ from the request: missing {', '.join(missing)[:300] or 'none'}, "
+            f"unexpected {', '.join(more)[:300] or 'none'}"
+        )
     _check_request(manifest, parameters or {}, optional)
     _check_ahead(manifest, mark)
     if mark is None:
@@ -379,37 +404,40 @@ def check_manifest(
         epoch = f" of epoch {manifest.epoch}" if manifest.epoch != mark.epoch else ""
         raise Untrusted(
             f"manifest sequence {manifest.sequence}{epoch} is lower than {mark.sequence}, which this robot has already "
-            "accepted: possible rollback. If the server was set up anew, remove state.json"
+            "accepted: possible rollback. If the server was reinstalled, delete state.json"
         )
     if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and manifest.root != mark.root:
         raise Untrusted(
-            f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark.root[:8]} was "
-            "seen under the same number: two servers use one key, or it was restored: raise its epoch"
+            f"manifest of sequence {manifest.sequence} has root {manifest.root[:8]}, but this robot has accepted root "
+            f"{mark.root[:8]} under the same sequence: two servers share one key, or the server was restored from a "
+            "backup. After a restore, raise the server's epoch"
         )
     old, new = mark.overlays_digest, manifest.overlays_digest
     if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and old not in (None, new):
         raise Untrusted(
-            f"the manifest of sequence {manifest.sequence} has the closures {(new or 'none')[:8]}, and "
-            f"{(old or 'none')[:8]} was seen under the same number: there are two servers with one key. If it was "
-            "restored, remove state.json"
+            f"manifest of sequence {manifest.sequence} has closures {(new or 'none')[:8]}, but this robot has accepted "
+            f"closures {(old or 'none')[:8]} under the same sequence: two servers share one key, or the server was "
+            "restored from a backup. After a restore, delete state.json"
         )
 
 
 def _check_request(manifest: Manifest, parameters: Mapping[str, Mapping[str, str]], optional: Sequence[str]) -> None:
-    """Refuse the answer to a request that was changed on its way. Servers without closures do not sign requests."""
+    """Refuse the response to a request that was changed in transit. Servers without closures do not sign requests."""
     if manifest.overlays_digest is None:
         return
     present = {file.format for file in manifest.files}
     silent = [name for name in optional if name not in present and name not in manifest.missing]
     if manifest.closures != "apply":
-        problem = f"closures={manifest.closures[:80]} instead of apply"
+        problem = f"closures={manifest.closures[:80]} instead of closures=apply"
     elif manifest.parameters != parameters:
-        problem = f"the parameters {str(manifest.parameters)[:300]} instead of {str(parameters)[:300]}"
+        problem = f"parameters {str(manifest.parameters)[:300]} instead of {str(parameters)[:300]}"
     elif silent:
-        problem = f"without the optional {', '.join(silent)[:300]}, and without a reason"
+        problem = f"optional formats {', '.join(silent)[:300]} are missing without a reason"
     else:
         return
-    raise Untrusted(f"the manifest answers another request ({problem}): check what is between the robot and the server")
+    raise Untrusted(
+        f"manifest belongs to another request ({problem}): check the proxies between the robot and the server"
+    )
 
 
 def _check_ahead(manifest: Manifest, mark: Mark | None) -> None:
@@ -421,8 +449,8 @@ def _check_ahead(manifest: Manifest, mark: Mark | None) -> None:
     ):
         if value > accepted + limit:
             raise Untrusted(
-                f"manifest {name} {value} is more than {limit} ahead of {accepted}, the last one that this robot has "
-                "accepted: rotate the server's key if it may be stolen"
+                f"manifest {name} {value} is more than {limit} ahead of {accepted}, the highest that this robot has "
+                "accepted: rotate the server's key if it may have been stolen"
             )
 
 
@@ -442,7 +470,10 @@ def _bytes(text: str) -> bytes | None:
 
 
 def pin_key(state: AgentState, key: str | None) -> AgentState:
-    """Return the state that trusts a key (id or public key, base64) of the options; another pinned key is forgotten."""
+    """Return the state with a trusted key set by the operator (id, or public key in base64).
+
+    Another pinned key and its accepted positions are removed.
+    """
     if key is None or key == state.given:
         return state
     if state.key is not None and key not in (key_id(state.key), base64.b64encode(state.key).decode()):

@@ -1,6 +1,6 @@
-"""What survives a restart, in one small file that is replaced whole: what was believed last, and what is still to do.
+"""Persistent state of the agent in ``state.json``: trusted key, accepted manifests and pending hooks.
 
-What is installed is not told here but by the folder itself (``current`` and the manifest in it): one truth for each.
+The installed version is not part of it: ``current`` and the manifest in it are the only source for that.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_TIME = 253402214400.0
 """9999-12-31, in seconds since 1970."""
 
 STATE_FORMAT = 2
-"""Format of state.json. Form 1, of releases without epochs, is read as well."""
+"""Format number of state.json. Format 1 (releases without epochs) is read as well."""
 
 
 class Mark(NamedTuple):
@@ -38,9 +38,10 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AgentState:
-    """Persistent state.
+    """Content of ``state.json``.
 
     Attributes:
+        key, given: pinned public key; key set by the operator (id, or public key in base64).
         marks: highest (epoch, sequence, root) accepted per channel; lower ones are refused.
         etag, expires, asked: of the installed manifest: ETag, expiry in seconds since 1970, channel and formats.
         activated: version folder for which the hooks have run; None while they run.
@@ -66,11 +67,14 @@ class AgentState:
 
 
 def load(path: Path, environment: str) -> AgentState:
-    """What stands there, or a fresh one; Invalid where it is of another environment or not to be read."""
+    """Read the state, or return a new one if there is no file.
+
+    Raises Invalid if the file is unreadable or belongs to another environment.
+    """
     try:
         body = json.loads(path.read_bytes())
         if body["form"] not in (1, STATE_FORMAT):
-            raise ValueError(f"it has the form {body['form']}, and this agent reads forms 1 and {STATE_FORMAT}")
+            raise ValueError(f"unknown form {body['form']!r:.80}, this agent reads 1 and {STATE_FORMAT}")
         state = AgentState(
             environment=str(body["environment"]),
             key=base64.b64decode(body["key"]) if body.get("key") else None,
@@ -95,15 +99,19 @@ def load(path: Path, environment: str) -> AgentState:
         return AgentState(environment)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Invalid(
-            f"{path} cannot be read ({error}). Remove it to start afresh; the key is then pinned anew at first contact"
+            f"could not read {path} ({error}): delete it to start with a new state. The agent then pins the key of the "
+            "next contact"
         ) from None
     if state.environment != environment:
-        raise Invalid(f"{path.parent} holds maps of {state.environment}, not of {environment}: use a folder for each")
+        raise Invalid(
+            f"{path.parent} contains maps of environment {state.environment!r:.80}, not {environment!r:.80}: "
+            "use one directory for each environment"
+        )
     return state
 
 
 def save(path: Path, state: AgentState) -> None:
-    """Whole or not at all, also where the power goes."""
+    """Write the state atomically and durably."""
     body = {
         "form": STATE_FORMAT,
         "environment": state.environment,
@@ -128,25 +136,25 @@ def _text(value: Any) -> str | None:
 def _name(value: Any) -> str | None:
     """Check the name of a version folder."""
     if value is not None and (not isinstance(value, str) or "/" in value or value in ("", ".", "..")):
-        raise ValueError(f"{value!r:.80} does not name a version folder")
+        raise ValueError(f"invalid version folder {value!r:.80}")
     return value
 
 
 class StateStore:
-    """The state in memory and on the disk. A change that could not be written is written with the next one."""
+    """The state in memory and on disk. If a write fails, the next ``save`` repeats it."""
 
     def __init__(self, path: Path, environment: str, free_space: Callable[[], None]) -> None:
-        """Create a store. free_space: called if the disk is full, before the state is written once more."""
+        """Create a store. free_space: called if the disk is full, before a second attempt to write."""
         self._path, self._free_space = path, free_space
         self.value = AgentState(environment)
         self._unsaved = False
 
     def load(self) -> None:
-        """Read the state from the disk. Raises Invalid."""
+        """Read the state from disk. Raises Invalid."""
         self.value = load(self._path, self.value.environment)
 
     def stage(self, state: AgentState) -> None:
-        """Replace the state; it is saved with the next call of ``save``."""
+        """Replace the state in memory; the next ``save`` writes it."""
         if state != self.value:
             self.value, self._unsaved = state, True
 
@@ -155,7 +163,7 @@ class StateStore:
         self.save(dataclasses.replace(self.value, **changes))
 
     def save(self, state: AgentState) -> None:
-        """Save a state if it is new, or if the last one could not be saved."""
+        """Save a state if it has changed or the last write failed."""
         self.stage(state)
         if self._unsaved:
             try:
@@ -169,13 +177,13 @@ class StateStore:
 
 
 def write_durably(path: Path, data: bytes) -> None:
-    """Replace a file at once, and for good."""
+    """Replace a file atomically and durably: it survives a power cut."""
     write_atomically(path, data)
     sync_folder(path.parent)
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Replace a file at once. No link that somebody has put beside it is followed, and no full disk left fuller."""
+    """Replace a file atomically. Never follows a planted link; removes its temporary file if writing fails."""
     temporary = path.with_name(f".{path.name}.new")
     temporary.unlink(missing_ok=True)
     try:
@@ -190,7 +198,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """What was renamed in it stays so after a power cut."""
+    """Sync a folder, so that renames in it survive a power cut."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -199,7 +207,7 @@ def sync_folder(path: Path) -> None:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     total, buffer = hashlib.sha256(), memoryview(bytearray(HASH_BYTES))
     with path.open("rb", buffering=0) as stream:
         while count := stream.readinto(buffer):

@@ -1,4 +1,4 @@
-"""The robot's status: sent over Zenoh at once, confirmed over HTTP, once for each change."""
+"""Report the robot's status: over Zenoh at once, confirmed over HTTP, once for each change."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from app.event_types import RobotState
 from app.events.messages import RobotStatus
 
 CONFIRM_SECONDS = 60.0
-"""Maximum time until a status sent over Zenoh is confirmed over HTTP: the bus acknowledges nothing. A fleet that
-changes at once spreads its confirmations over this time.
+"""Maximum time until a status sent over Zenoh is confirmed over HTTP, since Zenoh acknowledges nothing. A random delay
+spreads the confirmations of a fleet over this time.
 """
 
 FIRST_CONFIRM_SECONDS = 2.0
-"""The same for the first status after the start: a robot counts in roll-outs once it has reported with its token."""
+"""Maximum delay of the first confirmation: a robot counts in roll-outs only after it has reported with its token."""
 
 NO_ROOT = "0" * 64
 
 Subject = Manifest | tuple[int, str]
-"""A map that a status is about: its manifest, or version and root if there is no manifest yet."""
+"""Map that a status is about: its manifest, or version and root if there is no manifest yet."""
 
 REPEAT_SECONDS = 30.0
 """Interval after which a robot without Zenoh repeats its status with the next sync."""
 
 
 class Bus(Protocol):
-    """The robot's Zenoh session, as far as a status needs it."""
+    """Zenoh session as far as the reporter needs it."""
 
     @property
     def connected(self) -> bool:
         """Whether a router is connected."""
 
     def put_status(self, status: RobotStatus) -> bool:
-        """Publish a status; whether a router took it."""
+        """Publish a status. Return whether it was handed to a router."""
 
 
 class StatusReporter:
-    """The newest status of the robot and where it was sent."""
+    """Newest status of the robot, and what was sent of it over Zenoh and HTTP."""
 
     def __init__(
         self, environment: str, robot: str, web: ServerClient, stopping: threading.Event, refused: Callable[[str], None]
@@ -55,27 +55,27 @@ class StatusReporter:
         self.bus: Bus | None = None
         self.status: RobotStatus | None = None
         self.confirm_at: float | None = None
-        """Monotonic time at which ``send`` has to be called again, if any."""
+        """Monotonic time at which ``send`` must be called again, if any."""
         self._sent_http: RobotStatus | None = None
         self._sent_http_at = 0.0
         self._is_confirmed = False
         self._sent_zenoh: RobotStatus | None = None
 
     def set(self, status: RobotStatus) -> bool:
-        """Note a status and send it; False if nothing but its time is new."""
+        """Set the status. Return False if only its time differs."""
         if _is_same_status(status, self.status):
             return False
         self.status = status
         return True
 
     def forget_sent(self) -> None:
-        """Send the status again: a restarted router or server may have missed it."""
+        """Make the next ``send`` repeat the status, which a restarted router or server may have missed."""
         self._sent_http = self._sent_zenoh = None
 
     def send(self) -> None:
         """Send the status if it is new: over Zenoh at once and over HTTP later, or over HTTP at once without a router.
 
-        A robot that is not on the bus repeats its status now and then: only so does the server see it online.
+        Without a router the status is repeated every REPEAT_SECONDS, so that the server sees the robot online.
         """
         status, now = self.status, time.monotonic()
         if status is None or self._stopping.is_set():
@@ -101,7 +101,7 @@ class StatusReporter:
         except Unavailable:
             return
         except FleetMapError as error:
-            self._refused(f"the server does not take the robot's status: {error.detail}")
+            self._refused(f"the server rejects the robot's status: {error.detail}")
         self._sent_http, self._sent_http_at, self.confirm_at = status, now, None
         self._is_confirmed = True
 
@@ -122,16 +122,16 @@ def describe_status(
 ) -> RobotStatus:
     """Return the status of a robot. about: the map that it is about; default: the current one."""
     version, root = _version(about or current)
-    # That of a version fetched by its number is of no move of the channel: the server goes by the root then.
+    # A version fetched by number has no position in the channel: the server compares roots instead.
     sequence = current.sequence if current and current.channel is not None else None
     overlays = current.overlays_digest if current else None
     return RobotStatus(channel, version, root, state, detail, time, sequence, overlays, holds)
 
 
 def loaded_version(current: Manifest | None, *, is_loaded: bool, has_closures: bool) -> tuple[int, str] | None:
-    """Return version and root of the current map if the hooks have loaded it; None while they have not.
+    """Return version and root of the current map if the hooks have loaded it, else None.
 
-    A server that applies no closures does not have this member either.
+    Also None if the server applies no closures: such servers do not know this member.
     """
     if current is None:
         return (0, NO_ROOT) if has_closures else None
@@ -141,7 +141,7 @@ def loaded_version(current: Manifest | None, *, is_loaded: bool, has_closures: b
 
 
 def _version(subject: Subject | None) -> tuple[int, str]:
-    """Return the version and root of a map, those of none if there is none."""
+    """Return version and root of a map; 0 and NO_ROOT if there is none."""
     if isinstance(subject, Manifest):
         return subject.version, subject.root
     return subject or (0, NO_ROOT)

@@ -1,4 +1,4 @@
-"""Sleep between two syncs, until an event comes or the router is back."""
+"""Sleep between two syncs until an event arrives or the router reconnects."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ CLOSURE_EVENTS = ("overlay.accepted", "overlay.ended")
 """Events that change the closures in force."""
 
 DEBOUNCE_SECONDS = 0.02
-"""Events that come together are one look at the server. Doubled for each look that brought nothing, up to 5 seconds: on
-an open router anybody can put events.
+"""Debounce time after an event. Doubles with each wake-up without effect, up to 5 seconds: on an open router anyone can
+publish events.
 """
 
 MAX_DOUBLINGS = 8
 
 REJOIN_SECONDS = 1.0
-"""A fleet that finds its router again does not ask in the same moment: up to so long."""
+"""Maximum random delay of a sync after a reconnect, so that a fleet does not poll all at once."""
 
 
 class Alarm(threading.Event):
-    """Set by threads of Zenoh's when there is something to sync; the sync loop sleeps on it."""
+    """Event that wakes the sync loop; set by Zenoh threads."""
 
     def __init__(self, stopping: threading.Event) -> None:
         super().__init__()
         self._stopping = stopping
         self.rejoined = False
-        """Whether the router has come back since the last sync."""
+        """Whether the router has reconnected since the last sync."""
         self.idle_wakeups = 0
-        """Wake-ups in a row that brought nothing."""
+        """Number of consecutive wake-ups without effect."""
 
     def sleep(self, seconds: float, status: StatusReporter) -> bool:
-        """Sleep until something happens, at most so long: whether it did. The status is confirmed meanwhile."""
+        """Sleep until woken, at most ``seconds``; confirm the status when it is due. Return whether it was woken."""
         end = time.monotonic() + seconds
         while True:
             now = time.monotonic()
@@ -48,7 +48,7 @@ class Alarm(threading.Event):
             status.send()
 
     def _wait(self, seconds: float) -> bool:
-        """Wait until something happens, at most so long: whether an event or the router was it."""
+        """Wait until woken, at most ``seconds``, then debounce. Return whether it was woken."""
         woken = self.wait(seconds)
         if woken and not self._stopping.is_set():
             rejoined, self.rejoined = self.rejoined, False
@@ -58,9 +58,14 @@ class Alarm(threading.Event):
 
 
 def is_relevant(event: Event, channel: str | None, candidates: Collection[str | None]) -> bool:
-    """Whether an event may change the robot's map. channel: that it follows; candidates: those that it may follow."""
+    """Whether an event may change the robot's map.
+
+    Args:
+        channel: followed channel.
+        candidates: channels that the agent may follow.
+    """
     if event.type == "version.created":
         return channel in (LATEST, None)
     if event.type.startswith("overlay."):
-        return event.type in CLOSURE_EVENTS  # in force on every channel at once
+        return event.type in CLOSURE_EVENTS  # closures apply to every channel
     return event.channel in candidates or event.type.startswith("environment.")

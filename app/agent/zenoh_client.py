@@ -1,6 +1,6 @@
-"""The robot's Zenoh session: it hears of changes at once, and says how the robot is.
+"""Zenoh session of the robot: receives events and publishes the robot's status and liveliness token.
 
-Events are hints; what is true comes over HTTP, signed. So a forged event costs a request and changes nothing.
+Events only trigger a sync; the signed manifest over HTTP decides. So a forged event causes a request and no change.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from app.events import messages
 from app.events.credentials import ZenohCredentials, describe_connection_failure
 
 CONNECTION_POLL_SECONDS = 0.5
-"""Between two looks whether the router is there."""
+"""Interval between two checks of the connection."""
 
 CONNECT_MS = 5000
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
-"""How soon a session that lost its router tries again; Zenoh's own pauses grow to 4 s, in step for a whole fleet."""
+"""Pauses between attempts to reconnect; Zenoh's own grow to 4 s, at the same times for a whole fleet."""
 
 MAX_PAUSE_SECONDS = 30.0
 MAX_EVENT_BYTES = 2**18
 
 
 class ZenohClient:
-    """A session that is opened as soon as it can be, in a thread of its own. Methods are thread-safe.
+    """Zenoh session that a thread opens and keeps open. Thread-safe.
 
-    on_event: called with each event of the environment. on_connected: called when the router is there (again).
-    on_lost: called with the reason when it is not, once for each reason.
+    Args:
+        on_event: called with each event of the environment.
+        on_connected: called after each connection to a router.
+        on_lost: called with the reason if there is no connection, once per reason.
     """
 
     def __init__(
@@ -67,7 +69,7 @@ class ZenohClient:
         self.problem: str | None = None
 
     def set_endpoint(self, connect: str, prefix: str) -> None:
-        """Where the router is; the first call starts the thread, another address opens the session anew."""
+        """Set the address of the router. The first call starts the thread; another address reopens the session."""
         if self._endpoint == (connect, prefix):
             return
         self._endpoint = (connect, prefix)
@@ -78,12 +80,12 @@ class ZenohClient:
 
     @property
     def has_endpoint(self) -> bool:
-        """Whether it knows a router."""
+        """Whether a router address is set."""
         return self._endpoint is not None
 
     @property
     def connected(self) -> bool:
-        """Whether a router is there at this moment."""
+        """Whether the session is connected to a router."""
         session = self._session
         try:
             return session is not None and bool(session.info.routers_zid())
@@ -91,7 +93,7 @@ class ZenohClient:
             return False
 
     def put_status(self, status: messages.RobotStatus) -> bool:
-        """Say how the robot is: whether a router took it."""
+        """Publish the robot's status. Return whether it was handed to a router."""
         with self._lock:
             if self._session is None or self._endpoint is None or not self.connected:
                 return False
@@ -109,14 +111,14 @@ class ZenohClient:
             return True
 
     def close(self) -> None:
-        """End the session: the robot's token goes with it."""
+        """Close the session, which withdraws the robot's liveliness token."""
         self._stopping.set()
         self._aimed.set()
         if self._thread is not None:
             self._thread.join(CONNECT_MS / 1000 + 5)
         self._close_session()
 
-    # --- the thread ---
+    # --- thread ---
 
     def _run(self) -> None:
         pause = 1.0
@@ -141,7 +143,7 @@ class ZenohClient:
                 last_problem = None
                 self._on_connected()
             elif was_connected and not now:
-                self._on_lost(f"the router at {self._endpoint[0] if self._endpoint else ''} is gone")
+                self._on_lost(f"lost the connection to the router at {self._endpoint[0] if self._endpoint else ''}")
             was_connected = now
             self._aimed.wait(CONNECTION_POLL_SECONDS)
 
@@ -165,7 +167,7 @@ class ZenohClient:
                 ),
             ]
         except Exception as error:  # noqa: BLE001
-            self.problem = f"the router at {connect} refuses: {error}"
+            self.problem = f"the router at {connect} refuses the subscription: {error}"
             with contextlib.suppress(Exception):
                 _close(session)
             return False
@@ -196,9 +198,13 @@ class ZenohClient:
 
 
 def configuration(connect: str, file: Path | None = None, login: ZenohCredentials | None = None) -> zenoh.Config:
-    """A client of the routers at ``connect`` (separated by commas). file: Zenoh's own JSON5, for all else.
+    """Return the configuration of a Zenoh client.
 
-    Raises Invalid where a file of the login is missing.
+    Args:
+        connect: router addresses, comma-separated.
+        file: JSON5 file with further settings of Zenoh.
+
+    Raises Invalid if a file of ``login`` is missing.
     """
     config: zenoh.Config = zenoh.Config.from_file(str(file)) if file is not None else zenoh.Config()
     values: Mapping[str, Any] = {

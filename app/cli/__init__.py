@@ -1,6 +1,6 @@
-"""``fleetmap``: the server, and everything that can be done with one, from a shell.
+"""``fleetmap``: the command line of the server, its clients and the agent.
 
-Exit status: 0 it worked, 1 it did not (standard error says why), 2 wrong usage.
+Exit status: 0 success, 1 failure (the reason is on standard error), 2 wrong usage.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from app import __version__
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """The entry point: run one command and exit with its status."""
+    """Run one command and exit with its status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     sys.exit(run(given))
 

@@ -1,4 +1,4 @@
-"""The robot's side: a folder that always holds the channel's map, whole and verified."""
+"""``fleetmap agent`` and ``fleetmap agent-level``: keep a robot's map directory up to date with a channel."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def _copy_ros_package(workspace: Path | None) -> None:
-    """Copy the ROS 2 package and end."""
+    """Copy the ROS 2 package and exit."""
     if workspace is not None:
         from app.agent import ros
 
@@ -42,7 +42,7 @@ Formats = Annotated[
     typer.Option(
         "--formats",
         "-f",
-        help="Required formats, comma-separated, with their parameters: `occupancy_grid?level=L2&grid=map,tmap2`.",
+        help="Required formats, comma-separated, with optional parameters: `occupancy_grid?level=L2&grid=map,tmap2`.",
     ),
 ]
 OptionalFormats = Annotated[
@@ -57,18 +57,20 @@ Channel = Annotated[
     ),
 ]
 Robot = Annotated[
-    str | None, typer.Option("--robot", envvar="FLEETMAP_ROBOT", help="Name of the robot [default: this host's].")
+    str | None, typer.Option("--robot", envvar="FLEETMAP_ROBOT", help="Name of the robot [default: host name].")
 ]
 OnChange = Annotated[
     list[str] | None,
-    typer.Option("--on-change", help="Command to run after a change, or `nav2`, `topological`; repeatable."),
+    typer.Option(
+        "--on-change", help="Command to run after each switch, or a bundled hook (nav2, topological); repeatable."
+    ),
 ]
 BeforeSwitch = Annotated[
     list[str] | None,
     typer.Option(
         "--before-switch",
-        help="Command to run before each switch, also for a closure: exit status 0 switches, 75 runs it again "
-        "after 5 seconds, any other refuses the map; repeatable.",
+        help="Command to run before each switch, also for closures: exit status 0 allows the switch, 75 delays it "
+        "(runs again after 5 seconds), any other rejects the map; repeatable.",
     ),
 ]
 TrustedKey = Annotated[
@@ -76,31 +78,36 @@ TrustedKey = Annotated[
     typer.Option(
         "--key",
         envvar="FLEETMAP_AGENT_KEY",
-        help="Key of the server to trust: its id or public key (`fleetmap keys show`) [default: the first seen].",
+        help="Server key to trust, as key id or public key (`fleetmap keys show`) [default: pin the key of the first "
+        "contact].",
     ),
 ]
 Poll = Annotated[
     float,
-    typer.Option("--poll", min=0.1, help="Seconds between polls, up to a half more or less; events arrive at once."),
+    typer.Option("--poll", min=0.1, help="Seconds between polls, ±50 % jitter; events trigger a sync at once."),
 ]
 ZenohConnect = Annotated[
     str | None,
     typer.Option(
         "--zenoh",
         envvar="FLEETMAP_ZENOH_CONNECT",
-        help="Address of the Zenoh router [default: the server names it].",
+        help="Address of the Zenoh router [default: as announced by the server].",
     ),
 ]
 ZenohPrefix = Annotated[
     str | None,
-    typer.Option("--zenoh-prefix", envvar="FLEETMAP_ZENOH_PREFIX", help="Start of every key expression."),
+    typer.Option(
+        "--zenoh-prefix",
+        envvar="FLEETMAP_ZENOH_PREFIX",
+        help="Prefix of all Zenoh keys [default: as announced by the server].",
+    ),
 ]
 ZenohConfig = Annotated[
     Path | None,
     typer.Option(
         "--zenoh-config",
         envvar="FLEETMAP_ZENOH_CONFIG",
-        help="JSON5 file with Zenoh's own settings, for everything else.",
+        help="JSON5 file with further Zenoh settings.",
     ),
 ]
 ZenohCa = Annotated[
@@ -108,7 +115,7 @@ ZenohCa = Annotated[
     typer.Option(
         "--zenoh-ca",
         envvar="FLEETMAP_ZENOH_CA",
-        help="Authority that signs the router's certificate, PEM [default: public ones].",
+        help="CA certificate of the router, PEM file [default: public authorities].",
     ),
 ]
 ZenohCertificate = Annotated[
@@ -116,11 +123,11 @@ ZenohCertificate = Annotated[
     typer.Option(
         "--zenoh-certificate",
         envvar="FLEETMAP_ZENOH_CERTIFICATE",
-        help="Certificate of the robot, if the router needs one.",
+        help="Client certificate of the robot, PEM file, if the router requires one.",
     ),
 ]
 ZenohKey = Annotated[
-    Path | None, typer.Option("--zenoh-key", envvar="FLEETMAP_ZENOH_KEY", help="Private key of that certificate.")
+    Path | None, typer.Option("--zenoh-key", envvar="FLEETMAP_ZENOH_KEY", help="Private key of --zenoh-certificate.")
 ]
 ZenohUser = Annotated[
     str | None,
@@ -133,7 +140,7 @@ Ca = Annotated[
     typer.Option(
         "--ca",
         envvar="FLEETMAP_CA",
-        help="Authority that signs the server's certificate, PEM [default: public ones].",
+        help="CA certificate of the server, PEM file [default: public authorities].",
     ),
 ]
 RosPackage = Annotated[
@@ -143,7 +150,7 @@ RosPackage = Annotated[
         metavar="DIR",
         callback=_copy_ros_package,
         is_eager=True,
-        help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src) and exit.",
+        help="Copy the ROS 2 package fleetmap_ros to this folder (src of a workspace) and exit.",
     ),
 ]
 
@@ -151,7 +158,9 @@ RosPackage = Annotated[
 def agent(
     environment: Environment,
     formats: Formats,
-    into: Annotated[Path, typer.Option("--into", "-o", help="Folder; the maps are in its `current/<format>/`.")],
+    into: Annotated[
+        Path, typer.Option("--into", "-o", help="Directory for the maps; they appear in `current/<format>/`.")
+    ],
     optional: OptionalFormats = "",
     channel: Channel = None,
     robot: Robot = None,
@@ -168,16 +177,16 @@ def agent(
     zenoh_user: ZenohUser = None,
     ca: Ca = None,
     ros_package: RosPackage = None,  # noqa: ARG001  its callback
-    once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and exit.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Sync once, then exit.")] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each event.")] = False,
 ) -> None:
-    """Keep a folder on a robot up to date with the map of a channel.
+    """Keep a robot's map directory up to date with a channel.
 
-    It listens for events, fetches what differs, verifies signature and hashes, switches `current` in one step, and
-    reports the robot's status. Without a server or network the folder keeps its map. FLEETMAP_ZENOH_PASSWORD is the
-    password at the Zenoh router.
+    The agent receives events, fetches changed files, verifies the signature and all hashes, switches `current`
+    atomically and reports the robot's status. Without a connection it keeps the installed map. Set the password for the
+    Zenoh router with FLEETMAP_ZENOH_PASSWORD.
 
     Example: `fleetmap agent -e farm -f occupancy_grid,tmap2 -o /srv/maps --channel production --on-change nav2`
     """
@@ -214,7 +223,7 @@ def _required_formats(text: str) -> tuple[str, ...]:
 
     names = parse_formats(text)
     if not names:
-        raise Invalid("--formats needs one format or several, separated by commas: occupancy_grid,tmap2")
+        raise Invalid("--formats is empty: list at least one format, such as occupancy_grid,tmap2")
     return names
 
 
@@ -236,7 +245,7 @@ def _run(agent: Agent, *, once: bool) -> None:
     finally:
         agent.close()
     if not once:
-        # A thread of Zenoh's that still calls back while the interpreter comes down would abort it.
+        # Skip the interpreter's shutdown: a callback of a Zenoh thread during it would abort the process.
         with contextlib.suppress(OSError):
             sys.stdout.flush()
             sys.stderr.flush()
@@ -245,13 +254,13 @@ def _run(agent: Agent, *, once: bool) -> None:
 
 def agent_level(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of the agent (`--into`).")],
-    level: Annotated[str, typer.Argument(help="Level that the robot is on now, as in `current/levels.json`.")],
+    level: Annotated[str, typer.Argument(help="New level of the robot, one of `current/levels.json`.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each event.")] = False,
 ) -> None:
     """Load another level of the robot's map, for example after a ride in a lift.
 
-    Runs the agent's `--on-change` commands for that level and stores the level for later maps. Run it as the agent's
-    user; the agent may be running.
+    Runs the agent's `--on-change` commands for that level and stores the level for later maps. Run it as the user of
+    the agent. The agent may be running.
 
     Example: `fleetmap agent-level /srv/maps L2`
     """
@@ -265,7 +274,7 @@ def _logger(*, as_json: bool) -> Callable[..., None]:
     """Return a function that prints one line for each event."""
 
     def log(event: str, **members: Any) -> None:
-        # A log on a full disk, or nobody who reads (where rich would exit): the map is kept all the same.
+        # A full disk or a closed pipe (rich would exit) must not stop the agent.
         with contextlib.suppress(OSError, SystemExit, UnicodeError):
             print_line(event, members)
 
@@ -283,7 +292,7 @@ def _logger(*, as_json: bool) -> Callable[..., None]:
 
 
 def _line(members: dict[str, Any]) -> str:
-    """What happened, for people: the detail last, hashes short."""
+    """Format the members of an event as text: short hashes, the detail last."""
     words = []
     for name, value in members.items():
         if value in (None, "") or name == "detail":

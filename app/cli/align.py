@@ -1,4 +1,4 @@
-"""``fleetmap align``: a stored grid laid onto another map of its environment."""
+"""``fleetmap align``: align a stored grid with another map of its environment."""
 
 from __future__ import annotations
 
@@ -14,28 +14,26 @@ from app.errors import Invalid
 
 Onto = Annotated[
     str | None,
-    typer.Argument(help="Map to lay it onto: objects, voxels, or the name of another grid; or give --pair."),
+    typer.Argument(help="Reference map: objects, voxels, or the name of another grid. Or use --pair."),
 ]
 OntoLevel = Annotated[
-    str | None, typer.Option("--onto-level", help="Level of the map to lay it onto [default: the grid's].")
+    str | None, typer.Option("--onto-level", help="Level of the reference map [default: level of the grid].")
 ]
 Pair = Annotated[
     list[str] | None,
-    typer.Option("--pair", metavar="X,Y=X,Y", help="Where a point is, and where it should be, in metres; repeatable."),
+    typer.Option("--pair", metavar="X,Y=X,Y", help="Current and correct position of a point, in metres; repeatable."),
 ]
 Option = Annotated[
-    list[str] | None, options.named_values_option("A parameter of the slice of objects or voxels (height, …)")
+    list[str] | None, options.named_values_option("Parameter of the slice through objects or voxels (height, …)")
 ]
-Reach = Annotated[
-    float | None, typer.Option("--reach", min=0, help="Maximum distance to move the middle of the grid, in metres.")
-]
+Reach = Annotated[float | None, typer.Option("--reach", min=0, help="Maximum shift of the grid's centre, in metres.")]
 Near = Annotated[
     float | None,
     typer.Option(
         "--near", help="Distance at which two cells [default: 0.1] or points [default: 0.5] agree, in metres."
     ),
 ]
-Least = Annotated[float, typer.Option("--least", min=0, max=1, help="Minimum share of cells or points that agree.")]
+Least = Annotated[float, typer.Option("--least", min=0, max=1, help="Minimum share of agreeing cells or points.")]
 
 
 def align(
@@ -46,7 +44,7 @@ def align(
     onto_level: OntoLevel = None,
     pair: Pair = None,
     option: Option = None,
-    angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="Maximum turn to try, in degrees.")] = 180.0,
+    angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="Maximum rotation, in degrees.")] = 180.0,
     reach: Reach = None,
     near: Near = None,
     least: Least = 0.5,
@@ -56,9 +54,9 @@ def align(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Lay an occupancy grid onto another map of its environment, and store it there as a version.
+    """Align an occupancy grid with another map of its environment, and store it as a new version.
 
-    It reports how well the grid fits. The grid's origin changes, its cells do not: to turn the cells as well, use
+    Reports how well the grid fits. Only the origin of the grid changes. To rotate its cells as well, use
     `fleetmap export … occupancy_grid -O normalize=true`.
 
     Example: `fleetmap align farm objects --grid map --dry-run`
@@ -66,15 +64,15 @@ def align(
     body: dict[str, Any] = {"grid": grid, "level": level, "angle": angle, "reach": reach, "near": near}
     body |= {"least": least, "dry_run": dry_run, "message": message}
     if (onto is None) == (not pair):
-        raise typer.BadParameter("name what the grid is laid onto (objects, voxels, another grid), or give --pair")
+        raise typer.BadParameter("missing reference: use objects, voxels, the name of another grid, or --pair")
     if pair:
         if option or onto_level is not None:
-            raise typer.BadParameter("--option and --onto-level belong to a map, not to points")
+            raise typer.BadParameter("--option and --onto-level cannot be combined with --pair")
         body["pairs"] = [_pair(text) for text in pair]
     else:
         layer = onto if onto in ("objects", "voxels") else "occupancy"
         if option and layer == "occupancy":
-            raise typer.BadParameter("--option belongs to objects and voxels: a stored grid has no parameters")
+            raise typer.BadParameter("--option requires objects or voxels as reference: grids have no parameters")
         target: dict[str, Any] = {"layer": layer, "level": onto_level or level, "parameters": options.pairs(option)}
         body["onto"] = target if layer != "occupancy" else {**target, "name": onto}
     with Client(server, token) as client, output.progress_bar("aligning"):
@@ -112,11 +110,11 @@ def _place(origin: Any) -> str:
 
 
 def _pair(text: str) -> list[list[float]]:
-    """``X,Y=X,Y`` as two points; Invalid for anything else."""
+    """Parse ``X,Y=X,Y`` as two points. Raises Invalid."""
     try:
         (a, b), (c, d) = ([float(n) for n in point.split(",")] for point in text.split("="))
     except ValueError:
-        raise Invalid(f"--pair needs X,Y=X,Y in metres, got {text!r}") from None
+        raise Invalid(f"--pair must be X,Y=X,Y in metres, got {text[:80]!r}") from None
     if not all(math.isfinite(n) for n in (a, b, c, d)):
-        raise Invalid(f"--pair needs finite numbers, got {text!r}")
+        raise Invalid(f"--pair must have finite numbers, got {text[:80]!r}")
     return [[a, b], [c, d]]

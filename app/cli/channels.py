@@ -1,4 +1,4 @@
-"""``fleetmap channels``: which version each channel points to, and which robots have it."""
+"""``fleetmap channels``: list and show channels, and cancel planned moves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from app.cli.groups import Commands
 from app.cli.problems import RequestFailed
 from app.model.names import did_you_mean
 
-commands = Commands("List channels, the versions they point to, and how their robots follow. `promote` moves one.")
+commands = Commands(
+    "List channels, their versions and robots, and cancel planned moves. To move a channel, use `promote`."
+)
 
 Channel = Annotated[str, typer.Argument(help="Name of the channel.", autocompletion=completion.versions)]
 
@@ -25,7 +27,7 @@ def list_channels(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the channels of an environment, and how many robots have what they point to.
+    """List the channels of an environment, with the number of robots that run their version.
 
     Example: `fleetmap channels list farm`
     """
@@ -69,7 +71,7 @@ def show(
     row = next((row for row in rows if row["channel"] == channel), None)
     if row is None:
         names = [row["channel"] for row in rows]
-        detail = f"{environment} has no channel {channel!r}{did_you_mean(channel, names)}; it has: {', '.join(names)}"
+        detail = f"unknown channel {channel!r}{did_you_mean(channel, names)}: {environment} has {', '.join(names)}"
         raise RequestFailed({"title": "Not found", "detail": detail}, status=404)
     if as_json:
         output.show_json(row)
@@ -99,7 +101,7 @@ def cancel(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Cancel the planned move of a channel: it stays where it is. The same as `promote --cancel`.
+    """Cancel the planned move of a channel, which stays at its version. Same as `promote --cancel`.
 
     Example: `fleetmap channels cancel farm production`
     """
@@ -108,11 +110,11 @@ def cancel(
     if as_json:
         output.show_json({"environment": environment, "channel": channel, "planned": None})
     else:
-        output.print_result(f"{environment}: nothing is planned for {channel} any more")
+        output.print_result(f"{environment}: cancelled the planned move of {channel}")
 
 
 def planned_move_text(row: Mapping[str, Any]) -> str:
-    """Format what is planned for a channel: ``version 3 at 2026-05-01 08:30``."""
+    """Format the planned move of a channel: ``version 3 at 2026-05-01 08:30``."""
     plan = row.get("planned")
     if not plan:
         return ""

@@ -1,9 +1,10 @@
-"""The command line's side of HTTP: one client that knows the server, the token, problems, jobs and lost answers."""
+"""HTTP client of the command line: server address, token, problems, jobs and retries."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import tempfile
 import time
@@ -28,31 +29,34 @@ DEFAULT_SERVER = "http://127.0.0.1:8000"
 API = "/api/v1"
 
 MAX_ATTEMPTS = 4
-"""How often a request that may be repeated is sent before its failure is told."""
+"""Maximum number of attempts of a repeatable request."""
 
 RETRY_SECONDS = 0.5
-"""Before the second try; doubled each time. A server's Retry-After is waited for instead, up to MAX_RETRY_SECONDS."""
+"""Pause before the second attempt; doubles each time. A Retry-After replaces it, up to MAX_RETRY_SECONDS."""
 
 MAX_RETRY_SECONDS = 30.0
 
 POLL_SECONDS = 0.3
-"""Between two looks at a job; grows to MAX_POLL_SECONDS."""
+"""First interval between two polls of a job; grows to MAX_POLL_SECONDS."""
 
 MAX_POLL_SECONDS = 2.0
 
 STREAM_SECONDS = 60.0
-"""Longest silence of a stream of events, in seconds: the server sends a comment every 15."""
+"""Maximum time without data on an event stream; the server sends a comment every 15 seconds."""
+
+UNKNOWN_ENVIRONMENT = re.compile(r"(no|unknown) environment\b")
+"""Pattern in the detail of a 404 response for an unknown environment."""
 
 MAX_NAMES = 1000
-"""Names of environments that a mistyped one is compared with."""
+"""Maximum number of environments to compare a mistyped name with."""
 
 TIMEOUT = httpx.Timeout(10.0, read=330.0, write=60.0)
-"""Seconds. A conversion may take its server up to 300 seconds before it answers."""
+"""Timeouts in seconds. A conversion may take up to 300 seconds until the server responds."""
 
 
 @dataclass(slots=True)
 class LocalFile:
-    """A file to upload: its name there and its place here. It is open only while it is being read."""
+    """File to upload, with its name on the server and its local path. Open only while it is read."""
 
     name: str
     path: Path
@@ -62,7 +66,7 @@ class LocalFile:
     _offset: int = 0
 
     def read(self, count: int = -1) -> bytes:
-        """The next bytes; the file is closed at its end."""
+        """Read the next bytes. The file is closed at its end."""
         if self._stream is None:
             self._stream = self.path.open("rb")
             self._stream.seek(self._offset)
@@ -74,18 +78,18 @@ class LocalFile:
         return data
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """As for any file; counted from the size that was seen when it was found."""
+        """Set the position of the next read. The end is at ``size``, which may differ from the size on disk."""
         self._offset = {os.SEEK_SET: 0, os.SEEK_CUR: self._offset, os.SEEK_END: self.size}[whence] + offset
         if self._stream is not None:
             self._stream.seek(self._offset)
         return self._offset
 
     def tell(self) -> int:
-        """Where the next read starts."""
+        """Return the position of the next read."""
         return self._offset
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
@@ -93,7 +97,7 @@ class LocalFile:
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """Bytes that came in: in a temporary file, with what the server said of them."""
+    """Downloaded file in a temporary folder, with the response headers."""
 
     path: Path
     name: str
@@ -102,12 +106,12 @@ class Download:
 
     @property
     def is_zip(self) -> bool:
-        """Whether it is several files in an archive."""
+        """Whether it is a ZIP archive of several files."""
         return self.media_type == "application/zip"
 
 
 class Client:
-    """The server's HTTP interface. Every method raises Refused where it says no or nothing."""
+    """HTTP client of a server. All methods raise RequestFailed for error responses and failed connections."""
 
     def __init__(self, server: str | None = None, token: str | None = None) -> None:
         self.server = (server or os.environ.get("FLEETMAP_SERVER") or DEFAULT_SERVER).rstrip("/")
@@ -137,22 +141,22 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Let go of the connections."""
+        """Close the connections."""
         self._http.close()
 
     # --- JSON ---
 
     def get(self, path: str, params: Mapping[str, Any] | None = None) -> Any:
-        """The JSON at a path below the API."""
+        """Get JSON from a path below the API."""
         return self._json(self._send("GET", path, params=_present(params), repeat=True))
 
     def post(self, path: str, body: Mapping[str, Any], *, repeat: bool = False) -> Any:
-        """Send JSON; ``repeat`` where the server recognises the same request by its Idempotency-Key."""
+        """Post JSON. repeat: retry with an Idempotency-Key, which the server must support at this path."""
         headers = {"Idempotency-Key": secrets.token_hex(16)} if repeat else {}
         return self._json(self._send("POST", path, content=_present(body), headers=headers, repeat=repeat))
 
     def post_until_done(self, path: str, body: Mapping[str, Any]) -> Any:
-        """Send JSON that may be sent again; where it becomes a job, wait for its end with a bar and send it again."""
+        """Post JSON. If the server starts a job, wait for its end with a progress bar and post again."""
         while True:
             answer = self._send("POST", path, content=_present(body), repeat=True)
             if answer.status_code != httpx.codes.ACCEPTED:
@@ -160,21 +164,21 @@ class Client:
             self._wait(answer)
 
     def put(self, path: str, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Any:
-        """Put JSON."""
+        """Put JSON at a path below the API."""
         return self._json(self._send("PUT", path, content=_present(body), headers=headers, repeat=True))
 
     def patch(self, path: str, body: Mapping[str, Any]) -> Any:
-        """Change some members."""
+        """Patch a resource with a JSON body."""
         return self._json(self._send("PATCH", path, content=_present(body)))
 
     def delete(
         self, path: str, params: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
     ) -> Any:
-        """Delete what stands at a path."""
+        """Delete the resource at a path."""
         return self._json(self._send("DELETE", path, params=_present(params), headers=headers, repeat=True))
 
     def pages(self, path: str, params: Mapping[str, Any], *, limit: int | None = None) -> Iterator[Any]:
-        """All items of a list, or the first ``limit``; a page names the next one in ``Link: <…>; rel="next"``."""
+        """Yield the items of a paginated list, at most ``limit``; follows ``Link: <…>; rel="next"``."""
         count, address, query = 0, path, _present(params)
         while True:
             answer = self._send("GET", address, params=query, repeat=True)
@@ -214,9 +218,10 @@ class Client:
     # --- files ---
 
     def upload(self, path: str, files: Sequence[LocalFile], fields: Mapping[str, str]) -> tuple[int, Any]:
-        """Post files as one multipart request with a bar, and wait for its job if it becomes one: (status, JSON).
+        """Post files as one multipart request with a progress bar; wait for its job if it starts one.
 
-        A lost answer is asked for again with the same Idempotency-Key, so it never becomes a second version.
+        Returns status and JSON. If the response is lost, the request is repeated with the same Idempotency-Key, so that
+        it creates one version only.
         """
         headers = {"Idempotency-Key": secrets.token_hex(16)}
         with progress_bar("uploading", total=sum(f.size for f in files), count_bytes=True) as bar:
@@ -228,7 +233,7 @@ class Client:
 
     @contextmanager
     def download(self, path: str, params: Mapping[str, Any] | None = None) -> Iterator[Download]:
-        """Get a file with a bar into a temporary place that lasts as long as the block."""
+        """Download a file with a progress bar to a temporary folder, which is removed after the ``with`` block."""
         with tempfile.TemporaryDirectory(prefix="fleetmap-") as folder:
             yield self._download(path, _present(params), Path(folder) / "download")
 
@@ -239,12 +244,12 @@ class Client:
                     return _receive(answer, target)
                 answer.read()
                 self._check(answer)
-            self._wait(answer)  # made by now: asking again gets it from the cache
+            self._wait(answer)  # the map is cached then: request it again
 
-    # --- inside ---
+    # --- internals ---
 
     def _address(self, path: str) -> str:
-        """A path below the API; whole addresses and those that start with the API's stay as they are."""
+        """Prefix a path with the API's; complete addresses and prefixed paths stay unchanged."""
         return path if path.startswith(("http:", "https:", API, "/healthz", "/readyz")) else API + path
 
     def _send(
@@ -281,10 +286,10 @@ class Client:
                     return answer
                 pause = _seconds(answer.headers["Retry-After"], pause)
             time.sleep(pause)
-        raise AssertionError("the last try returns or raises")
+        raise AssertionError("the last attempt returns or raises")
 
     def _check(self, answer: httpx.Response) -> None:
-        """Raise Refused with the problem of an error, and a hint."""
+        """Raise RequestFailed with problem and hint for an error response."""
         if answer.status_code < 400:
             return
         problem: Any = None
@@ -294,14 +299,14 @@ class Client:
             except ValueError:
                 problem = None
         if not isinstance(problem, dict):
-            problem = {"title": answer.reason_phrase, "detail": f"{answer.url} answered {answer.status_code}"}
+            problem = {"title": answer.reason_phrase, "detail": f"{answer.url} returned status {answer.status_code}"}
         hint = _hint(answer, self.token)
-        if answer.status_code == httpx.codes.NOT_FOUND and "no environment" in str(problem.get("detail")):
+        if answer.status_code == httpx.codes.NOT_FOUND and UNKNOWN_ENVIRONMENT.search(str(problem.get("detail"))):
             hint = self._other_environments(answer.url)
         raise RequestFailed(problem, status=answer.status_code, hint=hint)
 
     def _other_environments(self, url: httpx.URL) -> str:
-        """Return the environment that a mistyped one probably means; only those that the token may see."""
+        """Return a hint with the most similar environment that the token can access."""
         environment = unquote(
             url.params.get("environment") or url.path.removeprefix(f"{API}/environments/").split("/")[0]
         )
@@ -312,7 +317,7 @@ class Client:
                     environment, (row["name"] for row in self.pages("/environments", {}, limit=MAX_NAMES))
                 )
         question = near.strip(" ()").capitalize()
-        return f"{question} `fleetmap environment list` lists all.".strip()
+        return f"{question} List all with `fleetmap environment list`.".strip()
 
     @contextmanager
     def _connect(self) -> Iterator[None]:
@@ -327,17 +332,17 @@ class Client:
         try:
             return answer.json()
         except ValueError as error:
-            detail = f"{answer.url} does not answer as a Fleet Map Server: its answer is no JSON"
+            detail = f"unexpected response from {answer.url} (not JSON): check the address of the Fleet Map Server"
             raise RequestFailed(
                 {"title": "Not a Fleet Map Server", "detail": detail}, status=answer.status_code
             ) from error
 
     def _wait(self, answer: httpx.Response) -> dict[str, Any]:
-        """Follow a job to its end with a bar; Refused with the job's problem where it fails."""
+        """Wait for a job with a progress bar and return it. Raises RequestFailed with its problem if it fails."""
         location = answer.headers.get("Location")
         if answer.status_code != httpx.codes.ACCEPTED or not location:
-            detail = f"unexpected answer {answer.status_code} of {answer.url}"
-            raise RequestFailed({"title": "Unexpected answer", "detail": detail}, status=answer.status_code)
+            detail = f"unexpected status {answer.status_code} from {answer.url}"
+            raise RequestFailed({"title": "Unexpected response", "detail": detail}, status=answer.status_code)
         location, pause = urljoin(str(answer.url), location), POLL_SECONDS
         with progress_bar("waiting", total=1.0) as bar:
             while True:
@@ -349,7 +354,7 @@ class Client:
                     return job
                 if job["state"] in ("failed", "cancelled"):
                     problem = job.get("problem") or {
-                        "title": f"The job was {job['state']}",
+                        "title": f"Job {job['state']}",
                         "detail": job.get("detail"),
                     }
                     raise RequestFailed(problem, status=problem.get("status"))
@@ -358,7 +363,7 @@ class Client:
 
 
 def quote_path(*parts: Any) -> str:
-    """A path below the API from its parts, each quoted whole."""
+    """Join percent-encoded parts to a path below the API."""
     return "/" + "/".join(quote(str(part), safe="") for part in parts)
 
 
@@ -382,7 +387,7 @@ def _receive(answer: httpx.Response, target: Path) -> Download:
 
 
 def _file_name(answer: httpx.Response) -> str:
-    """The name the server gave, without any folder: it decides no place on this machine."""
+    """Return the file name from the server, without folders, so that the server cannot choose a local path."""
     message = Message()
     message["Content-Disposition"] = answer.headers.get("Content-Disposition", "")
     named = message.get_filename() or PurePosixPath(answer.url.path).name
@@ -402,15 +407,15 @@ def _seconds(retry_after: str, otherwise: float) -> float:
 
 
 def _unreachable(server: str, error: httpx.TransportError) -> RequestFailed:
-    detail = f"no answer from {server}: {error or type(error).__name__}"
-    hint = "Is it running? Start it with `fleetmap serve`, or name another with --server or FLEETMAP_SERVER."
+    detail = f"no response from {server}: {error or type(error).__name__}"
+    hint = "Start the server with `fleetmap serve`, or set the address of another one with --server or FLEETMAP_SERVER."
     return RequestFailed({"title": "Server unreachable", "detail": detail}, hint=hint)
 
 
 def _hint(answer: httpx.Response, token: str | None) -> str:
-    """Return what to do about an error on the command line."""
+    """Return a hint for the command line, empty if there is none."""
     if answer.status_code == httpx.codes.UNAUTHORIZED and token:
-        return "Give another with --token or FLEETMAP_TOKEN."
+        return "Set another token with --token or FLEETMAP_TOKEN."
     if answer.status_code == httpx.codes.UNAUTHORIZED:
-        return "Give a token with --token or FLEETMAP_TOKEN; the server's first start printed the administrator's."
+        return "Set a token with --token or FLEETMAP_TOKEN; the first start of the server printed the administrator's."
     return ""

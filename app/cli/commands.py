@@ -1,4 +1,4 @@
-"""The commands of ``fleetmap``: their modules, their panels in the help, and the one that a call needs."""
+"""Commands of ``fleetmap``: their modules and help panels. Imports only the modules of the requested command."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("verify", "verify:verify"),
     ),
 }
-"""Commands in the order of the help: name, and where its function or group is (below ``app.cli``)."""
+"""Commands in the order of the help: name, and path of its function or group below ``app.cli``."""
 
 ALIASES: Mapping[str, str] = {
     "environments": "environment",
@@ -74,14 +74,14 @@ ALIASES: Mapping[str, str] = {
     "format": "formats",
     "version": "versions",
 }
-"""Further names of commands; the help does not list them."""
+"""Aliases of commands, hidden in the help."""
 
 NEGATIVE_ARGUMENTS = frozenset({"where"})
-"""Commands whose argument may start with a minus: a southern latitude is no option."""
+"""Commands whose argument may start with a minus sign, such as a southern latitude."""
 
 
 def needed_command(arguments: Sequence[str]) -> str | None:
-    """Return the only command that a call needs: the fewer are imported, the sooner it starts. None: all of them."""
+    """Return the requested command, so that only its module is imported; None for all."""
     if "_FLEETMAP_COMPLETE" not in os.environ:
         return groups.first_command(arguments)
     typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
@@ -91,10 +91,10 @@ def needed_command(arguments: Sequence[str]) -> str | None:
 
 
 class Root(groups.Group):
-    """All commands, in the order of the panels."""
+    """Command group that lists its commands in the order of the panels."""
 
     def list_commands(self, ctx: Context) -> list[str]:
-        """Return the names as the help lists them."""
+        """Return the command names in the order of the help."""
         order = [name for commands in PANELS.values() for name, _ in commands]
         return sorted(super().list_commands(ctx), key=lambda name: order.index(ALIASES.get(name, name)))
 
@@ -103,17 +103,16 @@ def build(only: str | None = None) -> typer.Typer:
     """Build the commands.
 
     Args:
-        only: the command that is needed: others are neither imported nor built. All of them for None and for a name
-            that is no command's. Only if it is named, ``serve`` gets an option for every setting: these import
-            the server's settings.
+        only: the requested command; no other is imported or built. None or an unknown name: all commands. ``serve``
+            gets an option for every setting only if it is requested, since these import the server's settings.
     """
     app = groups.Commands(
-        "Store versioned maps of every environment, and give each robot the map in its own format.",
+        "Store versioned maps of environments and serve each robot the map format that it needs.",
         cls=Root,
         no_args_is_help=True,
         add_completion=True,
         pretty_exceptions_enable=False,
-        epilog="New here? `fleetmap serve --demo`. A command's options and an example: `fleetmap COMMAND --help`.",
+        epilog="Try it: `fleetmap serve --demo`. Options and an example of a command: `fleetmap COMMAND --help`.",
     )
 
     @app.callback()
@@ -145,7 +144,7 @@ def build(only: str | None = None) -> typer.Typer:
 
 
 def _serve_without_flags() -> None:
-    """Start the server, with a demo if you like."""
+    """Start the server, with --demo including a demo environment."""
 
 
 def _show_version(flag: bool) -> None:

@@ -1,7 +1,7 @@
-"""Files that belong to maps which the user names: a grid's picture, a building's floor plans, a world's models.
+"""Find companion files of maps on the command line: a grid's image, a building's floor plans, a world's models.
 
-The rules are those of an upload of the folder: only files beside or below a map count, and only those that its format
-says it names. It needs the server's code.
+The rules are those for uploading the folder: only files beside or below a map that its format refers to. Requires the
+server's code.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from app.cli.client import LocalFile
 from app.cli.folder import single, walk
 
 MAX_LISTED = 20_000
-"""Maximum number of files below a map's folder that are looked at by name."""
+"""Maximum number of files to list below the folder of a map."""
 
 
 def with_companions(files: Sequence[LocalFile]) -> list[LocalFile]:
-    """Add the companions of files that are named by themselves; a name that is taken stays."""
+    """Add the companions of single files. Files that are already in the list take precedence."""
     out = {file.name: file for file in files}
     for file in files:
-        if "/" in file.name or file.path.name != file.name:  # of a folder, which is taken with all its files
+        if "/" in file.name or file.path.name != file.name:  # part of a folder, which is complete
             continue
         beside = _FilesBeside(file.path)
-        # A picture says nothing of itself: what speaks for it is a file of its name (a world file, a YAML).
+        # An image does not refer to other files: a file of the same name (world file, YAML) refers to it.
         same = [n for n in beside if "/" not in n and n != file.name and _stem(n) == _stem(file.name)]
         speaking = [n for n in same if file.name in _companions(n, beside)]
         for name in [*_companions(file.name, beside), *speaking]:
@@ -36,7 +36,7 @@ def _stem(name: str) -> str:
 
 
 def _companions(main: str, beside: _FilesBeside) -> list[str]:
-    """The files that a map names, of those beside and below it; none if it is no map."""
+    """Return the companion files of a map beside and below it; empty if the file is not a map."""
     from app import formats
 
     fmt = formats.detect(main, beside[main])
@@ -51,7 +51,7 @@ def _companions(main: str, beside: _FilesBeside) -> list[str]:
 
 
 class _FilesBeside(Mapping[str, bytes]):
-    """The files beside and below a map by name, read when they are needed."""
+    """Files beside and below a map by name; read lazily."""
 
     def __init__(self, path: Path) -> None:
         folder = path.resolve().parent
@@ -61,7 +61,7 @@ class _FilesBeside(Mapping[str, bytes]):
         self._read: dict[str, bytes] = {}
 
     def path(self, name: str) -> Path:
-        """Where a file is."""
+        """Return the path of a file."""
         return self._paths[name]
 
     def __getitem__(self, name: str) -> bytes:

@@ -1,6 +1,6 @@
-"""Completion in the shell: names of environments, formats, channels, levels and grids, as the server has them.
+"""Shell completion: names of environments, formats, channels, levels and grids of the server.
 
-It returns within TIMEOUT_SECONDS and is silent if the server is unavailable or refuses: completion prints no errors.
+Returns within TIMEOUT_SECONDS, and nothing if the server is unavailable or rejects the request: it prints no errors.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any
 import typer
 
 TIMEOUT_SECONDS = 1.0
-"""Longest wait for the server: someone has pressed the tab key."""
+"""Maximum wait for the server."""
 
 MAX_NAMES = 1000
 
 DRAWN_LAYERS = ("objects", "topology", "location", "zones")
-"""The same as ``app.upload_reader.DRAWN_LAYERS``, without its imports."""
+"""Copy of ``app.upload_reader.DRAWN_LAYERS``, to avoid its imports."""
 
 
 def environments(ctx: typer.Context) -> list[tuple[str, str]]:
@@ -64,7 +64,7 @@ def grids(ctx: typer.Context) -> list[str]:
 
 
 def drawn_layers() -> list[str]:
-    """Complete the layer that a drawing is meant for."""
+    """Complete the layer of a drawing."""
     return list(DRAWN_LAYERS)
 
 
@@ -81,7 +81,7 @@ def _distinct(names: Iterable[Any]) -> list[str]:
 
 
 def _rows(ctx: typer.Context, *path: str, **query: Any) -> list[Any]:
-    """Get a list from the server; empty if it cannot be had in time, or the environment is not typed yet."""
+    """Get a list from the server; empty if it fails or takes too long, or no environment is typed yet."""
     if not all(path):
         return []
     import json

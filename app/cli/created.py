@@ -1,4 +1,4 @@
-"""The environment that an import or a generated site goes into: created if absent, removed again if the work fails."""
+"""Create the environment of an import or a generated site if needed; remove it again if the command fails."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from app.errors import FleetMapError, Invalid
 from app.model.frame import Datum
 
 LABEL = 2
-"""Characters: words of a name up to this length distinguish siblings (``hall-a``, ``hall-b``); they are no slips."""
+"""Maximum number of characters of a word that distinguishes names on purpose (``hall-a``, ``hall-b``)."""
 
 MIN_LONG_WORD_CHARACTERS = 8
-"""Characters from which a word may have two slips instead of one."""
+"""Number of characters from which two misspellings in a word are tolerated instead of one."""
 
 
 @contextmanager
@@ -29,13 +29,13 @@ def ensure_environment(
     create: bool | None = True,
     dry_run: bool = False,
 ) -> Iterator[bool]:
-    """Give the block an environment with a datum, and undo both if the block fails.
+    """Provide an environment with a datum for the ``with`` block; undo both if the block fails.
 
     Args:
-        create: whether one that does not exist is created; None: unless its name looks like a slip.
-        dry_run: nothing is created or changed.
+        create: whether to create a missing environment; None: unless its name looks like a misspelling.
+        dry_run: create and change nothing.
 
-    Yields whether the environment was created now. Raises Refused or Invalid if it must not be created.
+    Yields whether the environment was created. Raises RequestFailed or Invalid if it must not be created.
     """
     datum_values = datum.as_dict() if datum else None
     try:
@@ -44,14 +44,14 @@ def ensure_environment(
         if refused.status != 404 or str(refused.problem.get("type")).endswith(":gone"):
             raise
         if dry_run:
-            detail = f"there is no environment {name} yet, and a dry run does not create it"
+            detail = f"no environment {name} yet: a dry run does not create it"
             raise RequestFailed(
                 {"title": "No such environment", "detail": detail}, status=404, hint=refused.hint
             ) from None
         _check_new_name(client, name, create, refused)
         new_environment = client.post("/environments", {"name": name, "title": title, "datum": datum_values})
         with _undo_on_error(
-            lambda: _remove(client, new_environment), f"The environment {name}, created for this, could not be removed"
+            lambda: _remove(client, new_environment), f"The new environment {name} could not be removed"
         ):
             yield True
         return
@@ -59,23 +59,23 @@ def ensure_environment(
         yield False
         return
     client.patch(quote_path("environments", name), {"datum": datum_values})
-    with _undo_on_error(lambda: _undo_datum(client, environment), f"The new datum of {name} could not be taken back"):
+    with _undo_on_error(lambda: _undo_datum(client, environment), f"The new datum of {name} could not be reset"):
         yield False
 
 
 def _check_new_name(client: Client, name: str, create: bool | None, refused: RequestFailed) -> None:
-    """Raise Refused or Invalid unless an environment of this name may be created."""
+    """Raise RequestFailed or Invalid unless an environment of this name may be created."""
     if create is False:
         raise refused
     if create is None:
         near = slip(name, (row["name"] for row in client.pages("/environments", {}, limit=MAX_NAMES)))
         if near is not None:
-            raise Invalid(f"there is no environment {name!r} (did you mean {near}?): use --create if the name is right")
+            raise Invalid(f"no environment {name!r} (did you mean {near}?): use --create if the name is right")
 
 
 @contextmanager
 def _undo_on_error(undo: Any, failure: str) -> Iterator[None]:
-    """Undo the preparation if the block fails or is interrupted; report it if that fails as well."""
+    """Call ``undo`` if the block fails or is interrupted; add a failure of ``undo`` to the error."""
     try:
         yield
     except BaseException as error:
@@ -99,14 +99,14 @@ def _undo_datum(client: Client, environment: Mapping[str, Any]) -> None:
     """Return to the version before the datum was set, unless another client has made a version since."""
     place = quote_path("environments", environment["name"])
     if client.get(place)["version"] == environment["version"] + 1:
-        message = "take back the datum: the import it was for failed"
+        message = "reset the datum: the import failed"
         client.post(f"{place}/versions", {"revert_to": environment["version"], "message": message}, repeat=True)
 
 
 def slip(name: str, existing: Iterable[str]) -> str | None:
-    """Return the existing name that a new one looks like a slip of; None for names that only number siblings.
+    """Return the existing name that a new one probably misspells; None if it differs on purpose.
 
-    ``fram-7`` is a slip of ``farm-7``; ``farm-8`` and ``hall-b`` are none of ``farm-7`` and ``hall-a``.
+    ``fram-7`` misspells ``farm-7``; ``farm-8`` and ``hall-b`` differ on purpose from ``farm-7`` and ``hall-a``.
     """
     return next((other for other in existing if _is_slip(_words(name), _words(other))), None)
 
@@ -127,7 +127,7 @@ def _is_similar(a: str, b: str) -> bool:
 
 
 def _slips(a: str, b: str) -> int:
-    """Count letters added, left out, changed or swapped between two words (optimal string alignment)."""
+    """Count letters added, missing, changed or swapped between two words (optimal string alignment)."""
     before: list[int] = []
     row = list(range(len(b) + 1))
     for i, x in enumerate(a, 1):

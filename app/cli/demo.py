@@ -1,7 +1,6 @@
-"""The demo: a small orchard that the server makes up, so that a newcomer has something to ask for.
+"""Demo environment: a small synthetic orchard.
 
-It is what ``fleetmap generate orchard`` makes with the seed and the parameters below, asked for over HTTP like
-anybody's.
+Equal to ``fleetmap generate orchard`` with the seed and parameters below; created over HTTP.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from app.cli.problems import RequestFailed
 NAME = "orchard"
 TITLE = "Demo orchard"
 DATUM = (52.4205, 5.6132)
-"""Latitude and longitude of the local origin, in the yard's south-west corner. x runs east along the tree rows."""
+"""Latitude and longitude of the local origin, the south-west corner of the yard. x runs east along the tree rows."""
 
 SITE: dict[str, Any] = {
     "generator": "orchard",
@@ -25,9 +24,9 @@ SITE: dict[str, Any] = {
 
 
 def install(client: Client) -> dict[str, Any]:
-    """Make sure that the demo is on the server: ``{environment, version, created}``.
+    """Create the demo environment unless it has content. Return ``{environment, version, created}``.
 
-    Where the environment holds something already, it stays as it is, with whatever its users made of it.
+    An environment with content stays unchanged, including changes by users.
     """
     try:
         client.post("/environments", {"name": NAME, "title": TITLE, "tags": ["demo"]})
@@ -42,7 +41,7 @@ def install(client: Client) -> dict[str, Any]:
 
 
 def curl_lines(server: str, token: str | None) -> list[str]:
-    """Three commands to paste: which map am I on, the network, and all of it as KML."""
+    """Return three example commands: find the map at a position, get the network, get all layers as KML."""
     access = f'-H "Authorization: Bearer {token}" ' if token else ""
     return [
         f'curl {access}"{server}/api/v1/environments?contains={DATUM[0]},{DATUM[1]}"',

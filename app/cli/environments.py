@@ -23,15 +23,18 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmat
 @commands.command("list")
 def list_environments(
     query: Annotated[
-        str | None, typer.Option("--query", "-q", help="Only with this text in name, title, description or tags.")
+        str | None,
+        typer.Option("--query", "-q", help="Only environments with this text in name, title, description or tags."),
     ] = None,
-    deleted: Annotated[bool, typer.Option("--deleted", help="Only deleted ones: they can be restored.")] = False,
+    deleted: Annotated[
+        bool, typer.Option("--deleted", help="Only deleted environments, which can be restored.")
+    ] = False,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number.")] = 1000,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the environments that your token may see, by name.
+    """List the environments that your token can access, sorted by name.
 
     Example: `fleetmap environment list --query orchard`
     """
@@ -94,7 +97,7 @@ def create(
         typer.Option(
             "--clone",
             metavar="ENVIRONMENT[@VERSION]",
-            help="Start with the content of this environment, or of one of its versions or channels.",
+            help="Copy the content of this environment, or of one of its versions or channels.",
             autocompletion=completion.environments,
         ),
     ] = None,
@@ -102,7 +105,7 @@ def create(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Create an environment (as administrator). `import` and `generate` create one as well.
+    """Create an environment (as administrator). `import` and `generate` create missing ones as well.
 
     Example: `fleetmap environment create farm --datum 53.2686,-0.5245 --title 'North farm'`
     """
@@ -121,7 +124,7 @@ def create(
 @commands.command("rename")
 def rename(
     environment: options.Environment,
-    name: Annotated[str | None, typer.Argument(help="New name; leave it out to change only the texts below.")] = None,
+    name: Annotated[str | None, typer.Argument(help="New name [default: keep the name].")] = None,
     title: Title = None,
     description: Description = None,
     tag: Tags = None,
@@ -137,12 +140,12 @@ def rename(
     """
     body = {"name": name, "title": title, "description": description, "tags": tag}
     if all(value is None for value in body.values()):
-        raise typer.BadParameter("give a new name, --title, --description or --tag")
+        raise typer.BadParameter("nothing to change: use a new name, --title, --description or --tag")
     if name is not None:
         check_name(name)
     with Client(server, token) as client:
         changed = client.patch(quote_path("environments", environment), body)
-    change = f"is now called {changed['name']}" if name not in (None, environment) else "changed"
+    change = f"renamed to {changed['name']}" if name not in (None, environment) else "changed"
     _show_result(changed, f"{environment}: {change}", as_json=as_json)
 
 
@@ -160,9 +163,9 @@ def set_datum(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show or set the datum: where the local origin is on earth. A new datum makes a version.
+    """Show or set the datum, the WGS 84 position of the local origin. A new datum creates a version.
 
-    Content in metres keeps its metres; content with positions on earth keeps these.
+    Content in metres keeps its local coordinates; content in degrees keeps its latitude and longitude.
 
     Example: `fleetmap environment datum farm 53.2686,-0.5245,12.5`
     """
@@ -194,7 +197,7 @@ def delete(
     if as_json:
         output.show_json({"environment": environment, "deleted": True})
     else:
-        output.print_result(f"{environment}: deleted; `fleetmap environment restore {environment}` brings it back")
+        output.print_result(f"{environment}: deleted; restore it with `fleetmap environment restore {environment}`")
 
 
 @commands.command("restore")
@@ -223,7 +226,7 @@ def purge(
 ) -> None:
     """Remove a deleted environment permanently, with all its versions (as administrator).
 
-    Only then its name is free again. It asks first, unless you give --yes.
+    Frees its name for a new environment. Asks for confirmation unless --yes is set.
 
     Example: `fleetmap environment purge farm --yes`
     """

@@ -1,4 +1,4 @@
-"""``fleetmap events``: what happens on the server, as it happens."""
+"""``fleetmap events``: list and follow the event log of the server."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.cli.client import RETRY_SECONDS, Client
 from app.cli.problems import RequestFailed
 
 MAX_PAUSE_SECONDS = 30.0
-"""Longest pause before a stream that ended is opened again."""
+"""Maximum pause before an interrupted stream is reopened."""
 
 
 def events(
@@ -25,7 +25,7 @@ def events(
         typer.Option(
             "--environment",
             "-e",
-            help="Only events of this environment [default: of all that your token may see].",
+            help="Only events of this environment [default: all that your token can access].",
             autocompletion=completion.environments,
         ),
     ] = None,
@@ -33,19 +33,23 @@ def events(
     since: Annotated[
         int | None,
         typer.Option(
-            "--since", min=0, metavar="ID", help="Only events after this id, the first column [default: the newest]."
+            "--since",
+            min=0,
+            metavar="ID",
+            help="Only events after this id (first column) [default: the newest events].",
         ),
     ] = None,
     limit: Annotated[
-        int, typer.Option("--limit", "-n", min=0, help="Number of past events, the newest ones (without --since).")
+        int, typer.Option("--limit", "-n", min=0, help="Number of newest events to list, without --since.")
     ] = 10,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the newest events, or follow them: versions, channels that move, overlays, robots' status.
+    """List the newest events, or follow them: versions, channel moves, overlays, robot status.
 
-    With --json each event is one line of JSON, with `id` and `type`. A stream that breaks is resumed where it ended.
+    With --json each event is one line of JSON with `id` and `type`. An interrupted stream is resumed after its last
+    event.
 
     Example: `fleetmap events --follow --environment farm`
     """
@@ -59,7 +63,7 @@ def events(
 
 
 def _follow(client: Client, environment: str | None, last: int | None, *, as_json: bool) -> None:
-    """Print events until the process is interrupted; open the stream again where it ended."""
+    """Print events until the process is interrupted; resume an interrupted stream after its last event."""
     pause = RETRY_SECONDS
     while True:
         try:

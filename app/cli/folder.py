@@ -1,8 +1,8 @@
-"""Which files of a folder make an environment, and what it is called.
+"""Collect the files of a folder to upload, and derive an environment name from the folder's name.
 
-An environment_template folder, as it is found in the wild, is a ROS package with ``config/location``,
-``config/metric``, ``config/topological`` and ``config/world``; the user gives the package, or its ``config``. Any
-other folder is taken as it is. Names keep their folders, since the server decides by them what a file is meant for.
+An environment_template folder is a ROS package with ``config/location``, ``config/metric``, ``config/topological`` and
+``config/world``; the user selects the package or its ``config``. Any other folder is uploaded completely. File names
+keep their folders, from which the server infers the purpose of a file.
 """
 
 from __future__ import annotations
@@ -19,23 +19,29 @@ from app.errors import Invalid
 
 CONFIG = "config"
 PARTS = ("location", "metric", "topological", "world")
-"""The folders of an environment_template's config; the same as ``app.upload_reader.TEMPLATE_FOLDERS``, without its
+"""Folders of an environment_template's config; copy of ``app.upload_reader.TEMPLATE_FOLDERS``, to avoid its
 imports."""
 
 SCRIPTS = ("environment.sh", "properties.sh")
-"""Read as literal assignments by the server; never run."""
+"""Scripts beside ``config``. The server parses their literal assignments and never runs them."""
 
 SKIPPED = frozenset({".git", ".svn", ".hg", "__pycache__", "node_modules", ".DS_Store"})
 
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 RESERVED = frozenset({"robots", "server"})
-"""What an environment may be called; the same as in ``app.store.base``, without its imports."""
+"""Reserved environment names; copy of ``app.store.base``, to avoid its imports."""
 
 
 @dataclass(frozen=True, slots=True)
 class UploadFolder:
-    """Files to upload. root: what the names are relative to. notes: what was left out, and why."""
+    """Files to upload.
+
+    Attributes:
+        root: folder that file names are relative to.
+        is_template: whether the folder is an environment_template.
+        notes: skipped files, with the reason.
+    """
 
     root: Path
     files: tuple[LocalFile, ...]
@@ -44,10 +50,9 @@ class UploadFolder:
 
 
 def collect(folder: Path) -> UploadFolder:
-    """All files of a folder that belong to its environment, sorted by name.
+    """Collect the files of a folder that belong to its environment, sorted by name.
 
-    Of an environment_template only ``config`` and the scripts beside it are taken: the rest of the package is no map.
-    Invalid where there is nothing to upload.
+    From an environment_template only ``config`` and the scripts beside it. Raises Invalid if there are no files.
     """
     folder = folder.resolve()
     root, template_paths = _template(folder)
@@ -56,23 +61,23 @@ def collect(folder: Path) -> UploadFolder:
     if template_paths is not None:
         files += [_local(root / name, root) for name in SCRIPTS if (root / name).is_file()]
     if not files:
-        raise Invalid(f"{folder} has no files to upload")
+        raise Invalid(f"no files to upload in {folder}")
     return UploadFolder(root, tuple(sorted(files, key=lambda f: f.name)), template_paths is not None, tuple(notes))
 
 
 def environment_name(text: str) -> str:
-    """A valid environment name made from a folder's: ``Farm North (2)`` becomes ``farm-north-2``.
+    """Derive a valid environment name from a folder name: ``farm-north-2`` from ``Farm North (2)``.
 
-    Invalid where nothing is left or the name is reserved.
+    Raises Invalid if no valid characters are left or the name is reserved.
     """
     name = re.sub(r"[^a-z0-9_-]+", "-", text.lower()).strip("-_")[:63].rstrip("-_")
     if not NAME.fullmatch(name) or name in RESERVED:
-        raise Invalid(f"{text!r} makes no name for an environment: give one with --environment")
+        raise Invalid(f"no environment name can be derived from {text[:80]!r}: set one with --environment")
     return name
 
 
 def check_name(name: str) -> None:
-    """Invalid where a name that the user gave cannot be an environment's, with one that could."""
+    """Raise Invalid, with a proposal, if this is not a valid environment name."""
     if NAME.fullmatch(name) and name not in RESERVED:
         return
     try:
@@ -80,18 +85,18 @@ def check_name(name: str) -> None:
     except Invalid:
         proposal = ""
     raise Invalid(
-        f"{name!r} cannot be an environment's name: 1 to 63 of a-z, 0-9, - and _, starting with a letter or digit, "
-        f"and not robots or server{proposal}"
+        f"invalid environment name {name[:80]!r}: use 1 to 63 characters of a-z, 0-9, - and _, starting with a letter "
+        f"or digit, and not robots or server{proposal}"
     )
 
 
 def single(path: Path, name: str | None = None) -> LocalFile:
-    """One file by its own name."""
+    """Return one file to upload; name: default its own."""
     return LocalFile(name or path.name, path, path.stat().st_size)
 
 
 def _template(folder: Path) -> tuple[Path, Path | None]:
-    """What names are relative to, and the config folder; None where this is no environment_template."""
+    """Return the folder that file names are relative to, and the config folder (None: not an environment_template)."""
     if _is_config(folder / CONFIG):
         return folder, folder / CONFIG
     if folder.name == CONFIG and _is_config(folder):
@@ -100,8 +105,10 @@ def _template(folder: Path) -> tuple[Path, Path | None]:
 
 
 def walk(folder: Path, limit: int) -> Iterator[Path]:
-    """Regular files beside each other and below, the nearest first, at most ``limit``. Links that lead out and folders
-    that cannot be listed are passed over."""
+    """Yield regular files in and below a folder, breadth first, at most ``limit``.
+
+    Skips links that lead outside the folder, and folders that cannot be listed.
+    """
     waiting, count = [folder], 0
     while waiting and count < limit:
         directory = waiting.pop(0)
@@ -125,7 +132,7 @@ def _is_config(folder: Path) -> bool:
 
 
 def _walk(folder: Path, root: Path, notes: list[str]) -> Iterator[Path]:
-    """Regular files below a folder. Links are followed only while they stay inside ``root``."""
+    """Yield regular files below a folder. Links to files inside ``root`` are followed."""
     for entry in sorted(folder.iterdir()):
         if entry.name in SKIPPED:
             continue
@@ -133,10 +140,10 @@ def _walk(folder: Path, root: Path, notes: list[str]) -> Iterator[Path]:
         if entry.is_symlink():
             target = entry.resolve()
             if not target.is_relative_to(root) or target.is_dir():
-                notes.append(f"{name}: a link out of the folder or to a folder is not followed")
+                notes.append(f"{name}: links to folders or to files outside the folder are not followed")
                 continue
         try:
-            mode = os.stat(entry).st_mode  # noqa: PTH116  one call tells what it is
+            mode = os.stat(entry).st_mode  # noqa: PTH116  one call for the type
         except OSError as error:
             notes.append(f"{name}: {error.strerror or error}")
             continue
@@ -145,7 +152,7 @@ def _walk(folder: Path, root: Path, notes: list[str]) -> Iterator[Path]:
         elif stat.S_ISREG(mode):
             yield entry
         else:
-            notes.append(f"{name}: neither a file nor a folder")
+            notes.append(f"{name}: not a regular file")
 
 
 def _local(path: Path, root: Path) -> LocalFile:

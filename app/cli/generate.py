@@ -1,4 +1,4 @@
-"""``fleetmap generate``: sites made up, on a server or straight into files."""
+"""``fleetmap generate``: generate synthetic sites, on a server or as files."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ Site = Annotated[
     ),
 ]
 Seed = Annotated[
-    int, typer.Option("--seed", min=0, help="Number to start from: the same seed gives the same site again.")
+    int, typer.Option("--seed", min=0, help="Random seed: the same seed and parameters give the same site.")
 ]
 EnvironmentOption = Annotated[
     str | None,
     typer.Option(
         "--environment",
         "-e",
-        help="Environment to store it in, created if it does not exist [default: SITE-SEED].",
+        help="Environment to store the site in, created if missing [default: SITE-SEED].",
         autocompletion=completion.environments,
     ),
 ]
 Describe = Annotated[
     bool,
-    typer.Option("--parameters", help="Only show what the generator makes, and its parameters: needs no server."),
+    typer.Option("--parameters", help="Only describe the generator and its parameters. Needs no server."),
 ]
 To = Annotated[
     str | None,
     typer.Option(
         "--to",
-        help="Write a map in this format instead: needs no server, stores nothing.",
+        help="Write a map in this format instead of storing the site. Needs no server.",
         autocompletion=completion.formats,
     ),
 ]
@@ -58,7 +58,7 @@ def generate(
     site: Site = None,
     seed: Seed = 0,
     environment: EnvironmentOption = None,
-    option: Annotated[list[str] | None, options.named_values_option("A parameter of the generator")] = None,
+    option: Annotated[list[str] | None, options.named_values_option("Parameter of the generator")] = None,
     datum: options.DatumText = None,
     describe: Describe = False,
     to: To = None,
@@ -70,10 +70,10 @@ def generate(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Generate a synthetic site with all its maps: rows of trees, rooms, streets, caves, … Without a name, list them.
+    """Generate a synthetic site with all its maps: orchards, buildings, streets, caves, … Without a name, list them.
 
     The list, --parameters and `--to FORMAT -o FILE` need no server. With --to, -O also takes parameters of the format.
-    An environment that does not exist is created, and removed again if the generator fails.
+    A missing environment is created, and removed again if the generator fails.
 
     Example: `fleetmap generate orchard --seed 7 -O rows=6 -e orchard-7`
     """
@@ -87,7 +87,7 @@ def generate(
     place = options.datum(datum)
     if to is None:
         if out is not None:
-            raise typer.BadParameter("-o needs --to FORMAT: name the format of the file")
+            raise typer.BadParameter("-o requires --to FORMAT, the format of the file")
         name = environment or environment_name(f"{site}-{seed}")
         check_name(name)
         body = {"generator": site, "seed": seed, "parameters": values, "message": message, "replace": replace}
@@ -100,11 +100,13 @@ def generate(
         show_commit(name, result, as_json=as_json)
         return
     if out is None:
-        raise typer.BadParameter("--to needs -o: a file, a folder, or - for standard output")
+        raise typer.BadParameter("--to requires -o: a file, a folder, or - for standard output")
     if environment is not None:
-        raise typer.BadParameter("--environment keeps the site on a server, --to writes a file: choose one")
+        raise typer.BadParameter(
+            "--environment and --to cannot be combined: store the site on a server, or write a file"
+        )
     if out == "-" and as_json:
-        raise typer.BadParameter("--json and -o - both want standard output")
+        raise typer.BadParameter("--json and -o - cannot be combined: both write to standard output")
     _write(site, seed, values, place, to, out, as_json=as_json)
 
 
@@ -117,7 +119,7 @@ def _list(*, as_json: bool) -> None:
         output.show_json(generators)
         return
     output.show_table(
-        ("generator", "what it makes", "works on", "gives", "parameters"),
+        ("generator", "description", "works on", "gives", "parameters"),
         [
             (
                 one["id"],
@@ -154,14 +156,14 @@ def _worked_on(details: Mapping[str, Any]) -> str:
 
 
 def _check_names(site: str, ours: set[str], to: str, values: Mapping[str, str]) -> None:
-    """Check options before anything is made. Raises Invalid with those of the generator and of the format."""
+    """Check the names of options. Raises Invalid with the accepted ones of the generator and the format."""
     from app import derive, formats, parameters
 
     theirs = {p["name"] for p in parameters.describe(formats.get_format(to).write_options)}
     derived = {name for step in derive.all_derivations() for name in derive.parameter_names(step)}
     for name in values.keys() - ours - theirs - derived:
         of_format = f"; {to} accepts {', '.join(sorted(theirs))}" if theirs else ""
-        reason = f"no such parameter of {site}; accepted: {', '.join(sorted(ours))}{of_format}"
+        reason = f"unknown parameter of {site}: use one of {', '.join(sorted(ours))}{of_format}"
         raise Invalid(f"{name}: {reason}", [Problem(reason, where=name)])
 
 
@@ -179,7 +181,7 @@ def _write(
     formats.get_format(to)
     if generator.editable_layers:
         raise Invalid(
-            f"{site} works on {', '.join(sorted(generator.editable_layers))} of an environment: name one with "
+            f"{site} changes the layers {', '.join(sorted(generator.editable_layers))} of an environment: set one with "
             "--environment"
         )
     ours = {p["name"] for p in parameters.describe(generator.parameters)}

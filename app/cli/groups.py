@@ -1,4 +1,4 @@
-"""Groups of commands: help in panels, ``--json`` on either side of a command, and names that nearly exist."""
+"""Command groups: help in panels, ``--json`` before or after a command, and proposals for mistyped names."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
     from typer._click import Context, HelpFormatter
 
 MAX_WIDTH = 120
-"""Columns of help, however wide the terminal is: longer lines are hard to read."""
+"""Maximum width of help in columns."""
 
 PIPED_WIDTH = 100
-"""Columns of help where the output is no terminal."""
+"""Width of help in columns if the output is not a terminal."""
 
 JSON = "fleetmap.json"
 """Key in a context's ``meta``: whether ``--json`` precedes the command."""
 
 LIST = "list"
-"""Command of a group of things that runs if none is named."""
+"""Default command of a ``ListGroup``."""
 
 
 class Command(TyperCommand):
-    """A command with help in panels, which proposes the nearest name for an unknown option."""
+    """Command with help in panels and a proposal for an unknown option."""
 
     def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
         """Parse the arguments."""
@@ -46,11 +46,11 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """Commands that take ``--json`` before their name as well, and propose the nearest name for an unknown one."""
+    """Command group that accepts ``--json`` before a command as well, with a proposal for an unknown command."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        self.suggest_commands = False  # in Typer's words
+        self.suggest_commands = False  # replaces Typer's own suggestions
         self.params.append(
             TyperOption(
                 param_decls=["--json"],
@@ -64,9 +64,9 @@ class Group(TyperGroup):
         )
 
     def resolve_command(self, ctx: Context, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find the command of the first argument and hand ``--json`` on to it."""
+        """Find the command of the first argument and pass ``--json`` on to it."""
         if not ctx.resilient_parsing and not args[0].startswith("-") and args[0] not in self.commands:
-            ctx.fail(f"there is no command {args[0]}{did_you_mean(args[0], self.commands)}")
+            ctx.fail(f"unknown command {args[0]}{did_you_mean(args[0], self.commands)}")
         name, command, rest = super().resolve_command(ctx, args)
         return name, command, ["--json", *rest] if ctx.meta.pop(JSON, False) else rest
 
@@ -82,10 +82,10 @@ class Group(TyperGroup):
 
 
 class ListGroup(Group):
-    """Commands for one kind of thing. Without a command it lists: ``channels farm`` is ``channels list farm``."""
+    """Command group with the default command ``list``: ``channels farm`` is ``channels list farm``."""
 
     def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
-        """Put ``list`` before arguments that name no command, unless they are one with a slip in it."""
+        """Insert ``list`` before arguments that start with neither a command nor a misspelled one."""
         if not ctx.resilient_parsing:
             first = next((argument for argument in args if argument != "--json"), "-")
             named = first == "--help" or (not first.startswith("-") and nearest(first, self.commands) is not None)
@@ -94,7 +94,7 @@ class ListGroup(Group):
 
 
 class Commands(typer.Typer):
-    """A group whose commands are of the classes above."""
+    """Typer application with the command and group classes of this module."""
 
     def __init__(self, help: str, *, cls: type[Group] = ListGroup, **attributes: Any) -> None:
         super().__init__(cls=cls, help=help, rich_markup_mode=None, **attributes)
@@ -106,15 +106,15 @@ class Commands(typer.Typer):
 
 @contextmanager
 def _naming_options(command: Command | Group, ctx: Context) -> Iterator[None]:
-    """Tell of an unknown option in the words of all other errors; Typer's say "possible options"."""
+    """Report unknown options in the style of all other errors."""
     try:
         yield
-    except Exception as error:  # Typer brings the class along in some releases, and takes it from click in others
+    except Exception as error:  # the class is Typer's or click's, depending on the release
         if type(error).__name__ != "NoSuchOption":
             raise
         option = getattr(error, "option_name", "")
         names = [name for parameter in command.get_params(ctx) for name in parameter.opts if name.startswith("--")]
-        ctx.fail(f"there is no option {option}{did_you_mean(option, names)}")
+        ctx.fail(f"unknown option {option}{did_you_mean(option, names)}")
 
 
 def show_help(command: Command | Group, ctx: Context) -> None:
@@ -127,7 +127,7 @@ def show_help(command: Command | Group, ctx: Context) -> None:
         if getattr(text, "help", None):
             text.help = _markup(text.help)
     rich_utils.MAX_WIDTH = _width()
-    rich_utils.FORCE_TERMINAL = None  # rich itself decides on colours, and honours FORCE_COLOR and NO_COLOR
+    rich_utils.FORCE_TERMINAL = None  # rich chooses colours and respects FORCE_COLOR and NO_COLOR
     rich_utils.rich_format_help(obj=command, ctx=ctx, markup_mode="rich")
 
 
@@ -146,12 +146,12 @@ def _markup(text: str) -> str:
     return "".join(f"[cyan]`{part}`[/]" if number % 2 else part for number, part in enumerate(parts))
 
 
-def _note_json(ctx: Context, parameter: Any, value: bool) -> bool:  # noqa: ARG001  as Typer calls it
+def _note_json(ctx: Context, parameter: Any, value: bool) -> bool:  # noqa: ARG001  Typer's signature
     if value:
         ctx.meta[JSON] = True
     return value
 
 
 def first_command(arguments: Sequence[str]) -> str | None:
-    """Return the first argument that is no option: the command, since no option before it takes a value."""
+    """Return the first argument that is not an option: the command, since no option before it takes a value."""
     return next((argument for argument in arguments if not argument.startswith("-")), None)

@@ -1,4 +1,4 @@
-"""``fleetmap jobs``: work of the server that takes long."""
+"""``fleetmap jobs``: list, show and cancel long-running conversions and uploads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.cli import options, output
 from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 
-commands = Commands("List, show and cancel the server's long-running work.")
+commands = Commands("List, show and cancel jobs, the server's long-running work.")
 
 STATES = ("queued", "running", "done", "failed", "cancelled")
 
@@ -23,7 +23,7 @@ def list_jobs(
         str | None,
         typer.Option(
             "--state",
-            help="Only queued, running, done, failed or cancelled ones.",
+            help="Only jobs in this state: queued, running, done, failed or cancelled.",
             autocompletion=lambda: list(STATES),
         ),
     ] = None,
@@ -32,7 +32,7 @@ def list_jobs(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the jobs of your token, newest first; as administrator, all of them.
+    """List the jobs of your token, newest first. An administrator sees all jobs.
 
     Example: `fleetmap jobs list`
     """
@@ -58,7 +58,7 @@ def show(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show one job: its progress, and where its result is or why it failed.
+    """Show one job: state, progress, and the location of its result or its problem.
 
     Example: `fleetmap jobs show 7f3a…`
     """
@@ -88,7 +88,7 @@ def cancel(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Cancel a job that runs. A job that has ended is removed from the list.
+    """Cancel a running job, or remove a finished one from the list.
 
     Example: `fleetmap jobs cancel 7f3a…`
     """
@@ -98,4 +98,4 @@ def cancel(
     if as_json:
         output.show_json({"id": job, "cancelled": running, "removed": not running})
     else:
-        output.print_result(f"job {job}: {'cancelled' if running else 'removed, since it had ended'}")
+        output.print_result(f"job {job}: {'cancelled' if running else 'removed, it was already finished'}")

@@ -1,4 +1,4 @@
-"""``fleetmap keys``: the keys that sign manifests, which robots verify."""
+"""``fleetmap keys``: list, show and rotate the keys that sign manifests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.cli.groups import Commands
 from app.cli.problems import RequestFailed
 from app.model.names import did_you_mean
 
-commands = Commands("List, show and rotate the keys that sign what robots fetch.")
+commands = Commands("List, show and rotate the keys that sign manifests for robots.")
 
 
 @commands.command("list")
@@ -21,7 +21,7 @@ def list_keys(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the server's public keys. The first one signs; each is endorsed by the key before it.
+    """List the server's public keys, newest first. The newest signs; each is endorsed by the next older one.
 
     Example: `fleetmap keys list`
     """
@@ -39,7 +39,7 @@ def list_keys(
 @commands.command("show")
 def show(
     key: Annotated[
-        str | None, typer.Argument(metavar="ID", help="Id of the key [default: the one that signs].")
+        str | None, typer.Argument(metavar="ID", help="Id of the key [default: the current signing key].")
     ] = None,
     server: options.Server = None,
     token: options.Token = None,
@@ -54,7 +54,7 @@ def show(
     row = next((row for row in rows if key in (None, row["id"])), None)
     if row is None:
         near = did_you_mean(key or "", [row["id"] for row in rows])
-        raise RequestFailed({"title": "Not found", "detail": f"the server has no key {key!r}{near}"}, status=404)
+        raise RequestFailed({"title": "Not found", "detail": f"unknown key {key!r}{near}"}, status=404)
     output.show_json(row) if as_json else output.print_result(row["public_key"])
 
 
@@ -65,17 +65,17 @@ def rotate(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Sign with a new key from now on (as administrator). Robots that trust the old key follow.
+    """Replace the signing key with a new one (as administrator). Robots that trust the old key accept the new one.
 
-    It asks first, unless you give --yes.
+    Asks for confirmation unless --yes is set.
 
     Example: `fleetmap keys rotate --yes`
     """
     if not yes:
-        typer.confirm("Sign with a new key from now on? This cannot be undone.", abort=True, err=True)
+        typer.confirm("Replace the signing key? This cannot be undone.", abort=True, err=True)
     with Client(server, token) as client:
         result = client.post("/keys", {})
     if as_json:
         output.show_json(result)
     else:
-        output.print_result(f"key {result['id']} signs from now on: {result['public_key']}")
+        output.print_result(f"new signing key {result['id']}: {result['public_key']}")

@@ -26,12 +26,12 @@ Environment = Annotated[
     typer.Option(
         "--environment",
         "-e",
-        help="Name of the environment, created if it does not exist [default: made from the folder's name].",
+        help="Name of the environment, created if missing [default: derived from the folder's name].",
         autocompletion=completion.environments,
     ),
 ]
 Mode = Annotated[
-    str, typer.Option("--mode", help="replace: a map replaces what it describes; merge: nothing is deleted.")
+    str, typer.Option("--mode", help="replace: a map replaces the parts that it contains; merge: nothing is deleted.")
 ]
 
 
@@ -55,8 +55,8 @@ def import_maps(
     """Upload a folder or files as a new version of an environment.
 
     A folder with config/location, config/metric, config/topological or config/world is an environment_template: the
-    folder of a file says what the file is meant for. An environment that does not exist is created, and removed again
-    if the upload fails.
+    server infers the purpose of a file from its folder. A missing environment is created, and removed again if the
+    upload fails.
 
     Example: `fleetmap import network.kml --environment farm --layer topology -m 'drawn by hand'`
     """
@@ -64,10 +64,10 @@ def import_maps(
     extra = options.pairs(option)
     if environment is not None:
         folders.check_name(environment)
-    files, suggested, notes = _collect(paths)
+    files, suggested, notes = _collect(paths, for_environment=environment is None)
     name = environment or suggested
     if name is None:
-        raise typer.BadParameter("files need --environment NAME; a folder would give its own name")
+        raise typer.BadParameter("missing --environment NAME: it is optional only for a single folder")
     fields = {"level": level, "mode": mode, "message": message or _default_message(paths)} | extra
     fields |= {k: v for k, v in (("format", format), ("layer", layer), ("grid", grid)) if v is not None}
     fields |= {"dry_run": "true"} if dry_run else {}
@@ -86,7 +86,7 @@ def import_maps(
         output.show_json(body)
         return
     for note in notes:
-        output.print_status(f"left out: {note}", style="yellow")
+        output.print_status(f"skipped: {note}", style="yellow")
     _show_import(name, status, body, dry_run=dry_run, is_new=is_new)
 
 
@@ -99,16 +99,16 @@ def export_map(
     option: options.Options = None,
     derive: options.Derive = True,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Also report what was derived, filled in or dropped on the way.")
+        bool, typer.Option("--verbose", "-v", help="Also print the map report: derived, filled-in and dropped data.")
     ] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Get the map of an environment in any format, and print the paths that were written.
+    """Export the map of an environment in any format, and print the written paths.
 
-    A map of several files becomes a folder if -o names one (`-o out/`), otherwise a ZIP. Without -o it is written
-    here, under the server's name for it.
+    Several files are written to a folder if -o is one (`-o out/`), otherwise as a ZIP. Default for -o: the file name
+    from the server, in the working directory.
 
     Example: `fleetmap export farm occupancy_grid -o maps/ -O resolution=0.1`
     """
@@ -134,10 +134,10 @@ def export_map(
 def link(
     environment: options.Environment,
     format: options.MapFormat,
-    file: Annotated[str | None, typer.Argument(help="Only this file of the map [default: the whole map].")] = None,
+    file: Annotated[str | None, typer.Argument(help="Only this file of the map [default: the complete map].")] = None,
     version: options.MapVersion = None,
     seconds: Annotated[
-        int | None, typer.Option("--seconds", min=1, help="Life in seconds [default: the server's maximum, 86400].")
+        int | None, typer.Option("--seconds", min=1, help="Lifetime in seconds [default: the server's maximum, 86400].")
     ] = None,
     option: options.Options = None,
     derive: options.Derive = True,
@@ -145,9 +145,9 @@ def link(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Create a signed link to a map: an address that needs no token until it expires.
+    """Create a signed link to a map, which needs no token until it expires.
 
-    The link names the version by number, so it always returns the same bytes. Anyone who has it can read this map.
+    The link contains the version number, so it always returns the same bytes. Anyone with the link can read this map.
 
     Example: `fleetmap link farm tmap2 --seconds 3600`
     """
@@ -184,8 +184,8 @@ def convert(
 ) -> None:
     """Convert map files on this machine, without a server.
 
-    A map of several files becomes a folder, or a ZIP if the name of the output ends in .zip. -O takes parameters of
-    the output's format, of the derivations on the way, and of the formats of the input.
+    Several files are written to a folder, or as a ZIP if -o ends in .zip. -O sets parameters of the output format, of
+    derivations and of the input formats.
 
     Example: `fleetmap convert network.kml --layer topology --to tmap2 -o network.tmap2.yaml`
     """
@@ -218,7 +218,7 @@ def convert(
         output.show_json({"files": names, "report": converted.report.as_dict()})
         return
     for note in notes:
-        output.print_status(f"left out: {note}", style="yellow")
+        output.print_status(f"skipped: {note}", style="yellow")
     for name in names if as_folder else [out] if out != "-" else []:
         output.print_status(f"wrote {Path(out) / name if as_folder else name}")
     show_report(converted.report.as_dict())
@@ -229,10 +229,10 @@ def check(
     format: options.Format = None,
     as_json: options.Json = False,
 ) -> None:
-    """Check whether the robots and tools that load these files would accept them.
+    """Check whether robots and tools would accept these map files.
 
-    The rules are those of each format's own loaders (Nav2's map_server, its route server, …). Nothing is uploaded or
-    changed. The exit status is 1 if a map would be refused.
+    Applies the rules of each format's own loaders (Nav2's map_server, its route server, …). Uploads and changes
+    nothing. The exit status is 1 if a map would be rejected.
 
     Example: `fleetmap check map.yaml map.pgm`
     """
@@ -250,16 +250,16 @@ def check(
         level = findings[0]["level"] if findings else "fine" if group.format.check else "unchecked"
         results.append({"format": group.format.name, "file": group.main, "result": level, "findings": findings})
     if not results:
-        raise Invalid("none of the files is a map that is known here: name the format with --format")
+        raise Invalid("no file has a recognised map format: set it with --format")
     if as_json:
         output.show_json({"maps": results, "unknown": rest})
     else:
         for note in notes:
-            output.print_status(f"left out: {note}", style="yellow")
+            output.print_status(f"skipped: {note}", style="yellow")
         for line in results:
             _show_check(line)
         for name in rest:
-            output.print_status(f"not checked: {name}: no format reads this file")
+            output.print_status(f"not checked: {name}: no format can read this file")
     if any(line["result"] == "error" for line in results):
         raise typer.Exit(1)
 
@@ -269,15 +269,13 @@ def list_formats(
         str | None,
         typer.Argument(
             metavar="[FORMAT]",
-            help="One format: its files, layers and parameters [default: list all formats].",
+            help="Show the files, layers and parameters of this format [default: list all formats].",
             autocompletion=completion.formats,
         ),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the formats that can be read and written, or describe one with its parameters.
-
-    Needs no server.
+    """List all formats, or describe one with its parameters. Needs no server.
 
     Example: `fleetmap formats occupancy_grid`
     """
@@ -304,11 +302,11 @@ def list_formats(
         )
         for f in descriptions
     ]
-    output.show_table(("format", "what it is", "read", "served as", "layers", "options"), rows)
+    output.show_table(("format", "description", "read", "served as", "layers", "options"), rows)
 
 
 def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
-    """Describe a format: files, the layers that it keeps and drops, what a map of it needs, and its parameters."""
+    """Print a format: files, layers that it keeps and drops, requirements of a map, and parameters."""
     carried_layers = [layer for layer in described["information"] if layer in fmt.layers]
     dropped = [layer for layer in described["information"] if layer not in fmt.layers]
     dropped += ["blocked edges"] if "topology" in fmt.layers and not fmt.traits.marks_blocked else []
@@ -319,10 +317,10 @@ def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
             "uploads": "yes, detected from the content" if fmt.read else "not read",
             "maps": ", ".join(fmt.files) if fmt.write else "not written",
             "media types": ", ".join(dict.fromkeys(fmt.files.values())) if fmt.write else "",
-            "a map needs": _requirements_text(fmt.needs) if fmt.write else "",
+            "requires": _requirements_text(fmt.needs) if fmt.write else "",
             "keeps": ", ".join(carried_layers),
             "derived from it": ", ".join(derived) if fmt.read else "",
-            "has no place for": ", ".join(dropped) if fmt.write else "",
+            "drops": ", ".join(dropped) if fmt.write else "",
         }
     )
     for use, title in (("write", "Parameters of a map"), ("read", "Parameters of an upload")):
@@ -330,7 +328,7 @@ def _show_format(fmt: Format, described: Mapping[str, Any]) -> None:
 
 
 def _requirements_text(needs: LayerRequirements) -> str:
-    """Format what a map needs: ``objects, or occupancy; and a datum``."""
+    """Format the requirements of a map: ``objects, or occupancy; and a datum``."""
     layers = ", or ".join(" with ".join(sorted(layers)) for layers in needs.one_of)
     datum = "a datum" if needs.datum else "a datum, if any content is in metres" if needs.anchor == "wgs84" else ""
     return "; and ".join(filter(None, (layers, datum)))
@@ -367,13 +365,13 @@ def coverage(
     environment: options.Environment,
     version: options.Version = "latest",
     picture: Annotated[
-        str | None, typer.Option("--picture", help="Write an SVG picture of which file makes which map to this path.")
+        str | None, typer.Option("--picture", help="Write an SVG diagram of sources, layers and formats to this path.")
     ] = None,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the formats that an environment can be exported in: directly, by deriving layers, or what is missing.
+    """List the formats that an environment can be exported in, with derivations needed or data missing.
 
     Example: `fleetmap coverage farm`
     """
@@ -395,11 +393,11 @@ def coverage(
         how = ", then ".join(steps) or "; ".join(row.get("missing") or ()) or "-"
         how += f"; {row['choose']}" if row.get("choose") else ""
         lines.append((row["format"], row["state"], how.removeprefix("-; ")))
-    output.show_table(("format", "state", "how, or what to supply"), lines)
+    output.show_table(("format", "state", "derivations, or what to supply"), lines)
 
 
 def show_report(report: Mapping[str, Any]) -> None:
-    """What a map is made of and what it lost, for people."""
+    """Print a map report as text."""
     for line in report.get("layers") or ():
         steps = ", ".join(_step(step) for step in line.get("steps") or ())
         name = "/".join(str(line[k]) for k in ("layer", "level", "name") if line.get(k))
@@ -412,11 +410,19 @@ def show_report(report: Mapping[str, Any]) -> None:
     output.show_warnings(report.get("warnings") or ())
 
 
-def _collect(paths: Sequence[Path]) -> tuple[list[LocalFile], str | None, tuple[str, ...]]:
-    """Files to upload, a name for the environment where they are one folder, and what was left out."""
+def _collect(
+    paths: Sequence[Path], *, for_environment: bool = False
+) -> tuple[list[LocalFile], str | None, tuple[str, ...]]:
+    """Collect the files to upload. Also return an environment name if it is a single folder, and skipped files.
+
+    Args:
+        for_environment: propose --environment for a missing path that may be the name of an environment.
+    """
     for path in paths:
         if not path.exists():
-            raise NotFound(f"{path} does not exist")
+            is_name = for_environment and len(paths) > 1 and folders.NAME.fullmatch(str(path)) is not None
+            hint = f": set an environment with --environment {path}" if is_name else ""
+            raise NotFound(f"no file or folder {str(path)!r}{hint}")
     if len(paths) == 1 and paths[0].is_dir():
         upload_folder = folders.collect(paths[0])
         inner = upload_folder.root if upload_folder.is_template else paths[0].resolve()
@@ -438,7 +444,7 @@ def _collect(paths: Sequence[Path]) -> tuple[list[LocalFile], str | None, tuple[
     names = [f.name for f in files]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise Invalid(f"two of the files are called {twice[0]}: import their folder, or one after the other")
+        raise Invalid(f"duplicate file name {twice[0]}: import their folder, or import them one by one")
     return files, None, tuple(notes)
 
 
@@ -449,23 +455,23 @@ def _default_message(paths: Sequence[Path]) -> str:
 
 def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bool, is_new: bool) -> None:
     if dry_run:
-        output.print_result(f"{name}: this would make a version")
+        output.print_result(f"{name}: this would create a version")
     elif status == 201:
         output.print_result(f"{name}: version {body['version']}{' of the new environment' if is_new else ''}")
     else:
-        output.print_result(f"{name}: nothing changed, version {body['version']} stays")
-    if dry_run or status == 201:  # else they are those of the version that stays
+        output.print_result(f"{name}: no changes, still version {body['version']}")
+    if dry_run or status == 201:  # otherwise these are the changes of the existing version
         for subject, change in (body.get("changes") or {}).items():
             output.print_result(f"  {change_line(subject, change)}")
     kinds = [f"{layer} {kind}" for layer, kind in (body.get("information") or {}).items() if kind != "missing"]
     if kinds:
-        output.print_result(f"  holds: {', '.join(kinds)}")
+        output.print_result(f"  layers: {', '.join(kinds)}")
     sources = body.get("sources") or []
     used = [s for s in sources if s.get("used")]
     idle = [s for s in sources if not s.get("used")]
     empty = sum(not s["size"] for s in idle)
     note = f" ({empty} of them empty)" if empty else ""
-    output.print_result(f"  files: {len(used)} used, {len(idle)} kept as sources only{note}")
+    output.print_result(f"  files: {len(used)} used, {len(idle)} stored as sources only{note}")
     for source in used:
         output.print_result(
             f"    {source['name']} ({source.get('format') or 'part of a map'}, {output.size(source['size'])})"
@@ -479,13 +485,13 @@ def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bo
 
 
 def _preferred_channel(client: Client, environment: str) -> str:
-    """What the short address for robots gives: production where there is one, else latest."""
+    """Return ``production`` if the channel exists, else ``latest``, like the short map address for robots."""
     names = {row["channel"] for row in channel_rows(client, environment)}
     return "production" if "production" in names else "latest"
 
 
 def _store(got: Download, to: str | None) -> list[str]:
-    """Put a download where the user wants it: the places."""
+    """Write a download to a file, a folder or standard output. Return the written paths."""
     if to is not None and output_files.wants_folder(to):
         if got.is_zip:
             return [str(Path(to) / name) for name in output_files.unpack(got.path, Path(to))]
@@ -501,10 +507,10 @@ def _store(got: Download, to: str | None) -> list[str]:
 
 
 _RESULTS: Mapping[str, str] = {
-    "fine": "nothing to complain of",
-    "warning": "loads, with doubts",
-    "error": "would be refused",
-    "unchecked": "no rules are known for this format",
+    "fine": "no problems",
+    "warning": "loads with warnings",
+    "error": "would be rejected",
+    "unchecked": "not checked, this format has no rules",
 }
 
 

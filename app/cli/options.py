@@ -1,4 +1,4 @@
-"""Options that several commands share, and how their texts are read."""
+"""Shared options of commands, and parsing of their values."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ CONNECTION = "Server and output"
 
 
 def named_values_option(help: str) -> Any:
-    """Declare the option -O NAME=VALUE, which ``pairs`` reads."""
+    """Declare the option -O NAME=VALUE, parsed by ``pairs``."""
     return typer.Option("--option", "-O", metavar="NAME=VALUE", help=f"{help}; repeatable.")
 
 
-Options = Annotated[
-    list[str] | None, named_values_option("A parameter of the format; `fleetmap formats FORMAT` lists them")
-]
+Options = Annotated[list[str] | None, named_values_option("Parameter of the format, see `fleetmap formats FORMAT`")]
 Server = Annotated[
     str | None,
     typer.Option(
@@ -54,7 +52,7 @@ Environment = Annotated[
 ]
 MapFormat = Annotated[
     str,
-    typer.Argument(help="Format of the map; `fleetmap formats` lists them.", autocompletion=completion.formats),
+    typer.Argument(help="Format of the map, see `fleetmap formats`.", autocompletion=completion.formats),
 ]
 Version = Annotated[
     str,
@@ -69,11 +67,11 @@ MapVersion = Annotated[
         autocompletion=completion.versions,
     ),
 ]
-Derive = Annotated[
-    bool, typer.Option("--derive/--no-derive", help="Compute layers that the map needs and no source contains.")
+Derive = Annotated[bool, typer.Option("--derive/--no-derive", help="Derive missing layers that the map needs.")]
+Message = Annotated[
+    str, typer.Option("--message", "-m", help="Reason for the change, shown in the history.", show_default=False)
 ]
-Message = Annotated[str, typer.Option("--message", "-m", help="Reason, for the history.", show_default=False)]
-Replace = Annotated[bool, typer.Option("--replace", help="Also replace what was uploaded or edited.")]
+Replace = Annotated[bool, typer.Option("--replace", help="Also replace uploaded or edited content.")]
 Format = Annotated[
     str | None,
     typer.Option(
@@ -91,9 +89,7 @@ Layer = Annotated[
         autocompletion=completion.drawn_layers,
     ),
 ]
-Level = Annotated[
-    str, typer.Option("--level", help="Level (storey) that the map belongs to.", autocompletion=completion.levels)
-]
+Level = Annotated[str, typer.Option("--level", help="Level of the map.", autocompletion=completion.levels)]
 Grid = Annotated[
     str | None,
     typer.Option("--grid", help="Name of the occupancy grid: map, keepout, speed, …", autocompletion=completion.grids),
@@ -111,7 +107,7 @@ Create = Annotated[
     bool | None,
     typer.Option(
         "--create/--no-create",
-        help="Create an environment that does not exist, or refuse to "
+        help="Create a missing environment, or fail "
         "[default: create, unless the name looks like a misspelling of an existing one].",
         show_default=False,
     ),
@@ -119,26 +115,26 @@ Create = Annotated[
 
 
 def check_choice(option: str, value: str | None, choices: Sequence[str]) -> None:
-    """Refuse a value that is none of the choices, with the nearest of them; None is the default."""
+    """Check that a value is one of the choices or None. Raises BadParameter with the most similar one."""
     if value is not None and value not in choices:
-        raise typer.BadParameter(f"{option} is one of {', '.join(choices)}{did_you_mean(value, choices)}")
+        raise typer.BadParameter(f"{option} must be one of {', '.join(choices)}{did_you_mean(value, choices)}")
 
 
 def pairs(texts: list[str] | None) -> dict[str, str]:
-    """``name=value`` texts as a dictionary; Invalid for anything else or a name given twice."""
+    """Parse ``name=value`` texts. Raises Invalid for other texts and duplicate names."""
     out: dict[str, str] = {}
     for text in texts or ():
         name, equals, value = text.partition("=")
         if not equals or not name.strip():
-            raise Invalid(f"--option needs NAME=VALUE, got {text!r}")
+            raise Invalid(f"--option must be NAME=VALUE, got {text[:80]!r}")
         if name.strip() in out:
-            raise Invalid(f"--option {name.strip()} is given twice")
+            raise Invalid(f"duplicate --option {name.strip()}")
         out[name.strip()] = value
     return out
 
 
 def datum(text: str | None) -> Datum | None:
-    """``LAT,LON`` or ``LAT,LON,HEADING`` in degrees; Invalid where it is not, or out of range."""
+    """Parse ``LAT,LON`` or ``LAT,LON,HEADING`` in degrees. Raises Invalid."""
     if text is None:
         return None
     try:
@@ -146,5 +142,5 @@ def datum(text: str | None) -> Datum | None:
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3):
-        raise Invalid(f"--datum needs LAT,LON or LAT,LON,HEADING in degrees, got {text!r}")
+        raise Invalid(f"--datum must be LAT,LON or LAT,LON,HEADING in degrees, got {text[:80]!r}")
     return Datum(numbers[0], numbers[1], heading=numbers[2] if len(numbers) == 3 else 0.0)

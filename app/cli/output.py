@@ -1,7 +1,7 @@
-"""What the command line prints: tables and progress for people, JSON for programs, problems for both.
+"""Output of the command line: tables, progress, JSON and problems.
 
 Results go to standard output, everything else (progress, warnings, errors) to standard error, so that output can be
-piped. Texts of files and servers are never read as markup, and their control characters never reach the terminal.
+piped. Texts of files and servers are never interpreted as markup, and their control characters are removed.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from rich.table import Table
 from rich.text import Text
 
 PIPED_WIDTH = 160
-"""Columns where the output is no terminal that could tell its own width."""
+"""Width in columns if the output is not a terminal."""
 
 WORD = 13
-"""Characters: words up to this length are not broken in tables."""
+"""Maximum number of characters of words that tables do not break."""
 
 GAP = 2
-"""Blanks between the columns of a table."""
+"""Number of spaces between the columns of a table."""
 
 MAX_FILES_NAMED = 3
-"""Files that one line of warning names where many have the same."""
+"""Maximum number of files listed in one line of a shared warning."""
 
 
 def _console(*, stderr: bool) -> Console:
@@ -39,28 +39,28 @@ def _console(*, stderr: bool) -> Console:
 
 
 def single_line(value: Any) -> str:
-    """A value as one line of text without control characters."""
+    """Format a value as one line of text without control characters."""
     text = "" if value is None else str(value)
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def print_status(text: str, *, style: str | None = None) -> None:
-    """A line for people, on standard error."""
+    """Print a line of status to standard error."""
     _console(stderr=True).print(Text(single_line(text), style=style or ""), soft_wrap=True)
 
 
 def print_result(text: str) -> None:
-    """A line of the result, on standard output."""
+    """Print a line of the result to standard output."""
     _console(stderr=False).print(Text(single_line(text)), soft_wrap=True)
 
 
 def show_json(value: Any) -> None:
-    """A result as JSON on standard output."""
+    """Print a result as JSON to standard output."""
     sys.stdout.write(json.dumps(value, ensure_ascii=False, indent=2) + "\n")
 
 
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, title: str | None = None) -> None:
-    """A table on standard output. What identifies a row stays in one line where there is room; long texts wrap."""
+    """Print a table to standard output. The first column stays on one line if possible; long texts wrap."""
     console = _console(stderr=False)
     cells = [[single_line(cell) for cell in row] for row in rows]
     table = Table(title=Text(single_line(title)) if title else None, box=None, pad_edge=False, title_justify="left")
@@ -74,7 +74,7 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, title: 
 
 
 def show_members(members: Mapping[str, Any]) -> None:
-    """Print what one thing is: a line for each member that has a value."""
+    """Print one object: a line for each member with a value."""
     width = max((len(name) for name in members), default=0)
     for name, value in members.items():
         if value not in (None, "", [], {}):
@@ -87,7 +87,7 @@ def minute(time: Any) -> str:
 
 
 def datum(datum: Any) -> str:
-    """Format a datum for people: ``53.25, -0.5, heading 12.5°``."""
+    """Format a datum: ``53.25, -0.5, heading 12.5°``."""
     if not isinstance(datum, Mapping):
         return "none"
     heading = datum.get("heading")
@@ -95,16 +95,16 @@ def datum(datum: Any) -> str:
 
 
 def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
-    """How wide each column of a table is, in characters of a terminal with ``room`` of them.
+    """Return the width of each column of a table, in characters; ``room`` is the width of the terminal.
 
-    Each gets a word's width. The first column, then the narrowest ones, get all that they need while that leaves the
-    others half of the room; these share it.
+    Each column gets the width of a word. Then the first column, then the narrowest ones, get their full width as long
+    as half of the remaining room is left for the others, which share it.
     """
     full = [max(map(cell_len, texts)) for texts in columns]
     words = [max((cell_len(word) for text in texts for word in text.split()), default=1) for texts in columns]
     widths = [max(1, min(WORD, word)) for word in words]
     left = room - GAP * (len(columns) - 1) - sum(widths)
-    while left < 0 and max(widths) > 1:  # a narrow terminal: even words are broken
+    while left < 0 and max(widths) > 1:  # narrow terminal: words are broken
         widths[widths.index(max(widths))] -= 1
         left += 1
     for number in sorted(range(len(columns)), key=lambda n: (n > 0, full[n])):
@@ -122,7 +122,7 @@ def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
 
 
 def problem_place(problem: Mapping[str, Any]) -> str:
-    """One problem as compilers print it: ``file:line: where: what``."""
+    """Format a problem like a compiler: ``file:line: where: what``."""
     head = str(problem.get("file") or "")
     if problem.get("line") is not None:
         head = f"{head}:{problem['line']}" if head else f"line {problem['line']}"
@@ -131,7 +131,7 @@ def problem_place(problem: Mapping[str, Any]) -> str:
 
 
 def show_warnings(warnings: Sequence[Mapping[str, Any]], *, limit: int = 20) -> None:
-    """Warnings on standard error, the first of many. Files that all have the same one share a line."""
+    """Print warnings to standard error, at most ``limit`` lines. Files with the same warning share a line."""
     lines: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for number, warning in enumerate(warnings):
         whole_file = warning.get("file") and warning.get("line") is None and not warning.get("where")
@@ -142,17 +142,17 @@ def show_warnings(warnings: Sequence[Mapping[str, Any]], *, limit: int = 20) -> 
         more = f" and {len(alike) - MAX_FILES_NAMED} more" if len(alike) > MAX_FILES_NAMED else ""
         line = f"{len(alike)} files: {alike[0].get('problem')}: {names}{more}" if names else problem_place(alike[0])
         severe = alike[0].get("level") == "error"
-        print_status(f"{'would be refused' if severe else 'warning'}: {line}", style="red" if severe else "yellow")
+        print_status(f"{'would be rejected' if severe else 'warning'}: {line}", style="red" if severe else "yellow")
     if len(groups) > limit:
         print_status(f"… and {sum(map(len, groups[limit:]))} more warnings (--json shows all)", style="yellow")
 
 
 def show_problem(problem: Mapping[str, Any], *, hint: str = "", as_json: bool = False, limit: int = 50) -> None:
-    """An RFC 9457 problem on standard error: what went wrong, then each place as ``file:line: reason``."""
+    """Print an RFC 9457 problem to standard error: the detail, then each error as ``file:line: reason``."""
     if as_json:
         sys.stderr.write(json.dumps(problem, ensure_ascii=False, indent=2) + "\n")
         return
-    detail = str(problem.get("detail") or problem.get("title") or "it failed")
+    detail = str(problem.get("detail") or problem.get("title") or "failed")
     print_status(f"error: {detail}", style="bold red")
     errors = [e for e in problem.get("errors") or () if isinstance(e, Mapping)]
     for error in errors[:limit]:
@@ -166,7 +166,7 @@ def show_problem(problem: Mapping[str, Any], *, hint: str = "", as_json: bool = 
 
 
 def size(count: int) -> str:
-    """Bytes for people."""
+    """Format a number of bytes with its unit."""
     value = float(count)
     for unit in ("B", "kB", "MB"):
         if value < 1000:
@@ -176,20 +176,20 @@ def size(count: int) -> str:
 
 
 class ProgressBar:
-    """One line of progress; it moves forward only where standard error is a terminal."""
+    """Progress in one line; shown only if standard error is a terminal."""
 
     def __init__(self, progress: Progress | None, task: TaskID | None) -> None:
         self._progress, self._task = progress, task
 
     def advance(self, amount: float) -> None:
-        """This much more is done."""
+        """Add an amount of completed work."""
         if self._progress is not None and self._task is not None:
             self._progress.advance(self._task, amount)
 
     def update(
         self, *, completed: float | None = None, total: float | None = None, description: str | None = None
     ) -> None:
-        """Set what is done, how much there is, or what is being done."""
+        """Set the completed or total amount, or the description."""
         if self._progress is not None and self._task is not None:
             text = None if description is None else single_line(description)
             self._progress.update(self._task, completed=completed, total=total, description=text)
@@ -197,7 +197,7 @@ class ProgressBar:
 
 @contextmanager
 def progress_bar(description: str, *, total: float | None = None, count_bytes: bool = False) -> Iterator[ProgressBar]:
-    """A progress bar on standard error while the block runs; ``total=None`` shows that work goes on."""
+    """Show a progress bar on standard error during the ``with`` block; without ``total`` it shows activity only."""
     if not sys.stderr.isatty():
         yield ProgressBar(None, None)
         return

@@ -1,4 +1,4 @@
-"""Putting maps on this machine's disk: whole or not at all, and never outside the folder that was named."""
+"""Write map files to the local disk: atomically, and never outside the chosen folder."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ STDOUT = Path("-")
 
 
 def wants_folder(output: str | None) -> bool:
-    """Whether the user means a folder: it is one, or is written with a slash at its end."""
+    """Whether the output is a folder: an existing one, or a name with a trailing slash."""
     return output is not None and (output.endswith("/") or Path(output).is_dir())
 
 
 def to_stdout(stream: IO[bytes]) -> None:
-    """All bytes to standard output; Invalid where that is a terminal."""
+    """Copy all bytes to standard output. Raises Invalid if that is a terminal."""
     if sys.stdout.isatty():
-        raise Invalid("this is no text for a terminal: redirect the output, or name a file with -o")
+        raise Invalid("binary output to a terminal: redirect it, or write a file with -o")
     shutil.copyfileobj(stream, sys.stdout.buffer)
     sys.stdout.buffer.flush()
 
 
 def to_file(path: Path, stream: IO[bytes]) -> None:
-    """All bytes to a file: written beside it and renamed, so that no reader sees half a map."""
+    """Write all bytes to a file atomically: to a temporary file, which is then renamed. Raises Invalid."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
     except OSError as error:
-        raise Invalid(f"{path} cannot be written: {error.strerror or error}") from error
+        raise Invalid(f"could not write {path}: {error.strerror or error}") from error
     try:
         with os.fdopen(handle, "wb") as target:
             shutil.copyfileobj(stream, target)
@@ -50,12 +50,12 @@ def to_file(path: Path, stream: IO[bytes]) -> None:
         with contextlib.suppress(OSError):
             Path(temporary).unlink()
         if isinstance(error, OSError):
-            raise Invalid(f"{path} cannot be written: {error.strerror or error}") from error
+            raise Invalid(f"could not write {path}: {error.strerror or error}") from error
         raise
 
 
 def unpack(archive: Path, folder: Path) -> list[str]:
-    """The files of a served archive below a folder: their names. Names that lead out of it are refused."""
+    """Unpack an archive from the server to a folder. Return the file names. Raises Invalid for unsafe names."""
     names = []
     with zipfile.ZipFile(archive) as opened:
         members = [m for m in opened.infolist() if not m.is_dir()]
@@ -68,15 +68,15 @@ def unpack(archive: Path, folder: Path) -> list[str]:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The place of a named file below a folder; Invalid for names that would leave it."""
+    """Return the path of a file below a folder. Raises Invalid for names that would leave it."""
     reason = name_problem(name)
     if reason:
-        raise Invalid(f"the map has a file called {name!r}, which cannot be written here: its name {reason}")
+        raise Invalid(f"unsafe file name {name[:80]!r} in the map: it {reason}")
     return folder.joinpath(*PurePosixPath(name).parts)
 
 
 def bundle(files: Mapping[str, bytes], output: Path, *, folder: bool) -> list[str]:
-    """A map's files as a folder, a file (several as a ZIP), or on standard output: the names that were written."""
+    """Write a map as a folder, a file (several files as a ZIP) or to standard output. Return the file names."""
     from app.syntax.archives import pack
 
     targets = {name: inside(output, name) for name in files}

@@ -1,4 +1,4 @@
-"""``fleetmap overlays``: what is blocked now, as robots and people have reported it."""
+"""``fleetmap overlays``: list, report and decide on temporary obstructions."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from app.cli.groups import Commands
 from app.errors import Invalid
 from app.model.names import did_you_mean
 
-commands = Commands("List, report and decide on what is blocked for a time (closures).")
+commands = Commands("List, report and decide on temporary obstructions (overlays, closures).")
 
 STATES = ("pending", "accepted", "rejected", "expired", "ended")
 
-Overlay = Annotated[str, typer.Argument(metavar="ID", help="Id of the overlay, as `fleetmap overlays list` shows it.")]
+Overlay = Annotated[str, typer.Argument(metavar="ID", help="Id of the overlay, see `fleetmap overlays list`.")]
 
 
 @commands.command("list")
@@ -29,7 +29,7 @@ def list_overlays(
         str | None,
         typer.Option(
             "--state",
-            help="Only pending, accepted (in force), rejected, expired or ended ones [default: all of 30 days].",
+            help="Only in this state: pending, accepted (in force), rejected, expired or ended [default: all].",
             autocompletion=lambda: list(STATES),
         ),
     ] = None,
@@ -37,7 +37,7 @@ def list_overlays(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List what was reported as blocked, oldest first.
+    """List reported obstructions, oldest first.
 
     Example: `fleetmap overlays list farm --state pending`
     """
@@ -81,7 +81,7 @@ def show(
     row = next((row for row in rows if row["id"] == overlay), None)
     if row is None:
         near = did_you_mean(overlay, [row["id"] for row in rows])
-        raise Invalid(f"{environment} has no overlay {overlay!r} of the last 30 days{near}")
+        raise Invalid(f"no overlay {overlay[:80]!r} in {environment} during the last 30 days{near}")
     if as_json:
         output.show_json(row)
         return
@@ -107,40 +107,44 @@ def show(
 @commands.command("create")
 def create(
     environment: options.Environment,
-    edge: Annotated[str | None, typer.Option("--edge", help="Id of the blocked edge: one direction of a lane.")] = None,
+    edge: Annotated[
+        str | None, typer.Option("--edge", help="Id of the blocked edge (one direction of a lane).")
+    ] = None,
     polygon: Annotated[
         Path | None, typer.Option("--polygon", metavar="FILE", help="GeoJSON file with the blocked polygon.")
     ] = None,
     crs: Annotated[
         str | None,
-        typer.Option("--crs", help="Coordinates of the polygon: wgs84 or local [default: wgs84 if there is a datum]."),
+        typer.Option(
+            "--crs", help="Coordinates of the polygon: wgs84 or local [default: wgs84 if the environment has a datum]."
+        ),
     ] = None,
     level: Annotated[
         str | None,
         typer.Option("--level", help="Level of the polygon [default: ground].", autocompletion=completion.levels),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=1, help="How long it is blocked [default: 3600].")
+        float | None, typer.Option("--seconds", min=1, help="Duration in seconds [default: 3600].")
     ] = None,
     until: Annotated[
-        str | None, typer.Option("--until", metavar="TIME", help="When it ends (RFC 3339), instead of --seconds.")
+        str | None, typer.Option("--until", metavar="TIME", help="End (RFC 3339), instead of --seconds.")
     ] = None,
-    detail: Annotated[str | None, typer.Option("--detail", "-m", help="What is in the way.")] = None,
+    detail: Annotated[str | None, typer.Option("--detail", "-m", help="Description of the obstruction.")] = None,
     accept: Annotated[
-        bool, typer.Option("--accept", help="Put it in force at once (as editor), instead of waiting for a decision.")
+        bool, typer.Option("--accept", help="Accept it at once (as editor), without a separate decision.")
     ] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Report that an edge or an area is blocked for a time.
+    """Report a temporarily blocked edge or area.
 
     Example: `fleetmap overlays create farm --edge A_B --seconds 1800 --detail 'fallen tree' --accept`
     """
     if (edge is None) == (polygon is None):
-        raise typer.BadParameter("give --edge or --polygon, one of them")
+        raise typer.BadParameter("use either --edge or --polygon")
     if edge is not None and (crs is not None or level is not None):
-        raise typer.BadParameter("--crs and --level belong to --polygon")
+        raise typer.BadParameter("--crs and --level require --polygon")
     body = {"kind": "blocked", "edge": edge, "crs": crs, "level": level, "ttl_seconds": seconds, "expires": until}
     body |= {"detail": detail, "polygon": _polygon(polygon) if polygon else None}
     body["state"] = "accepted" if accept else None
@@ -150,7 +154,7 @@ def create(
 
 
 def _decision(name: str, help: str) -> Callable[..., None]:
-    """Make the command that decides on an overlay by posting to its sub-path of the same name."""
+    """Create the command ``name``, which posts to the sub-path ``name`` of an overlay."""
 
     def decide(
         environment: options.Environment,
@@ -167,14 +171,16 @@ def _decision(name: str, help: str) -> Callable[..., None]:
     return decide
 
 
-accept = _decision("accept", "Put a pending overlay in force on every channel until its end (as editor).")
-reject = _decision("reject", "Reject a pending overlay: nothing changes (as editor).")
+accept = _decision("accept", "Accept a pending overlay: it is in force on every channel until its end (as editor).")
+reject = _decision("reject", "Reject a pending overlay (as editor).")
 end = _decision("end", "End an accepted overlay now: robots may use the edge or area again (as editor).")
-keep = _decision("keep", "Make an accepted overlay permanent in a new version (as editor). Promote that version then.")
+keep = _decision(
+    "keep", "Make an accepted overlay permanent in a new version (as editor). Promote that version afterwards."
+)
 
 
 def describe_obstruction(row: Mapping[str, Any]) -> str:
-    """Name what an overlay blocks: ``edge A_B``, ``area``."""
+    """Format the blocked item of an overlay: ``edge A_B`` or ``area``."""
     return f"edge {row['edge']}" if row.get("edge") else "area"
 
 
@@ -182,7 +188,7 @@ def _print_decision(environment: str, overlay: Mapping[str, Any], *, as_json: bo
     if as_json:
         output.show_json(overlay)
         return
-    permanence = f"; version {overlay['version']} keeps it blocked" if overlay.get("version") is not None else ""
+    permanence = f"; permanently blocked in version {overlay['version']}" if overlay.get("version") is not None else ""
     until = f" until {output.minute(overlay['expires'])} UTC" if overlay["state"] in ("pending", "accepted") else ""
     state = {"pending": "waits for a decision", "accepted": "is in force", "ended": "has ended"}
     became = state.get(overlay["state"], f"is {overlay['state']}")
@@ -192,7 +198,7 @@ def _print_decision(environment: str, overlay: Mapping[str, Any], *, as_json: bo
 
 
 def _polygon(path: Path) -> Any:
-    """Read the one polygon of a GeoJSON file: a geometry, a feature, or a collection of one. Raises Invalid."""
+    """Read a GeoJSON file with one polygon: a geometry, a feature, or a collection of one. Raises Invalid."""
     try:
         geometry = json.loads(path.read_bytes())
     except ValueError as error:
@@ -200,10 +206,10 @@ def _polygon(path: Path) -> Any:
     features = geometry.get("features") if isinstance(geometry, dict) else None
     if isinstance(features, list):
         if len(features) != 1:
-            raise Invalid(f"{path} has {len(features)} features: give a file with one polygon")
+            raise Invalid(f"{path} has {len(features)} features: use a file with one polygon")
         geometry = features[0]
     if isinstance(geometry, dict) and geometry.get("type") == "Feature":
         geometry = geometry.get("geometry")
     if not isinstance(geometry, dict) or geometry.get("type") not in ("Polygon", "MultiPolygon"):
-        raise Invalid(f"{path} has no polygon: give a GeoJSON Polygon or MultiPolygon")
+        raise Invalid(f"{path} has no polygon: use a GeoJSON Polygon or MultiPolygon")
     return geometry

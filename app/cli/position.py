@@ -1,4 +1,4 @@
-"""Which map am I on: the environments that a position is in."""
+"""``fleetmap where``: find the environments at a position."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def locate(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the environments that a position is in, best match first: which map am I on?
+    """List the environments that contain a position, best match first.
 
     GNSS fences come first, then the smallest area. The exit status is 1 if there is no such environment.
 

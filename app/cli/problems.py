@@ -9,7 +9,7 @@ from app.errors import FleetMapError
 
 
 class RequestFailed(Exception):
-    """The server's answer is a problem, or there is no answer. ``problem`` has RFC 9457's members."""
+    """Error response of the server, or no response. ``problem`` has the members of RFC 9457."""
 
     def __init__(self, problem: Mapping[str, Any], *, status: int | None = None, hint: str = "") -> None:
         super().__init__(str(problem.get("detail") or problem.get("title") or "refused"))
@@ -17,17 +17,17 @@ class RequestFailed(Exception):
 
 
 HINTS: Mapping[str, str] = {
-    "MissingDatum": "On the command line: --datum LAT,LON, or a datum.yaml among the files.",
-    "missing-datum": "On the command line: `fleetmap import PATH --environment NAME --datum LAT,LON`.",
-    "gone": "`fleetmap environment restore NAME` brings it back; `fleetmap environment purge NAME` frees the name.",
-    "Ambiguous": "On the command line: --option grid=NAME.",
-    "ambiguous": "On the command line: --option grid=NAME.",
+    "MissingDatum": "Set it with --datum LAT,LON, or add a datum.yaml to the files.",
+    "missing-datum": "Set it with `fleetmap import PATH --environment NAME --datum LAT,LON`.",
+    "gone": "Restore it with `fleetmap environment restore NAME`, or free its name with `… purge NAME`.",
+    "Ambiguous": "Choose one with --option grid=NAME.",
+    "ambiguous": "Choose one with --option grid=NAME.",
 }
-"""What to do here, by our own errors' class or the last word of a server's problem type."""
+"""Hints by error class, or by the last part of the problem type of the server."""
 
 
 def as_problem(error: FleetMapError) -> dict[str, Any]:
-    """An error of our own as the server would tell it."""
+    """Return the RFC 9457 problem of a local error."""
     problem: dict[str, Any] = {"title": type(error).__name__, "detail": error.detail}
     if error.problems:
         problem["errors"] = [p.as_dict() for p in error.problems]
@@ -35,7 +35,7 @@ def as_problem(error: FleetMapError) -> dict[str, Any]:
 
 
 def describe_error(error: Exception) -> tuple[dict[str, Any] | None, str]:
-    """Return the problem of an error and a hint; None for an error that is not the user's to mend."""
+    """Return the problem of an error and a hint; None for an internal error."""
     if isinstance(error, RequestFailed):
         kind = str(error.problem.get("type", "")).rpartition(":")[2]
         return error.problem, error.hint or HINTS.get(kind, "")
@@ -44,7 +44,7 @@ def describe_error(error: Exception) -> tuple[dict[str, Any] | None, str]:
     if isinstance(error, ModuleNotFoundError):
         if error.name is None or error.name.partition(".")[0] == "app":
             return None, ""
-        detail = f"this command needs the server's packages ({error.name} is not installed)"
+        detail = f"this command requires the server's packages: {error.name} is not installed"
         return {"title": "Not installed", "detail": detail}, 'pip install "fleet-map-server[server]"'
     if isinstance(error, OSError):
         prefix = f"{error.filename}: " if error.filename else ""

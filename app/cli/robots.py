@@ -1,4 +1,4 @@
-"""``fleetmap robots``: what each robot runs, and which are behind."""
+"""``fleetmap robots``: list, show and forget robots."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from app.cli import completion, options, output
 from app.cli.client import Client, quote_path
 from app.cli.groups import Commands
 
-commands = Commands("List robots, what they run, and which are offline or behind their channel.")
+commands = Commands("List robots with their version, state and lag behind their channel.")
 
 InEnvironment = Annotated[
     str | None,
@@ -64,12 +64,12 @@ def list_robots(
 def show(
     robot: Robot,
     environment: InEnvironment = None,
-    limit: Annotated[int, typer.Option("--limit", "-n", min=1, max=200, help="Number of former reports.")] = 10,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, max=200, help="Number of previous reports.")] = 10,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show one robot with its former reports, newest first.
+    """Show one robot with its previous reports, newest first.
 
     Example: `fleetmap robots show mower-3`
     """
@@ -106,15 +106,15 @@ def forget(
     robot: Robot,
     environment: Annotated[
         str,
-        typer.Option(
-            "--environment", "-e", help="Environment to forget it in.", autocompletion=completion.environments
-        ),
+        typer.Option("--environment", "-e", help="Environment of the robot.", autocompletion=completion.environments),
     ],
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Forget a robot that is out of service: it no longer counts for its channel. Its next report brings it back.
+    """Forget a robot that is out of service, so that it no longer counts for its channel.
+
+    Its next report adds it again.
 
     Example: `fleetmap robots forget mower-3 --environment farm`
     """
@@ -133,7 +133,7 @@ def runs(row: Mapping[str, Any]) -> str:
 
 
 def behind(row: Mapping[str, Any]) -> str:
-    """Format how far a robot is behind its channel; empty if it is not."""
+    """Format the lag of a robot behind its channel; empty if there is none."""
     lag = row.get("lag")
     if not lag or not (lag["differs"] or lag["events"]):
         return ""

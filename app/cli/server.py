@@ -1,4 +1,4 @@
-"""The server's side of the command line: serve and migrate, and the demo that ``serve --demo`` brings along."""
+"""Server commands: serve, migrate and demo."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ if TYPE_CHECKING:
 _ASSIGNED = re.compile(rf"\s*(?:export\s+)?({variables.PREFIX}\w+)\s*=", re.IGNORECASE)
 
 SECRETS_DIR = "FLEETMAP_SECRETS_DIR"
-"""Names the folder where a container mounts secrets: a file named like a setting (``fleetmap_admin_token``) holds its
-value. It is no setting itself, since it says where settings are."""
+"""Variable with the folder of mounted secrets, in which a file named like a setting (``fleetmap_admin_token``) contains
+its value. Not a setting itself, since settings are read from there.
+"""
 
 START_SECONDS = 60.0
-"""How long the demo waits for the server to be ready."""
+"""Maximum time that the demo waits until the server is ready."""
 
 PANELS: Mapping[str, str] = {
     **dict.fromkeys(("data", "database", "blob", "cache", "memory"), "Data"),
@@ -48,28 +49,28 @@ PANELS: Mapping[str, str] = {
     **dict.fromkeys(("imagery", "models"), "Satellite pictures and models"),
     "max": "Limits of uploads and maps",
 }
-"""Panels of the help by the first word of a setting; the others are in the first panel."""
+"""Help panels by the first word of a setting; the others are in the first panel."""
 
 NOT_FLAGS = frozenset({"admin_token", "zenoh_password"})
-"""Settings that must not stand in a command line, where every user of the machine can read them."""
+"""Settings without an option: secrets in a command line are visible to all users of the machine."""
 
 DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
-"""In the data folder, readable for its owner: lets ``serve --demo`` print commands that work at every start."""
+"""File in the data folder, readable by its owner only: keeps the token of ``serve --demo`` the same at every start."""
 
 
 def serve(*, demo: bool = False, **values: Any) -> None:
-    """Start the server, with a demo if you like.
+    """Start the server.
 
     It runs in the foreground and stops cleanly on SIGTERM and Ctrl-C.
 
-    Every option is also a setting: FLEETMAP_… in the environment or in a file .env, or a file fleetmap_… in the folder
-    that FLEETMAP_SECRETS_DIR names. Sizes are bytes, or have a unit: 512MiB, 2GB.
+    Each option can also be set as FLEETMAP_… in the environment or in a file .env, or as a file fleetmap_… in the
+    folder FLEETMAP_SECRETS_DIR. Sizes are in bytes or have a unit: 512MiB, 2GB.
 
     Example: `fleetmap serve --port 8080 --data-dir /srv/fleetmap --max-upload-bytes 2GiB`
     """
     settings = load_settings(values)
     if demo and settings.tls_certificate is not None:
-        raise typer.BadParameter("the demo is shown over plain HTTP: leave out --demo or --tls-certificate")
+        raise typer.BadParameter("--demo and --tls-certificate cannot be combined: the demo uses plain HTTP")
     _check_certificate(settings)
     if demo:
         settings = with_demo_token(settings)
@@ -78,7 +79,7 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         from app.pool import preload_in_background
 
         preload_in_background()
-    gc.disable()  # until the application is made: what is loaded by then stays
+    gc.disable()  # until the application is created: modules loaded until then stay in memory anyway
     from app import main
 
     try:
@@ -99,9 +100,9 @@ def serve(*, demo: bool = False, **values: Any) -> None:
 
 
 def _compile(folder: Path) -> None:
-    """Have the derivations' native code compiled into a folder, beside the start: workers read it and cannot write.
+    """Compile the native code of derivations into a folder, in the background. Workers only read the folder.
 
-    Where ``NUMBA_CACHE_DIR`` names a folder, that one is taken. Until it is done, workers compile what they need.
+    Uses the folder ``NUMBA_CACHE_DIR`` if set. Until compilation has finished, workers compile the code that they need.
     """
     from app import native
 
@@ -125,7 +126,7 @@ def migrate(
 ) -> None:
     """Migrate the database to the schema of this release.
 
-    PostgreSQL needs it before the server of a new release starts. SQLite is migrated at each start anyway.
+    Required for PostgreSQL before a new release starts. SQLite is migrated at each start.
 
     Example: `fleetmap migrate --database-url postgresql+psycopg://fleetmap@db/fleetmap`
     """
@@ -141,7 +142,7 @@ def migrate(
 
 
 def demo(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
-    """Install the demo environment on a running server. A second time changes nothing.
+    """Install the demo environment on a running server, if it is not installed yet.
 
     Example: `fleetmap demo`
     """
@@ -155,14 +156,14 @@ def demo(server: options.Server = None, token: options.Token = None, as_json: op
         output.show_json(result)
         return
     output.print_result(
-        f"{result['environment']}: version {result['version']}{'' if result['created'] else ' was there already'}"
+        f"{result['environment']}: version {result['version']}{'' if result['created'] else ' exists already'}"
     )
     for line in lines:
         output.print_result(f"  {line}")
 
 
 def application(settings: Settings) -> Any:
-    """The ASGI application, in a server process of its own: it ends with the process that started it."""
+    """Create the ASGI application of a server process, which stops with its parent process."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_stop_with_parent, args=(parent,), daemon=True).start()
@@ -170,13 +171,16 @@ def application(settings: Settings) -> Any:
 
     server_app = create_app(settings)
     gc.freeze()
-    gc.unfreeze()  # all of it counts as old now, without a look at any of it
+    gc.unfreeze()  # moves all objects to the oldest generation without scanning them
     gc.enable()
     return server_app
 
 
 def load_settings(values: Mapping[str, Any]) -> Settings:
-    """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones."""
+    """Load the settings from options, the environment, ``.env`` and mounted secrets, in this order of precedence.
+
+    Raises BadParameter for invalid settings.
+    """
     local.require_server_python("serve")
     from pydantic import ValidationError
 
@@ -186,7 +190,7 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
     folder = os.environ.get(SECRETS_DIR)
     if folder:
         if not Path(folder).is_dir():
-            raise typer.BadParameter(f"{SECRETS_DIR}: there is no folder {folder}")
+            raise typer.BadParameter(f"{SECRETS_DIR}: folder {folder} not found")
         given["_secrets_dir"] = folder
     _warn_unknown(Settings.model_fields, Path(".env"))
     try:
@@ -202,7 +206,7 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
 
 
 def _warn_unknown(settings: Iterable[str], file: Path) -> None:
-    """Warn of FLEETMAP_ variables, in the environment or a .env file, that nothing reads."""
+    """Warn about unused FLEETMAP_ variables in the environment or in a .env file."""
     names = dict.fromkeys(name.upper() for name in os.environ if name.upper().startswith(variables.PREFIX))
     if file.is_file():
         lines = file.read_text(errors="replace").splitlines()
@@ -213,14 +217,14 @@ def _warn_unknown(settings: Iterable[str], file: Path) -> None:
 
 
 def with_flags(function: Callable[..., None]) -> Callable[..., None]:
-    """``serve`` with an option for every setting, as ``app.config.Settings`` declares them."""
+    """Return ``serve`` with an option for each setting of ``app.config.Settings``."""
     local.require_server_python("serve")
     from app.config import Settings, format_size
 
     def command(**values: Any) -> None:
         function(**values)
 
-    demo = Annotated[bool, typer.Option("--demo", help="Install a small demo environment, and print commands to try.")]
+    demo = Annotated[bool, typer.Option("--demo", help="Install a small demo environment and print example commands.")]
     parameters: dict[str, tuple[Any, bool | None]] = {"demo": (demo, False)}
     for name, field in Settings.model_fields.items():
         if name in NOT_FLAGS:
@@ -247,7 +251,7 @@ def with_flags(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _metavar(annotation: Any) -> str:
-    """Return the word for a setting's value in the help: its choices, or its kind."""
+    """Return the placeholder for a setting's value in the help: its choices, or its type."""
     if get_origin(annotation) is Literal:
         return "|".join(get_args(annotation))
     kinds = {int: "NUMBER", float: "NUMBER", Path: "PATH"}
@@ -255,7 +259,7 @@ def _metavar(annotation: Any) -> str:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; Unavailable where the address is taken or not this machine's."""
+    """Open a listening socket. Raises Unavailable if the address is in use or does not belong to this machine."""
     listener: socket.socket | None = None
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(
@@ -268,13 +272,13 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         if listener is not None:
             listener.close()
-        detail = f"cannot listen on {host} port {port}: {error.strerror or error}; choose another with --port or --host"
+        detail = f"cannot listen on {host} port {port} ({error.strerror or error}): use another --port or --host"
         raise Unavailable(detail) from error
     return listener
 
 
 def local_address(listener: socket.socket, *, secure: bool = False) -> str:
-    """Where a client on this machine reaches it."""
+    """Return the URL of the server for clients on this machine."""
     scheme = "https" if secure else "http"
     host, port = listener.getsockname()[:2]
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  compared, not bound
@@ -282,17 +286,17 @@ def local_address(listener: socket.socket, *, secure: bool = False) -> str:
 
 
 def _check_certificate(settings: Settings) -> None:
-    """BadParameter where HTTPS could not be served with what was given."""
+    """Raise BadParameter if certificate and key cannot be loaded."""
     if settings.tls_certificate is None or settings.tls_key is None:
         return
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(settings.tls_certificate, settings.tls_key)
     except (OSError, ssl.SSLError) as error:
-        raise typer.BadParameter(f"--tls-certificate and --tls-key cannot be used: {error}") from error
+        raise typer.BadParameter(f"invalid --tls-certificate or --tls-key: {error}") from error
 
 
 def check(settings: Settings) -> None:
-    """Whether the server could start, told before it does; Unavailable with what to do about it."""
+    """Check database and data folder before the start. Raises Unavailable, with a solution."""
     with _store(settings) as store:
         if settings.database.startswith("sqlite"):
             from app.main import startup_lock
@@ -302,14 +306,14 @@ def check(settings: Settings) -> None:
         store.check()
         try:
             store.check_writable()
-        except NoRoom as error:  # maps are served all the same
+        except NoRoom as error:  # reading still works
             output.print_status(error.detail, style="yellow")
 
 
 def with_demo_token(settings: Settings) -> Settings:
-    """The settings with an administrator's token that stays the same at every start of the demo.
+    """Return the settings with an administrator's token that is the same at every start of the demo.
 
-    It is kept in the data folder, readable for its owner alone. One that the operator has set is left as it is.
+    It is stored in the data folder, readable by its owner only. A token set by the operator is kept.
     """
     from pydantic import SecretStr
 
@@ -332,7 +336,7 @@ def _store(settings: Settings) -> Any:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         settings.blob_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Unavailable(f"{error.filename}: {error.strerror}; choose a folder with --data-dir") from error
+        raise Unavailable(f"{error.filename}: {error.strerror}: use another folder with --data-dir") from error
     return closing(Store(settings.database, settings.blob_dir))
 
 
@@ -349,13 +353,13 @@ def _run(settings: Settings, listener: socket.socket) -> None:
     from app.main import server_config
 
     config = server_config(settings, partial(application, settings))
-    # Uvicorn raises the signal again once it has shut down; after a clean stop the exit status shall be 0.
+    # Uvicorn raises the signal again after its shutdown; the exit status of a clean stop must be 0.
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: None)
     if settings.workers > 1:
         supervisor = Multiprocess(config, sockets=[listener])
         supervisor.run()
-        clean = (None, 0, -signal.SIGTERM, -signal.SIGINT)  # uvicorn's workers end by the signal that stopped them
+        clean = (None, 0, -signal.SIGTERM, -signal.SIGINT)  # uvicorn's workers exit by the signal that stopped them
         if any(process.exitcode not in clean for process in supervisor.processes):
             raise typer.Exit(1)
         return
@@ -372,7 +376,7 @@ def _stop_with_parent(parent: Any) -> None:
 
 
 def _bring_demo(address: str, token: str | None) -> None:
-    """Once the server answers: install the demo and print what to try."""
+    """Wait until the server is ready, install the demo and print example commands."""
     from app.cli import demo as orchard
     from app.cli.client import Client
 
@@ -381,7 +385,7 @@ def _bring_demo(address: str, token: str | None) -> None:
         with Client(address, token) as client:
             result = orchard.install(client)
     except (FleetMapError, RequestFailed, OSError) as error:
-        output.print_status(f"the demo could not be installed: {error}", style="yellow")
+        output.print_status(f"could not install the demo: {error}", style="yellow")
         return
     output.print_result(f"demo environment: {result['environment']}, version {result['version']}")
     if token:
@@ -393,7 +397,7 @@ def _bring_demo(address: str, token: str | None) -> None:
 
 
 def wait_ready(address: str, *, seconds: float = START_SECONDS) -> None:
-    """Until the server says that it is ready; Unavailable where it does not in time."""
+    """Wait until the server is ready. Raises Unavailable after ``seconds``."""
     deadline = time.monotonic() + seconds
     while True:
         try:

@@ -1,4 +1,4 @@
-"""What formats ask for and no layer has: the named sets, and what an environment says of it."""
+"""``fleetmap template``: show and set the values that formats need and layers do not contain."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ def template(
     ] = None,
     chosen: Annotated[
         str | None,
-        typer.Option("--set", metavar="NAME", help="Use this template set, for the environment or the format."),
+        typer.Option("--set", metavar="NAME", help="Template set to use, for the environment or the format."),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values_option("A value for a parameter of the format")] = None,
+    option: Annotated[
+        list[str] | None, options.named_values_option("Value of a template parameter of the format")
+    ] = None,
     unset: Annotated[
-        bool, typer.Option("--unset", help="Return to the defaults; with -O NAME only for this parameter.")
+        bool, typer.Option("--unset", help="Reset to the defaults; with -O NAME only this parameter.")
     ] = False,
     message: options.Message = "",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would change; store nothing.")] = False,
@@ -38,10 +40,10 @@ def template(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show or set the values that are filled in where a format needs more than the layers contain.
+    """Show or set template values, which are filled in if a format needs more than the layers contain.
 
-    Each value comes from the environment, from its template set, or from the default of the format. A change makes
-    a version, since robots get other maps.
+    Each value comes from the environment, from its template set, or from the default of the format. A change creates a
+    version, since it changes maps.
 
     Example: `fleetmap template farm tmap2 -O xy_goal_tolerance=0.4`
     """
@@ -49,9 +51,9 @@ def template(
         _sets(as_json=as_json)
         return
     if option and format is None:
-        raise typer.BadParameter("--option needs the format whose parameter it is")
+        raise typer.BadParameter("--option requires a format, to which the parameter belongs")
     if unset and chosen is not None:
-        raise typer.BadParameter("--unset and --set exclude each other")
+        raise typer.BadParameter("--unset and --set cannot be combined")
     place = quote_path("environments", environment, "templates", *([format] if format else []))
     with Client(server, token) as client:
         if not (chosen or option or unset):
@@ -77,7 +79,7 @@ def template(
 def _merged_values(
     stored_template: Mapping[str, Any], chosen: str | None, texts: list[str], *, unset: bool
 ) -> dict[str, Any]:
-    """What is said of a format from now on: as before, with these options or without them."""
+    """Return the new template of a format: the stored one with these options set or removed."""
     values = dict(stored_template.get("values") or {})
     if unset:
         for text in texts:
@@ -90,10 +92,10 @@ def _merged_values(
 def _print_commit(environment: str, result: Mapping[str, Any], *, before: int) -> None:
     changes = result.get("changes") or {}
     if result["version"] is None:
-        output.print_result(f"{environment}: {'this would make a version' if changes else 'nothing would change'}")
+        output.print_result(f"{environment}: {'this would create a version' if changes else 'no changes'}")
     elif result["version"] == before:
-        output.print_result(f"{environment}: nothing changed, version {before} stays")
-        return  # its changes are those that made it
+        output.print_result(f"{environment}: no changes, still version {before}")
+        return  # the listed changes are those of the existing version
     else:
         output.print_result(f"{environment}: version {result['version']}")
     if "templates" in changes:
@@ -111,7 +113,7 @@ def _sets(*, as_json: bool) -> None:
     rows = (
         (s["name"], s["title"], "; ".join(f"{f}: {_values(v)}" for f, v in s["formats"].items())) for s in template_sets
     )
-    output.show_table(("set", "what it is for", "values"), rows)
+    output.show_table(("set", "purpose", "values"), rows)
 
 
 def _show(details: Mapping[str, Any]) -> None:
@@ -126,13 +128,13 @@ def _show(details: Mapping[str, Any]) -> None:
         for name, one in line["effective"].items()
         if one["from"] != "default"
     ]
-    output.print_result(f"{details['environment']}, version {details['version']}: the set {details['set']}")
+    output.print_result(f"{details['environment']}, version {details['version']}: template set {details['set']}")
     if rows:
         output.show_table(("format", "parameter", "value", "from"), rows)
 
 
 def _title(details: Mapping[str, Any]) -> str:
-    set_note = f", the set {details['set']}" if details.get("set") else ""
+    set_note = f", template set {details['set']}" if details.get("set") else ""
     return f"{details['environment']}, version {details['version']}: {details['format']}{set_note}"
 
 

@@ -1,4 +1,4 @@
-"""Access tokens: create, list, delete."""
+"""``fleetmap token``: create, list and delete access tokens."""
 
 from __future__ import annotations
 
@@ -18,26 +18,28 @@ ROLES = ("viewer", "robot", "editor", "admin")
 
 @commands.command("create")
 def create(
-    name: Annotated[str, typer.Argument(help="Name of its owner: it is the author in the history.")],
+    name: Annotated[str, typer.Argument(help="Name of the owner, shown as author in the history.")],
     role: Annotated[
         str, typer.Option("--role", "-r", help="viewer, robot, editor or admin.", autocompletion=lambda: list(ROLES))
     ] = "viewer",
     environments: Annotated[
         str | None,
-        typer.Option("--environments", "-e", help="Only environments with names like this: 'farm-*' [default: all]."),
+        typer.Option(
+            "--environments", "-e", help="Pattern of accessible environments, such as 'farm-*' [default: all]."
+        ),
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option("--robot", help="Robot whose status it may report (role robot) [default: NAME]."),
+        typer.Option("--robot", help="Robot that may report its status with this token (role robot) [default: NAME]."),
     ] = None,
     expires: Annotated[
-        str | None, typer.Option("--expires", metavar="TIME", help="End of its life (RFC 3339) [default: none].")
+        str | None, typer.Option("--expires", metavar="TIME", help="Time of expiry (RFC 3339) [default: never].")
     ] = None,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Create a token. It is printed only now: the server stores only its hash.
+    """Create a token. It is shown only once, since the server stores only its hash.
 
     Example: `fleetmap token create tractor-7 --role robot --environments 'farm-*'`
     """
@@ -48,8 +50,8 @@ def create(
     if as_json:
         output.show_json(result)
         return
-    scope = f"{role}, sets the status of the robot {result['robot']}" if result.get("robot") else role
-    output.print_status(f"token {result['id']} for {name} ({scope}), shown only this once:")
+    scope = f"{role}, reports the status of robot {result['robot']}" if result.get("robot") else role
+    output.print_status(f"token {result['id']} for {name} ({scope}), shown only once:")
     output.print_result(result["token"])
 
 
@@ -70,12 +72,12 @@ def show(server: options.Server = None, token: options.Token = None, as_json: op
 
 @commands.command("delete")
 def delete(
-    identifier: Annotated[str, typer.Argument(metavar="ID", help="As `fleetmap token list` shows it.")],
+    identifier: Annotated[str, typer.Argument(metavar="ID", help="Id of the token, see `fleetmap token list`.")],
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Delete a token: it is refused from now on.
+    """Delete a token, which loses its access at once.
 
     Example: `fleetmap token delete 3f9a…`
     """
@@ -84,4 +86,4 @@ def delete(
     if as_json:
         output.show_json({"id": identifier, "deleted": True})
     else:
-        output.print_result(f"token {identifier} is deleted")
+        output.print_result(f"deleted token {identifier}")

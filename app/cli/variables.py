@@ -1,4 +1,4 @@
-"""Environment variables ``FLEETMAP_…``: which ones are read, and warnings about those that nothing reads."""
+"""Environment variables ``FLEETMAP_…``: names in use, and warnings about unused ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from app.model.names import did_you_mean, nearest
 PREFIX = "FLEETMAP_"
 
 CLIENT = frozenset({"FLEETMAP_SERVER", "FLEETMAP_TOKEN", "FLEETMAP_CA"})
-"""Read by commands that call a server."""
+"""Variables of commands that call a server."""
 
 AGENT = frozenset(
     f"{PREFIX}{name}"
@@ -19,20 +19,20 @@ AGENT = frozenset(
         *("ZENOH_USER", "ZENOH_PASSWORD"),
     )
 )
-"""Read by the agent; its commands are given more."""
+"""Variables of the agent. Its hooks get further ones from the agent."""
 
 HOOKS = ("NAV2_", "ROS_", "TOPOLOGICAL_", "HOOK_")
-"""Starts of the names that the agent's ready-made hooks read."""
+"""Prefixes of the variables of the agent's bundled hooks."""
 
 COMPOSE = frozenset({"FLEETMAP_PUBLISH", "FLEETMAP_ZENOH_PUBLISH"})
-"""Read by the Compose file."""
+"""Variables of the Compose file."""
 
 MIN_SIMILARITY = 0.8
-"""Similarity, 0 to 1, from which a variable is meant for a client: the names of a server's settings are not known."""
+"""Minimum similarity (0 to 1) of a mistyped client variable; high, since clients do not know the server's settings."""
 
 
 def unknown(names: Iterable[str], settings: Iterable[str]) -> list[str]:
-    """Return a warning for each variable that neither a setting nor a client, the agent or its hooks read."""
+    """Return a warning for each variable that neither the server, a client, the agent nor its hooks use."""
     setting_names = {*settings, *CLIENT, *AGENT, *COMPOSE}
     hooks = tuple(f"{PREFIX}{start}" for start in HOOKS)
     return [
@@ -43,7 +43,7 @@ def unknown(names: Iterable[str], settings: Iterable[str]) -> list[str]:
 
 
 def mistyped(names: Iterable[str]) -> list[str]:
-    """Return a warning for each variable that is nearly one that a client reads."""
+    """Return a warning for each variable that is probably a mistyped client variable."""
     out = []
     for name in sorted(names):
         ours = name.startswith(PREFIX) and name not in CLIENT | AGENT | COMPOSE

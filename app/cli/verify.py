@@ -1,4 +1,4 @@
-"""``fleetmap verify``: everything that is stored against its hashes, and the repair of what is damaged."""
+"""``fleetmap verify``: check all stored data against its hashes and repair damage."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from app.store.store import Store
     from app.store.verify import Finding, VerifyResult
 
-REMOVED = "nowhere: it was removed, since no version has it"
+REMOVED = "nothing: removed, since no version uses it"
 MAX_ROUNDS = 10
-"""How often it is checked again after a repair: a tree is repaired level by level."""
+"""Maximum number of checks and repairs: a chunk tree is repaired level by level."""
 
 MAX_VERSIONS = 5
-"""Versions that one line of the table names."""
+"""Maximum number of versions listed in one row of the table."""
 
 
 Sources = Annotated[
@@ -34,21 +34,21 @@ Sources = Annotated[
     typer.Option(
         "--from",
         metavar="PLACE",
-        help="Where the same bytes may be: a file or folder of original files, another server's data folder, or "
-        "its address (with --token or FLEETMAP_TOKEN of an administrator); repeatable.",
+        help="Source for repairs: a file or folder of original files, the data folder of another server, or its "
+        "address (with --token or FLEETMAP_TOKEN of an administrator); repeatable.",
     ),
 ]
-DatabaseUrl = Annotated[
-    str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
+DatabaseUrl = Annotated[str | None, typer.Option("--database-url", help="Database [default: FLEETMAP_DATABASE_URL].")]
+DataDir = Annotated[
+    Path | None, typer.Option("--data-dir", help="Data folder of the server [default: FLEETMAP_DATA_DIR].")
 ]
-DataDir = Annotated[Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")]
-BlobUrl = Annotated[
-    str | None, typer.Option("--blob-url", help="The folder of stored files [default: FLEETMAP_BLOB_URL].")
-]
+BlobUrl = Annotated[str | None, typer.Option("--blob-url", help="Folder of stored files [default: FLEETMAP_BLOB_URL].")]
 
 
 def verify(
-    repair: Annotated[bool, typer.Option("--repair", help="Replace what is damaged; history stays as it is.")] = False,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Replace damaged data; the history does not change.")
+    ] = False,
     sources: Sources = None,
     database_url: DatabaseUrl = None,
     data_dir: DataDir = None,
@@ -58,9 +58,9 @@ def verify(
 ) -> None:
     """Check all stored data against its hashes.
 
-    Exit status 0: nothing is damaged (any more), 1: something is. It may run beside the server. Damaged cached maps are
-    removed, since they are made again anyway; nothing else is changed without --repair. Repair tries the places of
-    --from, then reads the uploads of damaged versions again.
+    Exit status: 0 if no damage is left, 1 otherwise. May run while the server runs. Removes damaged cached maps, which
+    are converted again when requested; changes nothing else without --repair. --repair tries the sources of --from,
+    then reads the uploads of damaged versions again.
 
     Example: `fleetmap verify --repair --from /backup/originals --from https://other-server`
     """
@@ -69,10 +69,12 @@ def verify(
     from app.convert.cache import Cache
 
     if sources and not repair:
-        raise typer.BadParameter("--from goes with --repair")
+        raise typer.BadParameter("--from requires --repair")
     settings = load_settings({"database_url": database_url, "data_dir": data_dir, "blob_url": blob_url})
     if not settings.blob_dir.is_dir():
-        raise Invalid(f"{settings.blob_dir}: no folder of stored files is there: name the server's by --data-dir")
+        raise Invalid(
+            f"folder of stored files {settings.blob_dir} not found: set the server's data folder with --data-dir"
+        )
     with ExitStack() as stack:
         store = stack.enter_context(closing(_open(settings, readonly=not repair)))
         verification = latest = _check(store)
@@ -88,11 +90,11 @@ def verify(
             if not fresh:
                 break
             healed |= fresh
-            latest = _check(store)  # what lay below a lost chunk is found only now
+            latest = _check(store)  # finds damage below repaired chunks
             left = latest.findings
             finding_keys = {(f.kind, f.name) for f in verification.findings}
             verification.findings += [f for f in left if (f.kind, f.name) not in finding_keys]
-    for f in left:  # what a failing disk spoils again counts as damaged
+    for f in left:  # damaged again, for example by a failing disk
         healed.pop((f.kind, f.name), None)
     cache = _check_cache(Cache(settings.cache_dir, settings.cache_bytes)) if settings.cache_dir.is_dir() else (0, 0)
     if as_json:
@@ -116,7 +118,7 @@ def _check(store: Store) -> VerifyResult:
 
 
 def _check_cache(cache: Any) -> tuple[int, int]:
-    """How many cached maps there are, and how many were damaged; those are removed, and made again when requested."""
+    """Check cached maps and remove damaged ones. Return the number of cached and of removed maps."""
     results = [cache.check(key)[1] for key in cache.stored_keys()]
     return len(results), results.count(False)
 
@@ -139,7 +141,7 @@ def _repair(
 
 
 class FolderDonor:
-    """Original files, below any names: what counts is their hash."""
+    """Source for repairs: original files with any names, identified by their hash."""
 
     def __init__(self, place: Path, hashes: set[str]) -> None:
         import hashlib
@@ -155,31 +157,31 @@ class FolderDonor:
                 self._files[sha256.hexdigest()] = path
 
     def blob(self, sha256: str) -> bytes | None:
-        """The file's content, if one has this hash."""
+        """Return the content of the file with this hash; None if there is none."""
         path = self._files.get(sha256)
         return None if path is None else path.read_bytes()
 
     def chunk(self, sha256: str) -> bytes | None:
-        """A folder of files has no chunks."""
+        """Return None: a folder of files has no chunks."""
         del sha256
         return None
 
 
 class StoreDonor:
-    """Another server's data folder."""
+    """Source for repairs: the data folder of another server."""
 
     def __init__(self, place: Path, store: Store) -> None:
         self.name, self._store = str(place), store
 
     def blob(self, sha256: str) -> bytes | None:
-        """The content, if it is there and intact."""
+        """Return a stored file if it is intact, else None."""
         try:
             return self._store.blobs.get(sha256)
         except FleetMapError:
             return None
 
     def chunk(self, sha256: str) -> bytes | None:
-        """The bytes, if they are there and intact."""
+        """Return a chunk if it is intact, else None."""
         try:
             return self._store.chunks.read(sha256)
         except FleetMapError:
@@ -187,17 +189,17 @@ class StoreDonor:
 
 
 class ServerDonor:
-    """Another server, by its address."""
+    """Source for repairs: another running server."""
 
     def __init__(self, address: str, client: Client) -> None:
         self.name, self._client = address, client
 
     def blob(self, sha256: str) -> bytes | None:
-        """The content, if the server has it."""
+        """Return a stored file if the server has it, else None."""
         return self._get("blobs", sha256)
 
     def chunk(self, sha256: str) -> bytes | None:
-        """The bytes, if the server has them."""
+        """Return a chunk if the server has it, else None."""
         return self._get("chunks", sha256)
 
     def _get(self, kind: str, sha256: str) -> bytes | None:
@@ -215,7 +217,7 @@ def _donor(place: str, token: str | None, findings: list[Finding], stack: ExitSt
         return ServerDonor(place, stack.enter_context(Client(place, token)))
     path = Path(place)
     if not path.exists():
-        raise Invalid(f"--from {place}: there is no such file or folder")
+        raise Invalid(f"--from {place}: no such file or folder")
     database = path / "fleetmap.sqlite3"
     if database.is_file():
         from app.store.store import Store
@@ -251,26 +253,26 @@ def _show(
     counts = ", ".join(f"{count} {kind}s" for kind, count in verification.checked.items() if kind != "database")
     output.print_result(f"checked: {counts}, {cache[0]} cached maps")
     if cache[1]:
-        output.print_result(f"{cache[1]} damaged cached maps were removed; they are made again when they are requested")
+        output.print_result(f"removed {cache[1]} damaged cached maps; they are converted again when requested")
     if not verification.findings:
-        output.print_result("nothing is damaged")
+        output.print_result("no damage found")
         return
     rows = []
     for f in verification.findings:
         versions = [f"{environment} {number}" for environment, number in f.versions]
         more = f" and {len(versions) - MAX_VERSIONS} more" if len(versions) > MAX_VERSIONS else ""
-        version_names = ", ".join(versions[:MAX_VERSIONS]) + more or "of no version"
+        version_names = ", ".join(versions[:MAX_VERSIONS]) + more or "none"
         source = healed.get((f.kind, f.name))
         rows.append((f"{f.kind} {f.name[:16]}", f.problem, version_names, f"repaired from {source}" if source else ""))
     output.show_table(("what", "problem", "versions", "repair"), rows)
     left = sum((f.kind, f.name) not in healed for f in verification.findings)
     if not left:
-        output.print_result("everything was repaired")
+        output.print_result("all damage repaired")
     elif repaired:
         output.print_result(
-            f"{left} still damaged: name another place by --from, upload the files again, or restore a backup"
+            f"{left} still damaged: set another source with --from, upload the files again, or restore a backup"
         )
     else:
         output.print_result(
-            f"{left} damaged: `fleetmap verify --repair` heals from uploads, and from places named by --from"
+            f"{left} damaged: run `fleetmap verify --repair`, which repairs from uploads and from sources of --from"
         )

@@ -1,4 +1,4 @@
-"""The history of an environment: versions, diff, promote, revert."""
+"""Commands for the history of an environment: versions, diff, promote, revert, derive."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def diff(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show what differs between two versions: a summary, then item by item (+ added, ~ changed, - deleted).
+    """Show the differences of two versions: a summary, then each item (+ added, ~ changed, - deleted).
 
     Example: `fleetmap diff farm production latest`
     """
@@ -101,36 +101,38 @@ def _summary(layer: str, change: Mapping[str, Any]) -> str:
 
 VersionOption = Annotated[
     str,
-    typer.Argument(
-        help="Version number or channel that the channel is to point to.", autocompletion=completion.versions
-    ),
+    typer.Argument(help="Version number or channel to move the channel to.", autocompletion=completion.versions),
 ]
 ChannelOption = Annotated[
     str, typer.Option("--channel", "-c", help="Channel to move.", autocompletion=completion.channels)
 ]
 At = Annotated[
     str | None,
-    typer.Option("--at", metavar="TIME", help="Move at this time (RFC 3339: 2030-01-31T06:00:00Z), not now."),
+    typer.Option("--at", metavar="TIME", help="Move at this time (RFC 3339: 2030-01-31T06:00:00Z) [default: now]."),
 ]
 Ready = Annotated[
     float | None,
-    typer.Option("--ready", metavar="SHARE", help="Move when this share of its online robots has the version (0.9)."),
+    typer.Option(
+        "--ready",
+        metavar="SHARE",
+        help="Move when this share of its online robots has fetched the version, such as 0.9.",
+    ),
 ]
 Failed = Annotated[
     float | None,
     typer.Option(
-        "--failed", metavar="SHARE", help="Do not move, or move back, if this share of its robots fails (0.2)."
+        "--failed", metavar="SHARE", help="Cancel or roll back if this share of its robots fails, such as 0.2."
     ),
 ]
 Deadline = Annotated[
     str | None,
     typer.Option(
-        "--deadline", metavar="TIME", help="Give up at this time if too few robots are ready (needs --ready)."
+        "--deadline", metavar="TIME", help="Cancel the move if too few robots are ready by then (requires --ready)."
     ),
 ]
 Window = Annotated[
     float | None,
-    typer.Option("--window", metavar="SECONDS", help="Watch robots for this long after the move [default: 600]."),
+    typer.Option("--window", metavar="SECONDS", help="Time to watch for failures after the move [default: 600]."),
 ]
 
 
@@ -148,9 +150,10 @@ def promote(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Move a channel to a version: its robots fetch that map. An older version rolls back.
+    """Move a channel to a version, which its robots then fetch. An older version is a rollback.
 
-    With --ready or --failed it moves in two stages: robots fetch the version first and are watched afterwards.
+    With --ready or --failed the move is a rollout in two stages: robots fetch the version first, then the channel moves
+    and failures are watched.
 
     Example: `fleetmap promote farm 12 --ready 0.9 --failed 0.2`
     """
@@ -160,7 +163,9 @@ def promote(
         path = quote_path("environments", environment, "channels", channel)
         if cancel:
             if at is not None or rollout:
-                raise typer.BadParameter("--cancel plans nothing: leave the other options out")
+                raise typer.BadParameter(
+                    "--cancel cannot be combined with --at, --ready, --failed, --deadline or --window"
+                )
             client.delete(f"{path}/planned")
             channels = client.get(quote_path("environments", environment, "channels"), {"robots": "false"})
             moved: Any = next((c for c in channels if c["channel"] == channel), {"channel": channel, "version": None})
@@ -170,13 +175,13 @@ def promote(
     if as_json:
         output.show_json(moved)
     elif cancel:
-        output.print_result(f"{environment}: nothing is planned for {channel} any more")
+        output.print_result(f"{environment}: cancelled the planned move of {channel}")
     elif moved["planned"] is None:
         watched = (moved["rollout"] or {}).get("state") == "watching"
-        more = ", and moves back where too many robots fail" if watched else ""
+        more = ", and is rolled back if too many robots fail" if watched else ""
         output.print_result(f"{environment}: {channel} points to version {number}{more}")
     else:
-        when = [f"{ready:.4g} of its online robots have it"] if ready is not None else []
+        when = [f"{ready:.4g} of its online robots have fetched it"] if ready is not None else []
         when += [f"it is {at}"] if at else []
         output.print_result(f"{environment}: {channel} will point to version {number} when {' and '.join(when)}")
 
@@ -205,11 +210,11 @@ def revert(
     if as_json:
         output.show_json(result)
     else:
-        output.print_result(f"{environment}: version {result['version']} holds what version {number} holds")
+        output.print_result(f"{environment}: version {result['version']} has the content of version {number}")
 
 
 def resolve(client: Client, environment: str, version: str) -> int:
-    """The number that a channel's name stands for; Refused where there is none."""
+    """Return the version number of a number or channel. Raises RequestFailed for an unknown channel."""
     if version.isascii() and version.isdigit():
         return int(version)
     number: int = client.get(quote_path("environments", environment, "versions", version))["version"]
@@ -217,7 +222,7 @@ def resolve(client: Client, environment: str, version: str) -> int:
 
 
 def channels_by_version(client: Client, environment: str) -> dict[int, list[str]]:
-    """Which channels stand on which version."""
+    """Return version -> channels that point to it."""
     channels: dict[int, list[str]] = {}
     for row in channel_rows(client, environment):
         channels.setdefault(row["version"], []).append(str(row["channel"]))
@@ -225,32 +230,32 @@ def channels_by_version(client: Client, environment: str) -> dict[int, list[str]
 
 
 def channel_rows(client: Client, environment: str) -> list[dict[str, Any]]:
-    """All channels of an environment."""
+    """Get all channels of an environment."""
     rows: list[dict[str, Any]] = client.get(quote_path("environments", environment, "channels"))
     return rows
 
 
 def summary(changes: Mapping[str, Any]) -> str:
-    """A version's changes in a few words."""
+    """Summarise the changes of a version in one line."""
     return "; ".join(change_line(subject, change) for subject, change in changes.items())
 
 
 def change_line(subject: str, change: Any) -> str:
-    """What changed and how: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
+    """Format a change: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
     if subject == "datum" and isinstance(change, Mapping):
         return f"datum: {output.datum(change.get('from'))} → {output.datum(change.get('to'))}"
     if subject == "templates" and isinstance(change, Mapping):
         return f"templates: {', '.join(_template_changes(change))}"
     if subject == "renewed" and isinstance(change, list):
         parts = ", ".join(f"{part['layer']} {part['level']}/{part['name']}" for part in change)
-        return f"derived anew with the same content: {parts}"
+        return f"derived again with the same content: {parts}"
     return f"{subject}: {counts(change)}"
 
 
 def counts(change: Any) -> str:
-    """One change in a few words: ``2 added, 1 deleted``. Boxes and zeros are left out.
+    """Format the counts of a change: ``2 added, 1 deleted``, without bounds and zeros.
 
-    ``file header`` is what a file says as a whole, beside its items.
+    ``file header`` stands for the collection document, the data of a file besides its items.
     """
     if not isinstance(change, Mapping):
         return str(change)
@@ -267,7 +272,7 @@ def counts(change: Any) -> str:
 
 
 def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
-    """A layer's differences: of features by id, of grids by name with the cells counted."""
+    """Return the differences of a layer, one per line: features by id, grids by name with cell counts."""
     if layer == "datum":
         return [f"~ {change_line(layer, change)}"]
     if layer == "templates":
@@ -282,7 +287,7 @@ def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
 
 
 def _template_changes(change: Mapping[str, Any]) -> list[str]:
-    """``tmap2 action: none → NavigateToPose``, for each value that differs."""
+    """Return the differing template values as ``tmap2 action: none → NavigateToPose``."""
     out = []
     for name, format_changes in change.items():
         if name == "set":
@@ -295,9 +300,9 @@ def _template_changes(change: Mapping[str, Any]) -> list[str]:
 
 
 def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
-    """What the named server can compute, or where none is named, or none answers, what any can."""
+    """List the derivations of the server; without one, or if it is unreachable, those of this installation."""
     named = server or os.environ.get("FLEETMAP_SERVER")
-    why = "no server is named"
+    why = "no server set"
     if named:
         try:
             with Client(server, token) as client:
@@ -310,7 +315,9 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
     local.require_server_python("derive")
     from app.catalogue import describe_derivations
 
-    output.print_status(f"{why}: a server with a provider of satellite pictures also has location_to_imagery")
+    output.print_status(
+        f"{why}: listing local derivations; a server with an imagery provider also has location_to_imagery"
+    )
     return describe_derivations()
 
 
@@ -325,16 +332,16 @@ def derive(
         str | None,
         typer.Argument(help="Derivation, such as occupancy_to_topology.", autocompletion=completion.derivations),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values_option("A parameter of the derivation")] = None,
+    option: Annotated[list[str] | None, options.named_values_option("Parameter of the derivation")] = None,
     message: options.Message = "",
     replace: options.Replace = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Compute a layer from other layers and store it as a version. Without names, list the derivations.
+    """Derive a layer from other layers and store it as a version. Without arguments, list the derivations.
 
-    The list comes from the server if you name one (--server or FLEETMAP_SERVER); otherwise it needs none.
+    The list comes from the server set by --server or FLEETMAP_SERVER, otherwise from this installation.
 
     Example: `fleetmap derive farm occupancy_to_topology -O robot_radius=0.3`
     """
@@ -344,7 +351,7 @@ def derive(
             output.show_json(derivations)
             return
         output.show_table(
-            ("derivation", "what it does", "from", "to", "parameters"),
+            ("derivation", "description", "from", "to", "parameters"),
             [
                 (d["id"], d["title"], ", ".join(d["needs"]), d["gives"], ", ".join(p["name"] for p in d["parameters"]))
                 for d in derivations
@@ -352,7 +359,7 @@ def derive(
         )
         return
     if method is None:
-        raise typer.BadParameter("name the derivation; `fleetmap derive` lists them")
+        raise typer.BadParameter("missing derivation: choose one of `fleetmap derive`")
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
     with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
         result = client.post(quote_path("environments", environment, "derivations"), body, repeat=True)
@@ -360,11 +367,11 @@ def derive(
 
 
 def show_commit(environment: str, result: Mapping[str, Any], *, as_json: bool) -> None:
-    """A version that a derivation or a generator has made, or that is as it was."""
+    """Print the version of a derivation or a generator, which may be unchanged."""
     if as_json:
         output.show_json(result)
         return
     output.print_result(
-        f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'nothing new'}"
+        f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'no changes'}"
     )
     output.show_warnings(result.get("warnings") or ())

@@ -1,5 +1,6 @@
-"""Events of every change, from the store's outbox to Zenoh, and what comes back from robots.
+"""Zenoh: publish the events of the store's outbox, answer queries, receive robot status.
 
-``messages`` what is said · ``bus`` the Zenoh session: publishers, queryables, inbound · ``router`` the router's own
-process · ``relay`` outbox -> bus, in order, at least once · ``leader`` the thread that one process of several runs.
+Modules: ``messages`` keys and payloads · ``bus`` Zenoh session with publishers, queryables and subscribers · ``router``
+process of the embedded router · ``security`` and ``credentials`` TLS and users · ``relay`` outbox to bus, in order, at
+least once · ``leader`` thread of one elected process · ``ros2``, ``ros_names`` and ``cdr`` ROS 2 topics.
 """

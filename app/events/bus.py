@@ -1,8 +1,8 @@
-"""The server's Zenoh session: publishers of events, queryables of maps, and what robots say of themselves.
+"""Zenoh session of the server: event publishers, queryables for maps, subscribers for robot status and liveliness.
 
-Zenoh calls back in threads of its own; callbacks here only hand over to a small pool of threads. Source of the choices:
-an AdvancedPublisher with cache and sporadic heartbeat over DROP loses nothing when a router is away for a while, where
-plain publishers lose everything of that time, and BLOCK lets one stopped subscriber stall all.
+Zenoh calls back in its own threads; callbacks only pass queries to a small thread pool and messages to a queue. Events
+use an AdvancedPublisher with cache and sporadic heartbeat over DROP: it loses nothing while a router is down for a
+short time. Plain publishers would lose these events, and with BLOCK one stopped subscriber would stall all others.
 """
 
 from __future__ import annotations
@@ -31,24 +31,25 @@ from app.events.security import RouterSecurity
 log = logging.getLogger(__name__)
 
 EVENT_CACHE_SIZE = 256
-"""Events of each environment that late joiners get, and that outlast a router's absence."""
+"""Number of events per environment that late joiners and reconnected robots receive."""
 
 PUBLISHERS = 4096
-"""Environments with a publisher; the ones that were silent longest give way."""
+"""Maximum number of environments with a publisher; the least recently used ones are closed."""
 
 HEARTBEAT_SECONDS = 0.3
 THREADS = 4
-"""So many queries are looked at at once, and so many more maps are made for them: who asks for what is there does not
-wait for what is being made."""
+"""Number of threads for queries, and of further threads for conversions, so that queries for cached maps do not wait
+for conversions.
+"""
 
 MAX_WAITING_QUERIES = 256
-"""Queries that may wait; further ones are told so."""
+"""Maximum number of waiting queries; further ones get an error reply."""
 
 MESSAGE_BYTES = 65 * 2**20
-"""Largest message that our router passes on, where maps may not be larger."""
+"""Minimum of the embedded router's message size limit; raised if larger replies are allowed."""
 
 RESTART_SECONDS = 8.0
-"""Longest pause before a router of ours that could not be started is tried again."""
+"""Maximum pause before another attempt to start the embedded router."""
 
 CONNECT_SECONDS = 10.0
 
@@ -57,7 +58,12 @@ Mode = Literal["router", "client", "off"]
 
 @dataclass(frozen=True, slots=True)
 class BusOptions:
-    """How to reach the fleet. config: a JSON5 file of Zenoh's own, for what ``security`` does not say."""
+    """Options of the Zenoh session and the embedded router.
+
+    Attributes:
+        listen, connect: endpoints, comma-separated.
+        config: JSON5 file with further Zenoh settings.
+    """
 
     mode: Mode = "router"
     listen: str = "tcp/127.0.0.1:7447"
@@ -70,7 +76,7 @@ class BusOptions:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What a query is answered with."""
+    """Reply to a query."""
 
     payload: bytes
     encoding: str
@@ -79,20 +85,21 @@ class Reply:
 DeferredReply = Callable[[], Reply]
 
 QueryHandler = Callable[[str, str, Mapping[str, str]], Reply | DeferredReply]
-"""(environment, the key after it, parameters) -> the answer, or what takes long and then gives it. Either may raise."""
+"""Function (environment, rest of the key, parameters) -> the reply, or a slow function that returns it. Both may raise.
+"""
 
 ErrorEncoder = Callable[[Exception], bytes]
-"""What went wrong -> the problem's JSON, as it is told over HTTP."""
+"""Function error -> JSON of its problem, as over HTTP."""
 
 OnStatus = Callable[[str, str, bytes], None]
-"""(environment, robot, payload). It must return at once."""
+"""Function (environment, robot, payload); must return at once."""
 
 OnLiveliness = Callable[[str, bool], None]
-"""(robot, whether its session is there). It must return at once."""
+"""Function (robot, whether its session is alive); must return at once."""
 
 
 def router_configuration(options: BusOptions) -> str:
-    """The router's configuration: the operator's file, and what this server decides. Raises FleetMapError."""
+    """Return the router's configuration: the operator's file with the server's values. Raises FleetMapError."""
     config = _base(options)
     own_rules = bool(json.loads(config.get_json("access_control/enabled")))
     for key, value in options.security.router_values(options.prefix, access=not own_rules).items():
@@ -104,15 +111,15 @@ def router_configuration(options: BusOptions) -> str:
     _set(config, "transport/shared_memory/enabled", False)
     _set(config, "transport/unicast/max_sessions", 10_000)
     if options.config is None:
-        # Zenoh's is 1 GiB, and what comes in pieces is put together in memory before it is passed on.
+        # Zenoh's limit is 1 GiB, and the router assembles fragmented messages in memory.
         _set(config, "transport/link/rx/max_message_size", max(MESSAGE_BYTES, options.max_reply_bytes + 2**20))
-    # With Zenoh's 100, so many who connect and say nothing keep everybody out for ten seconds.
+    # With Zenoh's default of 100, this many idle connections would block new clients for 10 seconds.
     _set(config, "transport/unicast/accept_pending", 1000)
     return str(config)
 
 
 def session_configuration(options: BusOptions) -> str:
-    """The configuration of the server's own session: a client of its router, or of the operator's. FleetMapError."""
+    """Return the configuration of the server's session, a client of its own or another router. Raises FleetMapError."""
     config = _base(options)
     endpoints = options.connect if options.mode == "client" else client_endpoint(options.listen)
     _set(config, "mode", "client")
@@ -124,7 +131,7 @@ def session_configuration(options: BusOptions) -> str:
     _set(config, "scouting/multicast/enabled", False)
     _set(config, "transport/shared_memory/enabled", False)
     with contextlib.suppress(zenoh.ZError):
-        _set(config, "access_control/enabled", False)  # the router's business
+        _set(config, "access_control/enabled", False)  # only the router needs it
         _set(config, "transport/auth/usrpwd/dictionary_file", None)
     security = options.security
     for key, value in (security.login.values() if options.mode == "client" else security.session_values()).items():
@@ -133,13 +140,13 @@ def session_configuration(options: BusOptions) -> str:
 
 
 def connection_error(options: BusOptions, error: Exception) -> str:
-    """Why the server's own session found no router."""
+    """Describe why the server's session could not connect."""
     endpoints = options.connect if options.mode == "client" else client_endpoint(options.listen)
     return describe_connection_failure(endpoints, error, options.security.login, names=options.mode == "client")
 
 
 def check(options: BusOptions) -> None:
-    """Whether what an operator has set up can be used, told before anything starts. Raises FleetMapError."""
+    """Check the options before the start. Raises FleetMapError."""
     if options.mode == "router":
         router_configuration(options)
     if options.mode != "off":
@@ -147,7 +154,7 @@ def check(options: BusOptions) -> None:
 
 
 def client_endpoint(listen: str) -> str:
-    """Where a client on this machine finds a router that listens there."""
+    """Return the endpoint for clients on this machine, from the listen endpoints."""
     first = listen.split(",", maxsplit=1)[0].strip()
     return first.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -158,7 +165,7 @@ def _base(options: BusOptions) -> zenoh.Config:
     try:
         return zenoh.Config.from_file(str(options.config))
     except Exception as error:
-        raise Unavailable(f"FLEETMAP_ZENOH_CONFIG: {options.config} cannot be read: {error}") from error
+        raise Unavailable(f"FLEETMAP_ZENOH_CONFIG: could not read {options.config}: {error}") from error
 
 
 def _set(config: zenoh.Config, key: str, value: Any) -> None:
@@ -166,7 +173,7 @@ def _set(config: zenoh.Config, key: str, value: Any) -> None:
 
 
 class Bus:
-    """One session, opened again where it breaks. All methods are thread-safe."""
+    """Zenoh session of the server, and the embedded router. Reconnects after failures. Thread-safe."""
 
     def __init__(
         self,
@@ -205,7 +212,7 @@ class Bus:
 
     @property
     def connected(self) -> bool:
-        """Whether a router is there at this moment."""
+        """Whether the session is connected to a router."""
         session = self._session
         try:
             return session is not None and bool(session.info.routers_zid())
@@ -213,7 +220,7 @@ class Bus:
             return False
 
     def open(self) -> bool:
-        """Start the router where it is ours and not there, connect, and declare everything. False where it fails."""
+        """Start the embedded router if needed, connect and declare everything. Return False if it fails."""
         with self._lock:
             if self.options.mode == "router" and (self._router is None or not self._router.alive):
                 if self._router is not None:
@@ -223,12 +230,12 @@ class Bus:
                     return False
                 router = Router(router_configuration(self.options))
                 if router.problem is not None:
-                    self._problem = f"the router cannot listen on {self.options.listen}: {first_line(router.problem)}"
+                    self._problem = f"router cannot listen on {self.options.listen}: {first_line(router.problem)}"
                     self._pause = min(RESTART_SECONDS, 2 * self._pause or 0.5)
                     self._restart = time.monotonic() + self._pause
                     return False
                 self._router, self._pause = router, 0.0
-                self._problem = f"the router at {self.endpoints} has started: it is looked for"
+                self._problem = f"connecting to the new router at {self.endpoints}"
             if self._session is not None:
                 return self.connected
             try:
@@ -242,18 +249,18 @@ class Bus:
             return True
 
     def ensure_connected(self) -> bool:
-        """Look after it: a dead router of ours is started again; the session finds it by itself."""
+        """Restart the embedded router if it has stopped; the session reconnects by itself. Return whether connected."""
         router = self._router
         is_missing = self.options.mode == "router" and (router is None or not router.alive)
         if self._session is None or is_missing:
             return self.open() and self.connected
         if self.connected:
             return True
-        self._problem = f"the router at {self.endpoints} is gone: it is looked for"
+        self._problem = f"lost the connection to the router at {self.endpoints}: reconnecting"
         return False
 
     def publish(self, environment: str, body: Mapping[str, Any]) -> None:
-        """Put an event. It stays in the publisher's cache for who joins late or missed it."""
+        """Publish an event and cache it for late joiners. Raises Unavailable without a session."""
         with self._lock:
             if self._session is None:
                 raise Unavailable(self._problem)
@@ -268,7 +275,7 @@ class Bus:
             publisher.put(messages.dumps(body), encoding=messages.JSON)
 
     def close(self) -> None:
-        """Undeclare, close the session, end the router."""
+        """Undeclare everything, close the session and stop the router."""
         for threads in (self._threads, self._workers):
             threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
@@ -279,7 +286,7 @@ class Bus:
 
     @property
     def endpoints(self) -> str:
-        """The router's address, or addresses."""
+        """Endpoints of the router, comma-separated."""
         return self.options.connect if self.options.mode == "client" else self.options.listen
 
     def _declare_publisher(self, session: zenoh.Session, environment: str) -> ext.AdvancedPublisher:
@@ -319,11 +326,11 @@ class Bus:
                 _close(self._session)
             self._session = None
 
-    # --- zenoh's threads: hand over, do nothing else ---
+    # --- callbacks in Zenoh threads: only pass on ---
 
     def _status(self, sample: zenoh.Sample) -> None:
         pieces = str(sample.key_expr).removeprefix(self.options.prefix + "/").split("/")
-        if sample.kind != zenoh.SampleKind.PUT or len(pieces) != 4:  # a key with ``**`` comes here as well
+        if sample.kind != zenoh.SampleKind.PUT or len(pieces) != 4:  # a key with ``**`` matches as well
             return
         environment, _, robot, _ = pieces
         payload = bytes(sample.payload) if len(sample.payload) <= messages.MAX_STATUS_BYTES else b""
@@ -335,7 +342,7 @@ class Bus:
 
     def _query(self, query: zenoh.Query) -> None:
         if not self._waiting.acquire(blocking=False):
-            self._reply_error(query, Unavailable("too many queries wait: try again in a few seconds"))
+            self._reply_error(query, Unavailable("too many waiting queries: try again in a few seconds"))
             return
         self._submit(self._threads, query, self._handle_query)
 
@@ -348,30 +355,30 @@ class Bus:
 
     @staticmethod
     def _hand_over(function: Callable[..., None], *arguments: Any) -> None:
-        """In this very thread, so that a robot's messages stay in order: who takes them only queues them."""
+        """Call a function that only queues, in this thread, so that a robot's messages stay in order."""
         try:
             function(*arguments)
         except Exception:
-            log.exception("a message over Zenoh could not be taken")
+            log.exception("handling a Zenoh message failed")
 
     def _handle_query(self, query: zenoh.Query) -> Reply | DeferredReply:
         key = str(query.key_expr)
         if "*" in key:
-            raise Invalid("query one key at a time: a key without wildcards")
+            raise Invalid("wildcards are unsupported: query a single key")
         environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
         return self._query_handler(environment, rest, _parameters(query))
 
     def _answer(self, query: zenoh.Query, find: Callable[[zenoh.Query], Reply | DeferredReply]) -> None:
-        """In a thread of ours: what ``find`` finds is the answer, or is left to the makers."""
+        """Reply with the result of ``find``; a deferred reply is passed to the worker threads. Runs in the pool."""
         try:
             reply = find(query)
             if not isinstance(reply, Reply):
                 make = reply
                 self._submit(self._workers, query, lambda _: make())
                 return
-            with contextlib.suppress(zenoh.ZError):  # who asked is gone
+            with contextlib.suppress(zenoh.ZError):  # the client has disconnected
                 query.reply(query.key_expr, reply.payload, encoding=reply.encoding)
-        except Exception as error:  # noqa: BLE001  told, and logged where it is a mistake of ours
+        except Exception as error:  # noqa: BLE001  reported to the client, and logged if internal
             self._reply_error(query, error)
         self._waiting.release()
         with contextlib.suppress(Exception):
@@ -395,20 +402,20 @@ def _drop(query: Any) -> None:
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:
-    """A selector's parameters, ``grid=keepout;derive=false``. Invalid for what is given twice."""
+    """Parse the parameters of a selector, ``grid=keepout;derive=false``. Raises Invalid for duplicates."""
     out: dict[str, str] = {}
     for pair in str(query.parameters).split(";"):
         name, _, value = pair.partition("=")
         if not name or name.startswith("_"):  # those with an underscore are Zenoh's own
             continue
         if name in out:
-            raise Invalid(f"the parameter {name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+            raise Invalid(f"duplicate parameter {name[:80]!r}", [Problem("duplicate parameter", where=name[:80])])
         out[name] = value
     return out
 
 
 def wait_connected(bus: Bus, seconds: float) -> bool:
-    """Until a router is there, at most this long."""
+    """Wait until the bus is connected, at most ``seconds``. Return whether it is."""
     deadline = time.monotonic() + seconds
     while not bus.ensure_connected():
         if time.monotonic() > deadline:

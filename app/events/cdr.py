@@ -1,8 +1,8 @@
-"""Three ROS 2 messages as CDR, as ``rmw_serialize`` gives them: version 1, little endian, no padding at the end.
+"""Encode three ROS 2 messages as CDR like ``rmw_serialize``: version 1, little endian, no padding at the end.
 
-Four bytes say the encoding (``00 01 00 00``); after them each number lies at a multiple of its size, counted from the
-end of those four. A text is its length in bytes with the closing NUL, the bytes, the NUL. Source: OMG DDSI-RTPS
-§10 and the ``.msg`` files of nav_msgs, map_msgs and std_msgs.
+Four bytes contain the encoding (``00 01 00 00``); after them each number is aligned to its size, counted from the end
+of these four bytes. A string is its length in bytes including the final NUL, the bytes and the NUL. Source: OMG
+DDSI-RTPS §10 and the ``.msg`` files of nav_msgs, map_msgs and std_msgs.
 """
 
 from __future__ import annotations
@@ -17,9 +17,12 @@ HEADER = b"\x00\x01\x00\x00"
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What an OccupancyGrid says. cells: int8 row by row from the bottom, -1 unknown (byte 255), else 0…100.
+    """Content of an OccupancyGrid.
 
-    origin: (x, y, yaw) of the lower left corner of cell (0, 0), metres and radians.
+    Attributes:
+        resolution: metres per cell.
+        origin: (x, y, yaw) of the lower left corner of cell (0, 0), in metres and radians.
+        cells: int8, row by row from the bottom: -1 unknown (byte 255), else 0…100.
     """
 
     width: int
@@ -30,12 +33,12 @@ class Grid:
 
     @property
     def frame(self) -> tuple[int, int, float, tuple[float, float, float]]:
-        """Where its cells lie: an update makes sense only between grids that agree in it."""
+        """Size, resolution and origin. An update requires grids with the same frame."""
         return self.width, self.height, self.resolution, self.origin
 
 
 def occupancy_grid(grid: Grid, stamp: datetime, frame_id: str) -> bytes:
-    """``nav_msgs/msg/OccupancyGrid``. stamp: for the header and ``map_load_time``."""
+    """Encode ``nav_msgs/msg/OccupancyGrid``. stamp: for the header and ``map_load_time``."""
     x, y, yaw = grid.origin
     writer = _Writer(_header(stamp, frame_id))
     writer.pack("iIfII", *_time(stamp), grid.resolution, grid.width, grid.height)
@@ -46,14 +49,14 @@ def occupancy_grid(grid: Grid, stamp: datetime, frame_id: str) -> bytes:
 def occupancy_grid_update(
     x: int, y: int, width: int, height: int, cells: bytes, stamp: datetime, frame_id: str
 ) -> bytes:
-    """``map_msgs/msg/OccupancyGridUpdate``: a rectangle of cells; (x, y) is its lower left cell (column, row)."""
+    """Encode ``map_msgs/msg/OccupancyGridUpdate``, a rectangle of cells; (x, y): its lower left cell (column, row)."""
     writer = _Writer(_header(stamp, frame_id))
     writer.pack("iiII", x, y, width, height)
     return writer.sequence(cells)
 
 
 def string(text: str) -> bytes:
-    """``std_msgs/msg/String``."""
+    """Encode ``std_msgs/msg/String``."""
     return HEADER + _text(text)
 
 
@@ -62,12 +65,12 @@ class _Writer:
         self._data = bytearray(start)
 
     def pack(self, numbers: str, *values: float) -> None:
-        """Numbers of one size, aligned to it."""
+        """Append numbers of one size, aligned to it."""
         size = struct.calcsize("<" + numbers[-1])
         self._data += bytes(-(len(self._data) - len(HEADER)) % size) + struct.pack("<" + numbers, *values)
 
     def sequence(self, items: bytes) -> bytes:
-        """A sequence of bytes, the last member."""
+        """Append a byte sequence as the last member and return the message."""
         self.pack("I", len(items))
         return bytes(self._data) + items
 

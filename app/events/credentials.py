@@ -1,4 +1,4 @@
-"""How a client shows who it is, and knows whom it talks to: TLS, and for Zenoh a user with a password."""
+"""Credentials of clients: TLS files, and user and password for Zenoh."""
 
 from __future__ import annotations
 
@@ -12,13 +12,18 @@ from typing import Any
 from app.errors import Invalid
 
 PROBE_SECONDS = 2.0
-"""How long TLS is tried where Zenoh did not get through."""
+"""Time limit of the TLS probe after Zenoh could not connect."""
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohCredentials:
-    """ca: whom to trust, PEM; without it, public certification authorities. certificate and key: shown where the router
-    asks for them, PEM. user and password: as the router knows them."""
+    """Credentials for a Zenoh router.
+
+    Attributes:
+        ca: certification authority to trust (PEM); default: public ones.
+        certificate, key: client certificate and private key (PEM), for routers that require them.
+        user, password: user of the router.
+    """
 
     ca: Path | None = None
     certificate: Path | None = None
@@ -27,40 +32,40 @@ class ZenohCredentials:
     password: str | None = field(default=None, repr=False)
 
     def values(self) -> dict[str, Any]:
-        """Zenoh's settings for a session that connects. Invalid where something is missing."""
+        """Return Zenoh's settings for a client session. Raises Invalid if something is missing."""
         out: dict[str, Any] = {}
         if self.ca is not None:
             out["transport/link/tls/root_ca_certificate"] = readable_file(self.ca)
             ca_ssl_context(self.ca)
         if (self.certificate is None) != (self.key is None):
-            raise Invalid("a certificate for Zenoh needs its key, and the other way round")
+            raise Invalid("Zenoh certificate and key must be set together")
         if self.certificate is not None and self.key is not None:
             out["transport/link/tls/connect_certificate"] = readable_file(self.certificate)
             out["transport/link/tls/connect_private_key"] = readable_file(self.key)
             _show(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), self.certificate, self.key)
             out["transport/link/tls/enable_mtls"] = True
         if (self.user is None) != (self.password is None):
-            raise Invalid("a user of Zenoh needs a password, and the other way round")
+            raise Invalid("Zenoh user and password must be set together")
         if self.user is not None:
             out["transport/auth/usrpwd"] = {"user": self.user, "password": self.password, "dictionary_file": None}
         return out
 
 
 def readable_file(path: Path) -> str:
-    """A file that can be read, as Zenoh is told it: of one that cannot it only says that nobody answers."""
+    """Return the absolute path of a readable file. Raises Invalid; Zenoh would report a failed connection only."""
     try:
         with path.open("rb"):
             return str(path.resolve())
     except OSError as error:
-        raise Invalid(f"{path} cannot be read: {error.strerror or error}") from error
+        raise Invalid(f"could not read {path}: {error.strerror or error}") from error
 
 
 def ca_ssl_context(ca: Path) -> ssl.SSLContext:
-    """TLS that believes certificates of this certification authority alone. Raises Invalid."""
+    """Return a TLS context that trusts only this certification authority. Raises Invalid."""
     try:
         return ssl.create_default_context(cafile=ca)
     except (OSError, ssl.SSLError) as error:
-        raise Invalid(f"{ca} holds no certificate of a certification authority (PEM): {error}") from error
+        raise Invalid(f"{ca} is not a certificate of a certification authority (PEM): {error}") from error
 
 
 def server_ssl_context(address: str, ca: Path | None) -> ssl.SSLContext | bool:
@@ -74,23 +79,27 @@ def server_ssl_context(address: str, ca: Path | None) -> ssl.SSLContext | bool:
 
 
 def _show(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
-    """Have a certificate that is shown to who asks. Invalid where it and its key are none."""
+    """Load the certificate to present. Raises Invalid if the files are not a certificate and its key."""
     try:
         context.load_cert_chain(certificate, key, password="")  # never ask a terminal
     except (OSError, ssl.SSLError) as error:
-        raise Invalid(f"{certificate} and {key} are no certificate and its unencrypted key (PEM): {error}") from error
+        raise Invalid(
+            f"{certificate} and {key} are not a certificate and its unencrypted key (PEM): {error}"
+        ) from error
 
 
 def describe_connection_failure(hosts: str, error: Exception, login: ZenohCredentials, *, names: bool = True) -> str:
-    """Why nobody was reached at ``hosts``: what TLS has against it, of which Zenoh does not tell, else what Zenoh says.
+    """Describe why a connection failed: the TLS error, which Zenoh does not report, else Zenoh's own error.
 
-    hosts: endpoints, separated by commas; the first is asked. names: whether its certificate has to name it.
+    Args:
+        hosts: endpoints, comma-separated; the first one is probed.
+        names: whether the certificate must contain the host name.
     """
     return f"no router at {hosts}: {_tls_failure(hosts, login, names=names) or first_line(str(error))}"
 
 
 def first_line(text: str) -> str:
-    """The first line of what Zenoh says, without the places in its source."""
+    """Return the first line of a Zenoh error, without its source locations."""
     return re.sub(r",? at /\S+", "", text.splitlines()[0] if text else "")[:300]
 
 
@@ -107,11 +116,11 @@ def _tls_failure(endpoints: str, login: ZenohCredentials, *, names: bool) -> str
             socket.create_connection((match[1], int(match[2])), PROBE_SECONDS) as bare,
             context.wrap_socket(bare, server_hostname=match[1]) as link,
         ):
-            link.recv(1)  # who does not like our certificate says so only now
+            link.recv(1)  # the router rejects a client certificate only now
     except ssl.SSLCertVerificationError as error:
-        return f"its certificate is not to be trusted: {error.verify_message}"
+        return f"certificate not trusted: {error.verify_message}"
     except ssl.SSLError as error:
-        return f"it refuses: {(error.reason or str(error)).replace('_', ' ').lower()}"
+        return f"TLS error: {(error.reason or str(error)).replace('_', ' ').lower()}"
     except (OSError, Invalid):
         return None
     return None

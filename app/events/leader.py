@@ -1,4 +1,4 @@
-"""A thread that one process of a data folder has, of all that could: the others wait for its end."""
+"""Run a background thread in exactly one process per data folder, elected by a file lock."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from app.errors import FleetMapError
 log = logging.getLogger(__name__)
 
 POLL_SECONDS = 1.0
-"""How often the others look whether they are needed, and how long a pause is after something went wrong."""
+"""Interval between attempts of the other processes to get the lock, and pause after an error."""
 
 
 class LeaderThread(ABC):
-    """It does rounds while it holds the lock ``NAME.lock``, and says in ``NAME.json`` how it stands, for all processes.
+    """Thread that works while it holds the lock ``NAME.lock``. Writes its state to ``NAME.json`` for all processes.
 
-    well, trouble: what the log says when it is connected, and when it is down.
+    Args:
+        well: log line when the state becomes ``connected``.
+        trouble: start of the log line when the state becomes ``down``.
     """
 
     def __init__(self, data_dir: Path, name: str, *, well: str, trouble: str) -> None:
@@ -34,13 +36,13 @@ class LeaderThread(ABC):
         self._thread = threading.Thread(target=self._run, name=f"fleetmap-{name}", daemon=True)
 
     def start(self) -> None:
-        """Begin; returns at once. What a process said that was killed no longer holds from here on."""
-        with contextlib.suppress(OSError):  # the thread tries again, and tells
+        """Start the thread and return at once. Replaces the state of a killed process if the lock is free."""
+        with contextlib.suppress(OSError):  # the thread tries again and reports the error
             self._try_lock()
         self._thread.start()
 
     def close(self) -> None:
-        """Stop, take back what is out, and give the lock to the next one."""
+        """Stop the thread, release its resources and then the lock."""
         self._stopping.set()
         self._thread.join(15)
         self._release()
@@ -50,15 +52,15 @@ class LeaderThread(ABC):
 
     @abstractmethod
     def _run_once(self) -> None:
-        """Do what there is to do, then wait for more. FleetMapError: it is down for now."""
+        """Do pending work, then wait for more. Raises FleetMapError while it is down."""
 
     @abstractmethod
     def _release(self) -> None:
-        """Take back what is out."""
+        """Release resources."""
 
     def _on_unexpected_error(self) -> None:
-        """After an error of our own: its log entry, and what else helps."""
-        log.exception("%s stumbled", self._thread.name)
+        """Log an internal error. Subclasses may also clean up."""
+        log.exception("%s: unexpected error; retrying", self._thread.name)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -70,7 +72,7 @@ class LeaderThread(ABC):
             except FleetMapError as error:
                 self._publish_state({"state": "down", "detail": error.detail})
                 self._stopping.wait(POLL_SECONDS)
-            except Exception:  # noqa: BLE001  logged by _stumbled
+            except Exception:  # noqa: BLE001  logged by _on_unexpected_error
                 self._on_unexpected_error()
                 self._stopping.wait(POLL_SECONDS)
 
@@ -87,7 +89,7 @@ class LeaderThread(ABC):
         return True
 
     def _publish_state(self, state: dict[str, Any]) -> None:
-        """Tell the log when it changes, and all processes by a file."""
+        """Write the state to its file, and log changes."""
         path = _state_file(self._data_dir, self._name)
         if state == self._logged_state and path.exists():
             return
@@ -101,12 +103,12 @@ class LeaderThread(ABC):
         try:
             temporary.write_text(json.dumps(state))
             temporary.replace(path)
-        except OSError as error:  # a full disk stops no event
-            log.warning("%s cannot be written: %s", path.name, error.strerror)
+        except OSError as error:  # keep running on a full disk
+            log.warning("%s: could not write %s: %s", self._thread.name, path.name, error.strerror)
 
 
 def read_state(data_dir: Path, name: str) -> dict[str, Any]:
-    """What /readyz says: ``starting``, ``connected``, or ``down`` with the reason."""
+    """Read the state of a leader thread for /readyz: ``starting``, ``connected``, or ``down`` with the reason."""
     try:
         state: dict[str, Any] = json.loads(_state_file(data_dir, name).read_text())
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""What is said over Zenoh: keys and payloads.
+"""Keys and payloads of Zenoh messages.
 
-The robot's side imports nothing of the server but this, and what errors and event types are.
+Shared with the agent, which imports nothing else of the server except errors, event types and credentials.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from app.errors import Invalid, Problem
 from app.event_types import EVENT_TYPES, EventType, RobotState
 
 PREFIX = "fleetmap"
-"""The usual start of every key."""
+"""Default prefix of all keys."""
 
 JSON = "application/json"
 
@@ -25,7 +25,7 @@ SIGNATURE = "fleetmap-signature"
 ROBOT_STATES: tuple[RobotState, ...] = get_args(RobotState)
 
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
-"""A robot's name is one piece of a key and of an address: no slash, no wildcard."""
+"""Robot name: one segment of a key and of a URL, without slashes and wildcards."""
 
 MAX_STATUS_BYTES = 16 * 2**10
 MAX_DETAIL = 2000
@@ -34,39 +34,41 @@ _ROOT = re.compile(r"[0-9a-f]{64}")
 
 
 def events_key(prefix: str, environment: str) -> str:
-    """Where the events of an environment are put (``*``: of all)."""
+    """Return the key of an environment's events (``*``: of all environments)."""
     return f"{prefix}/{environment}/events"
 
 
 def status_key(prefix: str, environment: str, robot: str) -> str:
-    """Where a robot puts its status."""
+    """Return the key of a robot's status."""
     return f"{prefix}/{environment}/robots/{robot}/status"
 
 
 def robot_key(prefix: str, robot: str) -> str:
-    """A robot's liveliness token."""
+    """Return the key of a robot's liveliness token."""
     return f"{prefix}/robots/{robot}"
 
 
 POSITION_QUERY = ("server", "where")
-"""The pieces of the key, after the prefix, at which environments are found by position."""
+"""Segments after the prefix of the key to find environments by position."""
 
 
 def position_key(prefix: str) -> str:
-    """Key at which the server answers which environments a position is in (``?lat=…;lon=…``)."""
+    """Return the key to query environments by position (``?lat=…;lon=…``)."""
     return "/".join((prefix, *POSITION_QUERY))
 
 
 def server_key(prefix: str) -> str:
-    """The server's liveliness token."""
+    """Return the key of the server's liveliness token."""
     return f"{prefix}/server"
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One change of an environment. Robots order by ``sequence``, never by version.
+    """A change of an environment. Robots order events by ``sequence``, never by version.
 
-    layers: ``[{layer, level, name, change, hash}]``. previous: ``{version, root}`` or None. body: all members.
+    Attributes:
+        body: all members, such as layers (``[{layer, level, name, change, hash}]``) and previous (``{version, root}``
+            or None).
     """
 
     sequence: int
@@ -79,28 +81,33 @@ class Event:
 
     @classmethod
     def from_json(cls, data: bytes | str) -> Event:
-        """An event as it came; Invalid where it is not one. Unknown members are kept in ``body``."""
+        """Parse an event; ``body`` keeps unknown members. Raises Invalid."""
         try:
             body = json.loads(data)
             kind, channel = body["type"], body.get("channel")
             sequence, version, root = body["sequence"], body["version"], body["root"]
             environment = body["environment"]
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise Invalid(f"this is no event: {error}") from None
+            raise Invalid(f"invalid event: {error}") from None
         if kind not in EVENT_TYPES or not isinstance(environment, str) or not isinstance(root, str):
-            raise Invalid(f"this is no event: type {kind!r}, environment {environment!r}")
+            raise Invalid(f"invalid event: type {kind!r:.80}, environment {environment!r:.80}, root {root!r:.80}")
         for number in (sequence, version):
             if isinstance(number, bool) or not isinstance(number, int) or number < 0:
-                raise Invalid(f"this is no event: sequence {sequence!r}, version {version!r}")
+                raise Invalid(f"invalid event: sequence {sequence!r:.80}, version {version!r:.80}")
         return cls(sequence, kind, environment, version, root, channel, body)
 
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """A robot's report of itself. time: RFC 3339, by the robot's clock.
+    """Status that a robot reports.
 
-    holds: version and root that the robot's ``current`` points to and that it has loaded, whatever the state is about;
-    the root ``NO_ROOT`` for none; None if it does not say. overlays: digest of the closures in that map.
+    Attributes:
+        version, root: map that ``state`` is about.
+        time: RFC 3339, by the robot's clock.
+        sequence: position of the installed map in its channel.
+        overlays: digest of the closures in the installed map.
+        holds: version and root of the map that the robot has loaded, whatever ``state`` is about; the root ``NO_ROOT``
+            if it has none; None if not reported.
     """
 
     channel: str
@@ -115,20 +122,20 @@ class RobotStatus:
 
     @classmethod
     def from_json(cls, data: bytes | str) -> RobotStatus:
-        """A status as it came; Invalid says what is wrong with it."""
+        """Parse a status. Raises Invalid with all problems."""
         if len(data) > MAX_STATUS_BYTES:
-            raise Invalid(f"a status has at most {MAX_STATUS_BYTES} bytes")
+            raise Invalid(f"invalid status: must be at most {MAX_STATUS_BYTES} bytes")
         try:
             body = json.loads(data)
         except (ValueError, RecursionError):
-            raise Invalid("a status is a JSON object") from None
+            raise Invalid("invalid status: must be a JSON object") from None
         return cls.from_dict(body)
 
     @classmethod
     def from_dict(cls, body: Any) -> RobotStatus:
-        """The same from members that are read already."""
+        """Check a status that is parsed already. Raises Invalid with all problems."""
         if not isinstance(body, Mapping):
-            raise Invalid("a status is a JSON object")
+            raise Invalid("invalid status: must be a JSON object")
         problems = []
 
         def check(name: str, good: bool, accepted: str) -> None:
@@ -138,13 +145,17 @@ class RobotStatus:
         channel, version, root = body.get("channel"), body.get("version"), body.get("root")
         state, detail, time = body.get("state"), body.get("detail"), body.get("time")
         sequence, overlays = body.get("sequence"), body.get("overlays")
-        check("channel", isinstance(channel, str) and _CHANNEL.fullmatch(channel) is not None, "a channel's name")
-        check("version", _is_number(version), "a version's number")
+        check("channel", isinstance(channel, str) and _CHANNEL.fullmatch(channel) is not None, "a channel name")
+        check("version", _is_number(version), "a version number")
         check("root", isinstance(root, str) and _ROOT.fullmatch(root) is not None, "64 hexadecimal digits")
         check("state", state in ROBOT_STATES, " or ".join(ROBOT_STATES))
-        check("detail", detail is None or (isinstance(detail, str) and len(detail) <= MAX_DETAIL), "a short text")
+        check(
+            "detail",
+            detail is None or (isinstance(detail, str) and len(detail) <= MAX_DETAIL),
+            f"a string of at most {MAX_DETAIL} characters",
+        )
         check("time", time is None or (isinstance(time, str) and len(time) <= 64), "an RFC 3339 time")
-        check("sequence", sequence is None or _is_number(sequence), "an event's number")
+        check("sequence", sequence is None or _is_number(sequence), "an event sequence")
         hashed = isinstance(overlays, str) and _ROOT.fullmatch(overlays) is not None
         check("overlays", overlays is None or hashed, "64 hexadecimal digits")
         holds = _read_holds(body.get("holds"))
@@ -155,7 +166,7 @@ class RobotStatus:
         return cls(str(channel), int(version or 0), str(root), robot_state, detail, time, sequence, overlays, holds)
 
     def as_dict(self) -> dict[str, Any]:
-        """The status without its empty members."""
+        """Return the members of the status that are set."""
         members = {
             "channel": self.channel,
             "version": self.version,
@@ -175,7 +186,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _read_holds(value: Any) -> tuple[int, str] | None:
-    """The member ``holds``; None where it is none."""
+    """Parse the member ``holds``; None if it is invalid."""
     if not isinstance(value, Mapping):
         return None
     version, root = value.get("version"), value.get("root")
@@ -185,5 +196,5 @@ def _read_holds(value: Any) -> tuple[int, str] | None:
 
 
 def dumps(value: Mapping[str, Any]) -> bytes:
-    """A payload: compact JSON in UTF-8."""
+    """Encode a payload as compact JSON in UTF-8."""
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()

@@ -1,8 +1,8 @@
-"""The outbox -> Zenoh: in order, at least once, through the loss of router, server or database.
+"""Relay of the outbox to Zenoh: in order and at least once, even if router, server or database fail.
 
-One process of a data folder relays (it holds a file lock); where it dies, another takes over. What was published is
-noted in the database after it was handed to a connected session, so what a crash leaves open is published again: robots
-know by ``sequence`` what they have.
+One process per data folder relays, elected by a file lock; if it dies, another takes over. The database stores the
+position after events were passed to a connected session, so events may be published again after a crash; robots detect
+repeated events by ``sequence``.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from app.store.store import Store
 from app.store.values import Event
 
 COMMIT_POLL_SECONDS = 0.004
-"""How often the host's generation number is looked at: a read of shared memory."""
+"""Interval between two reads of the commit counter in shared memory."""
 
 PAGE = 500
 MAX_REPLAYED_EVENTS = 20_000
-"""At a start so many events fill the publishers' caches again: where environments are many, the last ones of each."""
+"""Maximum number of events republished at start to fill the publishers' caches, the newest of each environment."""
 
 NAME = "events"
 
 
 class Relay(LeaderThread):
-    """A thread that publishes what the outbox holds."""
+    """Thread that publishes the events of the outbox."""
 
     def __init__(self, store: Store, bus: Bus, data_dir: Path) -> None:
         super().__init__(
-            data_dir, NAME, well=f"events go out over Zenoh at {bus.endpoints}", trouble="NO EVENTS GO OUT"
+            data_dir, NAME, well=f"event relay: connected to Zenoh at {bus.endpoints}", trouble="event relay: down"
         )
         self._store, self._bus = store, bus
         self._replayed_for = 0
@@ -41,7 +41,7 @@ class Relay(LeaderThread):
         self._bus.close()
 
     def _run_once(self) -> None:
-        """Publish what is there, then wait for more."""
+        """Publish pending events, then wait for more."""
         if not self._bus.ensure_connected():
             self._publish_state(self._bus.state)
             self._stopping.wait(POLL_SECONDS / 4)
@@ -51,8 +51,8 @@ class Relay(LeaderThread):
             self._replayed_for = self._bus.opened
         generation = self._store.generation()
         self._publish_new()
-        self._publish_state(self._bus.state)  # not before: nothing goes out while the database is away
-        # The database is asked all the same (another host may have committed), and the session looked after.
+        self._publish_state(self._bus.state)  # only now: without the database nothing is published
+        # Also return periodically: another host may have committed, and the session must be checked.
         last_read = time.monotonic()
         while not self._stopping.wait(COMMIT_POLL_SECONDS):
             if self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS:
@@ -72,7 +72,7 @@ class Relay(LeaderThread):
             self._store.events.set_relayed(position)
 
     def _replay(self) -> None:
-        """A new session's caches are empty: put the last events of each environment again, oldest first."""
+        """Fill the empty caches of a new session: publish the last events of each environment again, oldest first."""
         position = self._store.events.relay_position()
         for event in self._store.events.last(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS):
             if self._stopping.is_set():
@@ -80,10 +80,10 @@ class Relay(LeaderThread):
             self._publish(event)
 
     def _publish(self, event: Event) -> None:
-        # The body says the name the environment had then; after a rename robots listen to both until they resync.
+        # After a rename the body keeps the old name; robots subscribe to both until they have synced.
         self._bus.publish(event.environment, event.body)
 
 
 def relay_state(data_dir: Path, mode: str) -> dict[str, Any]:
-    """What /readyz says of events: ``off``, ``starting``, ``connected`` or ``down`` with the reason."""
+    """Return the state of the relay for /readyz: ``off``, ``starting``, ``connected`` or ``down`` with the reason."""
     return {"state": "off"} if mode == "off" else leader.read_state(data_dir, NAME)

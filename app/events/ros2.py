@@ -1,11 +1,11 @@
-"""Maps as topics of ROS 2, without a ROS node: latched grids, their changes, and networks, in CDR over Zenoh.
+"""Publish maps as ROS 2 topics without a ROS node: latched grids, grid updates and networks, in CDR over Zenoh.
 
-A thread with a session of its own, since messages are large and must not be dropped: Zenoh drops what waits for more
-than 50 ms, and blocks the session instead where it is told to; events would wait with it. What a channel stands on is
-looked at after each commit, so what goes out is always a whole state, and the last one, never a queue of them.
+Runs in a thread with its own session, since messages are large and must not be dropped: Zenoh drops messages that wait
+for more than 50 ms, or blocks the session, and then events would wait as well. The channels' versions are read after
+each commit, so only the newest complete state is published, never a queue of states.
 
-Latched: rmw_zenoh and zenoh-bridge-ros2dds (since 1.5.1) subscribe with history to publishers that keep their last
-samples and can be detected; a plain publisher tells late joiners nothing.
+Latched: rmw_zenoh and zenoh-bridge-ros2dds (since 1.5.1) subscribe with history to publishers that cache their last
+samples and can be detected; late joiners get nothing from a plain publisher.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from app.store.values import Version
 log = logging.getLogger(__name__)
 
 FRAME = "map"
-"""The frame of all maps, as Nav2 and topological_navigation call it."""
+"""Frame id of all maps, the default of Nav2 and topological_navigation."""
 
 HEARTBEAT_SECONDS = 0.5
 COMMIT_POLL_SECONDS = 0.02
 VERSION_POLL_SECONDS = 5.0
-"""How often the database is asked all the same: another host may have committed."""
+"""Maximum interval between two reads of the database: another host may have committed."""
 
 RETRY_SECONDS = 30.0
-"""After a map could not be made it is tried again so much later, or when the channel moves."""
+"""Pause before another attempt after a failed conversion, unless the channel moves earlier."""
 
 NAME = "ros2"
 
 
 @dataclass(frozen=True, slots=True)
 class Ros2Options:
-    """What goes out, and on whose keys."""
+    """Environments to publish, and styles of keys."""
 
     environments: tuple[EnvironmentSelector, ...]
     keys: tuple[Keys, ...] = ("rmw_zenoh", "ros2dds")
@@ -57,8 +57,13 @@ class Ros2Options:
 
 @dataclass(frozen=True, slots=True)
 class TopicContent:
-    """What an environment has to say. grids: by level, None for the lowest. network: the tmap2 as JSON. absent: why
-    something is not there, for the log."""
+    """Content of an environment's topics.
+
+    Attributes:
+        grids: by level, None for the lowest.
+        network: tmap2 as JSON.
+        absent: reasons for missing content, for the log.
+    """
 
     grids: Mapping[str | None, cdr.Grid]
     network: str | None
@@ -66,14 +71,14 @@ class TopicContent:
 
 
 LookUpVersions = Callable[[], Mapping[str, Version]]
-"""The chosen environments, each with the version that its channel stands on."""
+"""Function that returns the selected environments with the version that their channel points to."""
 
 Fetch = Callable[[Version], TopicContent]
-"""What is in a version. Raises FleetMapError where it cannot be had now."""
+"""Function that returns the content of a version. Raises FleetMapError if it is not available."""
 
 
 class TopicPublisher:
-    """A topic on one kind of keys. It is detected and keeps its last message as long as it is held."""
+    """Publisher of a topic in one style of keys. Can be discovered and caches its last message until it is closed."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, style: Keys, domain: int, entity: int) -> None:
         key = topic.key(style, domain)
@@ -93,13 +98,13 @@ class TopicPublisher:
             self._publisher = session.declare_publisher(key, reliability=reliable, congestion_control=block)
         token = topic.token(style, domain, str(session.info.zid()), entity)
         self._token: Any = session.liveliness().declare_token(token)
-        # rmw_zenoh hashes the token by XXH3; for who receives it is just an id that stays the same.
+        # rmw_zenoh hashes the token with XXH3; subscribers only need a constant id.
         self._gid = hashlib.sha256(token.encode()).digest()[:16]
         self._attached = style != "ros2dds"
         self._count = 0
 
     def put(self, payload: zenoh.ZBytes) -> None:
-        """Publish; rmw_zenoh drops what comes without its attachment."""
+        """Publish a message, with the attachment that rmw_zenoh requires."""
         if not self._attached:
             self._publisher.put(payload)
             return
@@ -108,7 +113,7 @@ class TopicPublisher:
         self._publisher.put(payload, attachment=ext.z_serialize(attachment))
 
     def close(self) -> None:
-        """Say that it is gone."""
+        """Withdraw the publisher and its liveliness token."""
         for declaration in (self._token, self._publisher):
             with contextlib.suppress(Exception):
                 declaration.undeclare()
@@ -116,7 +121,7 @@ class TopicPublisher:
 
 @dataclass(slots=True)
 class _Topic:
-    """A topic on all its keys, and what was said last."""
+    """A topic with its publishers, and the last published content."""
 
     publishers: Sequence[TopicPublisher]
     last: cdr.Grid | str | None = None
@@ -133,8 +138,12 @@ class _Topic:
 
 @dataclass(slots=True)
 class _PublishedEnvironment:
-    """An environment: root and closures' digest that were published, and its topics by name. retry: when it is
-    published again after a failure.
+    """Published state of an environment.
+
+    Attributes:
+        versions: published root and digest of closures.
+        topics: by name.
+        retry: monotonic time of the next attempt after a failure.
     """
 
     versions: tuple[str, str] = ("", "")
@@ -143,7 +152,7 @@ class _PublishedEnvironment:
 
 
 class Ros2Publisher(LeaderThread):
-    """The thread. One process of a data folder publishes (it holds a file lock); where it dies, another takes over."""
+    """Thread that publishes maps to ROS 2. One process per data folder publishes; if it dies, another takes over."""
 
     def __init__(
         self,
@@ -155,7 +164,7 @@ class Ros2Publisher(LeaderThread):
         look: LookUpVersions,
         fetch: Fetch,
     ) -> None:
-        super().__init__(data_dir, NAME, well="maps go out to ROS 2", trouble="NOTHING GOES OUT TO ROS 2")
+        super().__init__(data_dir, NAME, well="ROS 2 publisher: connected", trouble="ROS 2 publisher: down")
         self._options, self._bus = options, bus
         self._generation, self._look_up_versions, self._fetch = generation, look, fetch
         self._session: zenoh.Session | None = None
@@ -165,7 +174,7 @@ class Ros2Publisher(LeaderThread):
         self._owners: dict[str, str] = {}
 
     def _run_once(self) -> None:
-        """Publish what has changed, then wait for more."""
+        """Publish changes, then wait for more."""
         if self._session is None and not self._open():
             self._stopping.wait(POLL_SECONDS)
             return
@@ -193,7 +202,7 @@ class Ros2Publisher(LeaderThread):
 
     def _on_unexpected_error(self) -> None:
         super()._on_unexpected_error()
-        self._release()  # what was said last is not known for sure
+        self._release()  # the last published state is uncertain
 
     def _release(self) -> None:
         for name in list(self._environments):
@@ -205,7 +214,7 @@ class Ros2Publisher(LeaderThread):
         self._session = self._node = None
         self._entities = 0
 
-    # --- what has changed ---
+    # --- changes ---
 
     def _publish_changes(self, standing: Mapping[str, Version]) -> None:
         for name in [n for n in self._environments if n not in standing]:
@@ -222,11 +231,11 @@ class Ros2Publisher(LeaderThread):
             place.versions, place.retry = shown, None
             try:
                 content = self._fetch(version)
-            except Exception as error:  # one environment's trouble is not the others'
+            except Exception as error:  # continue with the other environments
                 if isinstance(error, FleetMapError):
-                    log.warning("ROS 2: %s stays as it is: %s", name, error.detail)
+                    log.warning("ROS 2: could not update %s, will retry: %s", name, error.detail)
                 else:
-                    log.exception("ROS 2: %s stays as it is", name)
+                    log.exception("ROS 2: could not update %s, will retry", name)
                 place.retry = time.monotonic() + RETRY_SECONDS
                 continue
             for reason in content.absent:
@@ -240,11 +249,16 @@ class Ros2Publisher(LeaderThread):
         for level, grid in content.grids.items():
             topic, updates = ros_names.map_topic(namespace, level), ros_names.update_topic(namespace, level)
             if topic.name in topic_names:
-                log.error("ROS 2: a level of %s is left out: another one has its topic %s", name, topic.name)
+                log.error("ROS 2: skipped a level of %s: another level has the same topic %s", name, topic.name)
                 continue
             size = grid.width * grid.height
             if size > self._bus.max_reply_bytes:
-                log.error("ROS 2: %s is left out: %d bytes are more than is sent over Zenoh", topic.name, size)
+                log.error(
+                    "ROS 2: skipped %s: %d bytes exceed FLEETMAP_ZENOH_MAX_REPLY_BYTES (%d)",
+                    topic.name,
+                    size,
+                    self._bus.max_reply_bytes,
+                )
                 continue
             out, changes = self._out(name, place, topic), self._out(name, place, updates)
             if out is None or changes is None:
@@ -257,7 +271,7 @@ class Ros2Publisher(LeaderThread):
                 changes.put(update(before, grid, version))
             out.put(cdr.occupancy_grid(grid, version.time, FRAME))
             out.last = grid
-            log.info("ROS 2: %s is version %d of %s", topic.name, version.number, name)
+            log.info("ROS 2: published %s (version=%d, environment=%s)", topic.name, version.number, name)
         if content.network is not None:
             topic = ros_names.network_topic(namespace)
             out = self._out(name, place, topic)
@@ -266,17 +280,22 @@ class Ros2Publisher(LeaderThread):
                 if out.last != content.network:
                     out.put(cdr.string(content.network))
                     out.last = content.network
-                    log.info("ROS 2: %s is version %d of %s", topic.name, version.number, name)
+                    log.info("ROS 2: published %s (version=%d, environment=%s)", topic.name, version.number, name)
         self._retire(name, topic_names)
 
     def _out(self, name: str, place: _PublishedEnvironment, topic: Topic) -> _Topic | None:
-        """The topic, declared; None where another environment has it."""
+        """Return the declared topic; None if another environment has a topic of this name."""
         existing_topic = place.topics.get(topic.name)
         if existing_topic is not None:
             return existing_topic
         owner = self._owners.get(topic.name)
         if owner is not None:
-            log.error("ROS 2: %s of %s is left out: %s has that topic; give namespaces", topic.name, name, owner)
+            log.error(
+                "ROS 2: skipped %s of %s: %s has the same topic; set namespaces in FLEETMAP_ROS2_ENVIRONMENTS",
+                topic.name,
+                name,
+                owner,
+            )
             return None
         assert self._session is not None
         publishers = []
@@ -296,7 +315,10 @@ class Ros2Publisher(LeaderThread):
 
 
 def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
-    """The smallest rectangle that holds all cells in which two different grids of one frame differ, as a message."""
+    """Encode the bounding rectangle of all differing cells as an OccupancyGridUpdate.
+
+    The grids must have the same frame and differ in at least one cell.
+    """
     shape = (after.height, after.width)
     new = np.frombuffer(after.cells, np.int8).reshape(shape)
     changed = new != np.frombuffer(before.cells, np.int8).reshape(shape)
@@ -307,7 +329,7 @@ def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
 
 
 def ros2_state(data_dir: Path) -> dict[str, Any]:
-    """What /readyz says of topics: ``starting``, ``connected`` with their number, or ``down`` with the reason."""
+    """Return the state for /readyz: ``starting``, ``connected`` with the number of topics, ``down`` with the reason."""
     return leader.read_state(data_dir, NAME)
 
 

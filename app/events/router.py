@@ -1,7 +1,7 @@
-"""The Zenoh router of the embedded default, in a process of its own: native threads of a router and a server that
-forks or is killed do not mix. It ends when its standard input does, that is with the server that started it.
+"""Embedded Zenoh router in a separate process, since native threads do not survive forks of the server.
 
-``python -m app.events.router`` reads one line of JSON5 (the configuration), prints ``listening`` or why not.
+It stops when its standard input closes, which also happens if the server is killed. ``python -m app.events.router``
+reads one line of JSON5 (the configuration) and prints ``listening`` or the error.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ START_SECONDS = 20.0
 
 
 class Router:
-    """A router process. ``problem`` says why it does not run."""
+    """Process of the router. ``problem``: why it could not start, else None."""
 
     def __init__(self, configuration: str) -> None:
         self.problem: str | None = None
@@ -28,7 +28,7 @@ class Router:
             stdout=subprocess.PIPE,
             env=env,
             text=True,
-            start_new_session=True,  # Ctrl-C in a terminal ends the server, which ends the router
+            start_new_session=True,  # Ctrl-C stops the server, which stops the router
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -48,11 +48,11 @@ class Router:
 
     @property
     def alive(self) -> bool:
-        """Whether it still runs."""
+        """Whether the process is running."""
         return self._process.poll() is None
 
     def close(self) -> None:
-        """End it."""
+        """Stop the process."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
@@ -67,14 +67,14 @@ def main() -> int:
     """Run a router until standard input ends."""
     import zenoh
 
-    # Zenoh logs to standard output, of which the server reads one line: what else is said belongs to its log.
+    # Zenoh logs to standard output: redirect it to standard error, since the server reads the status line.
     status_stream = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     zenoh.init_log_from_env_or("error")
     configuration = sys.stdin.readline()
     try:
         session = zenoh.open(zenoh.Config.from_json5(configuration))
-    except Exception as error:  # noqa: BLE001  zenoh raises its own class for all; the parent tells it
+    except Exception as error:  # noqa: BLE001  zenoh raises one class for everything; the parent reports it
         print(
             str(error).splitlines()[0][:500] if str(error) else "the router did not start",
             file=status_stream,

@@ -1,10 +1,10 @@
-"""A router of our own that tells friend from foe: TLS, users, and who may say what.
+"""Security of the embedded router: TLS, users and access control.
 
-Only the server puts events, maps and topics of ROS 2; a robot puts its own status and shows its own token. Everybody
-who may come in hears and asks everything: what a robot may hear is decided by whether it has a password (and, where
-asked for, a certificate). Source: Zenoh's access control, where a message is let through if a rule of its sender
-(ingress) and one of its receiver (egress) say so. Keys with a piece that starts with ``@`` are matched by no wildcard;
-they carry history and recovery (``@adv``) and the graph of ROS 2.
+Only the server may publish events, maps and ROS 2 topics; a robot may publish only its own status and liveliness token.
+Every user may subscribe to and query all keys, so read access depends only on a password (and a certificate if
+required). Source: Zenoh's access control, which passes a message if a rule of its sender (ingress) and one of its
+receiver (egress) allow it. Wildcards do not match key segments that start with ``@``, which are used for history and
+recovery (``@adv``) and for the ROS 2 graph.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from app.events import messages
 from app.events.credentials import ZenohCredentials, readable_file
 
 SERVER = "server"
-"""The user that the server itself is on its own router."""
+"""User name of the server on its own router."""
 
 PASSWORD_FILE = "zenoh-password"  # noqa: S105  the name of a file
 USERS_FILE = "zenoh-users"
@@ -34,10 +34,14 @@ PUBLISHER_MESSAGES = ("put", "delete", "declare_queryable", "reply", "liveliness
 
 @dataclass(frozen=True, slots=True)
 class RouterSecurity:
-    """What an operator sets. login: of the server at somebody else's router, and of its own router at others.
+    """Security settings of the operator.
 
-    certificate and key of the login are what a router of our own shows, too. mutual: robots must show a certificate
-    that the login's ca has signed. users: a file of ``name:password`` lines. folder: for what is kept between starts.
+    Attributes:
+        login: credentials of the server at another router, and of its own router at other routers. The embedded router
+            presents its certificate to robots as well.
+        mutual: whether robots must present a certificate signed by the login's ca.
+        users: file of ``name:password`` lines.
+        folder: folder for generated files.
     """
 
     login: ZenohCredentials = field(default_factory=ZenohCredentials)
@@ -46,12 +50,12 @@ class RouterSecurity:
     folder: Path = Path()
 
     def router_values(self, prefix: str, *, access: bool) -> dict[str, Any]:
-        """Zenoh's settings for the router. access: whether to say who may say what. Raises Invalid."""
+        """Return Zenoh's settings for the router. access: whether to add access control. Raises Invalid."""
         out = self.login.values()
         if self.login.certificate is not None and self.login.key is not None:
             out["transport/link/tls/listen_certificate"] = readable_file(self.login.certificate)
             out["transport/link/tls/listen_private_key"] = readable_file(self.login.key)
-        # Unless asked for, a robot without a certificate is welcome.
+        # By default, robots need no certificate.
         out["transport/link/tls/enable_mtls"] = self.mutual
         if self.users is not None:
             users = {**read_users(self.users), SERVER: self._server_password()}
@@ -62,10 +66,10 @@ class RouterSecurity:
         return out
 
     def session_values(self) -> dict[str, Any]:
-        """Zenoh's settings for the server's own session at its own router."""
+        """Return Zenoh's settings for the server's session at its own router."""
         out = self.login.values()
         out["transport/link/tls/enable_mtls"] = self.mutual
-        # It connects to an address of this machine, which no certificate may name.
+        # The session connects to a loopback address, which the certificate need not contain.
         out["transport/link/tls/verify_name_on_connect"] = False
         if self.users is not None:
             credentials = {"user": SERVER, "password": self._server_password(), "dictionary_file": None}
@@ -73,14 +77,14 @@ class RouterSecurity:
         return out
 
     def _server_password(self) -> str:
-        """Made once; all processes of the data folder have the same."""
+        """Return the server's password, created once and shared by all processes of the data folder."""
         path = self.folder / PASSWORD_FILE
         if not path.is_file():
             temporary = _private(path, secrets.token_urlsafe(32))
             try:
                 os.link(temporary, path)
             except FileExistsError:
-                pass  # another process was quicker
+                pass  # another process has created it
             finally:
                 temporary.unlink()
         return path.read_text().strip()
@@ -92,10 +96,10 @@ class RouterSecurity:
 
 
 def read_users(path: Path) -> dict[str, str]:
-    """A file of ``name:password`` lines; ``#`` starts a comment line. Names are robots'. Raises Invalid."""
+    """Read a file of ``name:password`` lines; ``#`` starts a comment line. Names are robot names. Raises Invalid."""
     readable_file(path)
     if path.stat().st_size > MAX_USERS_BYTES:
-        raise Invalid(f"{path} has more than {MAX_USERS_BYTES} bytes: is it a file of users?")
+        raise Invalid(f"{path} exceeds {MAX_USERS_BYTES} bytes: it must be a file of NAME:PASSWORD lines")
     users: dict[str, str] = {}
     problems = []
     for number, raw in enumerate(path.read_bytes().splitlines(), 1):
@@ -109,23 +113,23 @@ def read_users(path: Path) -> dict[str, str]:
         name, colon, password = line.partition(":")
         name, password = name.strip(), password.strip()
         if not colon or not password or not password.isprintable():
-            problems.append(Problem("not NAME:PASSWORD", path.name, number))
+            problems.append(Problem("must be NAME:PASSWORD", path.name, number))
         elif not messages.ROBOT_NAME.fullmatch(name):
-            problems.append(Problem("a name is of letters, digits, dots, - and _", path.name, number))
+            problems.append(Problem("invalid name: use letters, digits, dots, - and _", path.name, number))
         elif name == SERVER:
-            problems.append(Problem(f"the name {SERVER} is the server's own", path.name, number))
+            problems.append(Problem(f"the name {SERVER} is reserved", path.name, number))
         elif name in users:
-            problems.append(Problem("this name is there already", path.name, number))
+            problems.append(Problem("duplicate name", path.name, number))
         else:
             users[name] = password
     if problems or not users:
-        summary = "; ".join(f"line {p.line}: {p.problem}" for p in problems[:20]) or "there is no user in it"
+        summary = "; ".join(f"line {p.line}: {p.problem}" for p in problems[:20]) or "the file has no users"
         raise Invalid(f"{path}: {summary}", problems)
     return users
 
 
 def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
-    """Zenoh's access control: what is not allowed is dropped (the router says so with ``RUST_LOG=zenoh=trace``)."""
+    """Return Zenoh's access control. Denied messages are dropped; to see them, set ``RUST_LOG=zenoh=trace``."""
 
     def rule(name: str, flows: list[str], kinds: Iterable[str], keys: Iterable[str]) -> dict[str, Any]:
         return {"id": name, "permission": "allow", "flows": flows, "messages": list(kinds), "key_exprs": list(keys)}
@@ -133,13 +137,13 @@ def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
     names = list(robots)
     rules = [
         rule(
-            "the server says and hears all",
+            "server: all messages",
             ["ingress", "egress"],
             (*PUBLISHER_MESSAGES, *SUBSCRIBER_MESSAGES),
             ALL_KEYS,
         ),
-        rule("robots hear all", ["egress"], (*PUBLISHER_MESSAGES, *SUBSCRIBER_MESSAGES), ALL_KEYS),
-        rule("robots ask all", ["ingress"], SUBSCRIBER_MESSAGES, ALL_KEYS),
+        rule("robots: receive all", ["egress"], (*PUBLISHER_MESSAGES, *SUBSCRIBER_MESSAGES), ALL_KEYS),
+        rule("robots: subscribe and query all", ["ingress"], SUBSCRIBER_MESSAGES, ALL_KEYS),
     ]
     subjects = [{"id": SERVER, "usernames": [SERVER]}, {"id": "robots", "usernames": names}]
     policies = [
@@ -164,7 +168,7 @@ def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
 
 
 def _private(path: Path, text: str) -> Path:
-    """A new file beside ``path`` that only its owner reads."""
+    """Write a temporary file beside ``path``, readable by its owner only, and return it."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
     with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:  # noqa: PTH123  its mode
         stream.write(text)

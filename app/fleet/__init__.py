@@ -1,7 +1,8 @@
-"""The fleet: who holds what, who is there, who lags.
+"""Fleet status, rollouts and robot reports.
 
-``status`` what follows from what is stored · ``rollout`` when channels move, and move back · ``report_queue`` what
-comes over the bus, in order, into the store.
+Modules: ``status`` online, lag and convergence of robots · ``rollout`` steps of rollouts · ``report_queue`` stores
+reports in order · ``overlays`` permanent closures · ``live`` closures for running planners · ``vda5050`` VDA 5050
+messages.
 """
 
 from app.fleet.report_queue import WARN_SECONDS, ReportQueue, report_from_status, wait_until_stored

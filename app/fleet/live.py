@@ -1,4 +1,4 @@
-"""Closures as the requests that planners take while they run, read from the files that these planners have loaded."""
+"""Closures as requests to running planners, derived from the map files that these planners have loaded."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from app.store.values import Version
 
 
 def with_closures(version: Version, closures: Closures | None) -> Version:
-    """The version, its maps showing these closures."""
+    """Return the version with these closures applied to its maps."""
     return replace(version, closures=closures)
 
 
 def closed_edges(files: Mapping[str, bytes]) -> list[int]:
-    """Numbers of the edges that a Nav2 route graph marks as blocked, ascending."""
+    """Return the ids of edges that a Nav2 route graph marks as blocked, ascending."""
     graph = json.loads(next(iter(files.values())))
     edges = (feature["properties"] for feature in graph["features"])
     return sorted(e["id"] for e in edges if "startid" in e and (e.get("metadata") or {}).get("blocked") is True)
 
 
 def closed_lanes(files: Mapping[str, bytes]) -> dict[str, list[int]]:
-    """Indexes of the lanes that navigation graphs mark as blocked, ascending, by file.
+    """Return the indices of lanes that navigation graphs mark as blocked, ascending, by file.
 
-    Counted as rmf_fleet_adapter's parse_graph.cpp counts them: the lanes of all levels in the order of the file; a lane
-    with a dock_name behind a door or lift takes two indexes, the first for the way to a waypoint of its own.
+    Counted as in rmf_fleet_adapter's parse_graph.cpp: the lanes of all levels in file order; a lane with a dock_name
+    behind a door or lift takes two indices, the first for the path to an additional waypoint.
     """
     out = {}
     for name, data in files.items():
@@ -54,7 +54,7 @@ def closed_lanes(files: Mapping[str, bytes]) -> dict[str, list[int]]:
 
 
 def _has_entry_event(lane: Sequence[Any], parameters: Mapping[str, Any], in_lift: Sequence[bool]) -> bool:
-    """Whether a robot does something before it enters a lane: a lift session, or a door."""
+    """Whether a lane has an entry event: a lift session or a door."""
     begin, end = in_lift[lane[0]], in_lift[lane[1]]
     if begin or end:
         return begin is not end
@@ -62,10 +62,10 @@ def _has_entry_event(lane: Sequence[Any], parameters: Mapping[str, Any], in_lift
 
 
 def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[str, Any]]:
-    """Zone sets of VDA 5050 3.0, one for each level with closed areas. Raises MissingDatum for degrees without one.
+    """Return VDA 5050 3.0 zone sets, one for each level with closed areas.
 
-    Coordinates are local metres, vertices run counter-clockwise. The default level's map is ``map_id``, that of another
-    level ``map_id/LEVEL``.
+    Coordinates are local metres; vertices are counter-clockwise. The map id of the default level is ``map_id``, that of
+    other levels ``map_id/LEVEL``. Raises MissingDatum if an area in degrees cannot be converted.
     """
     out = []
     for level in sorted({c.level for c in closures.items if c.polygon is not None}):
@@ -84,11 +84,11 @@ def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[st
 
 
 def _outlines(closure: Closure, version: Version) -> list[list[dict[str, float]]]:
-    """The outer rings of a closed area, counter-clockwise, without the repeated last point. Holes are closed, too."""
+    """Return the outer rings of a closed area, counter-clockwise, without the repeated last point. Fills holes."""
     shape = shapely.geometry.shape(closure.polygon)
     if closure.crs == "wgs84":
         if version.datum is None:
-            raise MissingDatum(f"{version.environment} has no datum, so a closed area in degrees has no local place")
+            raise MissingDatum(f"{version.environment} has no datum, which closed areas in degrees require")
         shape = local_frame(version.datum).geometries_to_local(shapely.get_parts([shape]))
     parts = shapely.get_parts(shape)
     rings = []

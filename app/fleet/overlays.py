@@ -21,7 +21,10 @@ BLOCKED, UNTIL = "blocked", "blocked_until"
 
 
 def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
-    """Edits that make a closure permanent; none if the edge is blocked already. Raises Invalid for an unknown edge."""
+    """Return edits that make a closure permanent; none if the edge is blocked already.
+
+    Raises Invalid for an unknown edge.
+    """
     if overlay.edge is not None:
         key, edge = find_edge(store, [head], overlay.edge)
         if edge.properties.get(BLOCKED) is True and UNTIL not in edge.properties:
@@ -39,7 +42,7 @@ def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[
 def find_edge(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartKey, Feature]:
     """Find an edge and its network in the first of these versions that has it. Raises Invalid if none has.
 
-    A piece of a bent edge, as formats with straight edges name it, is found as that edge if no edge has its own name.
+    A piece of a bent edge, which formats with straight edges split, resolves to that edge unless an edge has this id.
     """
     numbers = []
     environment = ""
@@ -56,14 +59,14 @@ def find_edge(store: Store, versions: Iterable[Version], edge: str) -> tuple[Par
                         if feature.properties.get("kind") == "edge" and (not number or number <= pieces > 1):
                             return entry.key, feature
     raise Invalid(
-        f"{environment} has no edge {edge[:80]!r} in version {' or '.join(numbers)}: use an edge's id, as "
-        "GET …/layers/topology lists it",
-        [Problem("no such edge", where="edge")],
+        f"unknown edge {edge[:80]!r} in version {' or '.join(numbers)} of {environment}: use an edge id of "
+        "GET …/layers/topology",
+        [Problem("unknown edge", where="edge")],
     )
 
 
 def _put_edge(key: PartKey, edge: Feature, properties: Mapping[str, Any]) -> dict[str, Any]:
-    """The edge with other properties, where it is."""
+    """Return an edit that replaces the properties of an edge."""
     shape = None if edge.geometry.is_empty else json.loads(shapely.to_geojson(edge.geometry))
     local = edge.anchor == "local"
     feature = {"type": "Feature", "id": edge.id, "geometry": None if local else shape, "properties": dict(properties)}

@@ -1,5 +1,6 @@
-"""What robots say, into the store: in order, many in one transaction; what came over the bus also when the database was
-away. A fleet that reports at once costs some transactions, not one for each robot.
+"""Queue of robot reports: stores them in order, many in one transaction.
+
+Reports from Zenoh wait while the database is unavailable. Simultaneous reports of a fleet need few transactions.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from app.store.store import Store
 log = logging.getLogger(__name__)
 
 QUEUE_SIZE = 20_000
-"""So many reports wait for the database; of further ones it is told that they were left out."""
+"""Maximum number of waiting reports; further ones are dropped and logged."""
 
 MAX_QUEUED_PER_ROBOT = 200
-"""Of one robot so many wait, of those that came over the bus: who says too much displaces nobody else."""
+"""Maximum number of waiting reports from Zenoh per robot, so that one robot cannot displace others."""
 
 BATCH = 100
-"""Reports in one transaction: a quarter of a second on SQLite, in which nobody else can write."""
+"""Maximum number of reports in one transaction: about 0.25 s on SQLite, which blocks other writers."""
 
 PRESENCE_REFRESH_SECONDS = 15.0
 RETRY_SECONDS = 1.0
@@ -39,7 +40,7 @@ MAX_PRESENT = 100_000
 
 
 def report_from_status(status: RobotStatus) -> RobotReport:
-    """A status as the store takes it. A time that is none counts as not told: nothing depends on robots' clocks."""
+    """Convert a status for the store. An invalid time is dropped, since nothing depends on robots' clocks."""
     reported_at = None
     if status.time is not None:
         with contextlib.suppress(ValueError, OverflowError):
@@ -51,17 +52,19 @@ def report_from_status(status: RobotStatus) -> RobotReport:
 
 @dataclass(frozen=True, slots=True)
 class _QueuedReport:
-    """A report that waits. result: who waits to be told whether it was taken, None for what came over the bus."""
+    """A waiting report. result: future of the caller; None for reports from Zenoh."""
 
     report: ReceivedReport
     result: Future[FleetMapError | None] | None = None
 
 
 class ReportQueue:
-    """Reports and liveliness. ``enqueue_status`` and ``set_presence`` return at once, ``store_report`` when it is
-    stored; a thread writes.
+    """Queue with a writer thread for reports and presence of robots. Thread-safe.
 
-    bus_vouches: whether reports over the bus come with authority, because its router lets nobody in but its users.
+    ``enqueue_status`` and ``set_presence`` return at once, ``store_report`` after the report is stored.
+
+    Args:
+        bus_vouches: whether reports from Zenoh count as authenticated, because the router requires users.
     """
 
     def __init__(
@@ -79,14 +82,14 @@ class ReportQueue:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin to write; once."""
+        """Start the writer thread. Further calls have no effect."""
         if self._thread is not None:
             return
         self._thread = threading.Thread(target=self._run, name="fleetmap-fleet", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Write what waits, then end."""
+        """Write waiting reports, then stop."""
         self._stopping.set()
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)
@@ -94,7 +97,7 @@ class ReportQueue:
             self._thread.join(10)
 
     def enqueue_status(self, environment: str, robot: str, payload: bytes) -> None:
-        """A robot's status as it came."""
+        """Queue a robot's status from Zenoh, not yet parsed. Drops it if the queue is full."""
         with self._lock:
             if self._shares[robot] >= MAX_QUEUED_PER_ROBOT:
                 self._dropped_count += 1
@@ -107,22 +110,22 @@ class ReportQueue:
             self._shares[robot] += 1
 
     def store_report(self, received: ReceivedReport) -> None:
-        """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
+        """Store a report from HTTP. Blocks until it is stored. Raises the store's error if it is rejected."""
         wait_until_stored(self.submit_report(received), WARN_SECONDS)
 
     def submit_report(self, received: ReceivedReport) -> Future[FleetMapError | None]:
-        """The same without waiting: what the store has against it comes as the future's result."""
+        """Queue a report from HTTP. The future's result is None or the store's error. Raises Unavailable."""
         result: Future[FleetMapError | None] = Future()
         if self._thread is None or self._stopping.is_set():
             raise Unavailable("the server is starting or stopping: try again in a few seconds")
         try:
             self._queue.put_nowait(_QueuedReport(received, result))
         except queue.Full:
-            raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
+            raise Unavailable("too many waiting robot reports: try again in a few seconds") from None
         return result
 
     def set_presence(self, robot: str, on_bus: bool) -> None:
-        """A robot's session came or went."""
+        """Record that a robot's Zenoh session appeared or disappeared."""
         if not ROBOT_NAME.fullmatch(robot):
             return
         with self._lock:
@@ -149,14 +152,14 @@ class ReportQueue:
                 self._write(batch)
                 batch = []
             except Unavailable as error:
-                log.warning("reports of robots wait: %s", error.detail)
+                log.warning("robot reports: storing delayed, will retry: %s", error.detail)
                 for queued in batch:
                     _resolve_futures(queued, error)
                 batch = [queued for queued in batch if queued.result is None]
                 if self._stopping.wait(RETRY_SECONDS):
                     return
             except Exception:
-                log.exception("reports of robots could not be taken together")
+                log.exception("robot reports: storing a batch failed; retrying one at a time")
                 batch = self._write_each(batch)
             if self._stopping.is_set() and self._queue.empty():
                 return
@@ -184,12 +187,10 @@ class ReportQueue:
             try:
                 out.append(_QueuedReport(_read(environment, robot, payload, came, vouched=self._bus_vouches)))
             except FleetMapError as error:
-                refused.append(f"a report of {robot!r:.128} in {environment!r:.64} was left out: {error.detail}")
+                refused.append(f"robot reports: dropped one of {robot!r:.128} in {environment!r:.64}: {error.detail}")
         _warn(refused)
         if self._dropped_count:
-            log.error(
-                "%d reports of robots were left out: they come faster than they can be stored", self._dropped_count
-            )
+            log.error("robot reports: dropped %d, the queue is full", self._dropped_count)
             self._dropped_count = 0
         return out
 
@@ -201,12 +202,12 @@ class ReportQueue:
             batch, self._store.robots.note_reports([queued.report for queued in batch]), strict=True
         ):
             if refused is not None and queued.result is None:
-                unheard.append(f"a report of {queued.report.robot} was left out: {refused.detail}")
+                unheard.append(f"robot reports: dropped one of {queued.report.robot}: {refused.detail}")
             _resolve_futures(queued, refused)
         _warn(unheard)
 
     def _write_each(self, batch: list[_QueuedReport]) -> list[_QueuedReport]:
-        """Each on its own, so that one that cannot be taken harms no other; those for which the database is away."""
+        """Store reports one at a time, so that a bad one affects no other. Return those to retry."""
         left = []
         for queued in batch:
             try:
@@ -215,8 +216,8 @@ class ReportQueue:
                 _resolve_futures(queued, error)
                 left += [queued] if queued.result is None else []
             except Exception:
-                log.exception("a report of %s was left out", queued.report.robot)
-                _resolve_futures(queued, Unavailable("internal error; the server's log has the details"))
+                log.exception("robot reports: dropped one of %s", queued.report.robot)
+                _resolve_futures(queued, Unavailable("internal server error; details are in the server log"))
         return left
 
     def _write_presence(self, *, everybody: bool) -> None:
@@ -232,7 +233,7 @@ class ReportQueue:
 
 
 def wait_until_stored(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:
-    """Raise what the store had against a report; Unavailable where it did not say within so many seconds."""
+    """Wait until a report is stored. Raises the store's error if it is rejected, Unavailable after ``seconds``."""
     try:
         refused = result.result(seconds)
     except TimeoutError:
@@ -247,12 +248,12 @@ def _resolve_futures(queued: _QueuedReport, refused: FleetMapError | None) -> No
 
 
 def _warn(reasons: list[str]) -> None:
-    """One line for many: who says nonsense all the time must not fill the disk."""
+    """Log the first reason and the number of others, so that invalid reports do not fill the log."""
     if reasons:
         log.warning("%s%s", reasons[0], f" (and {len(reasons) - 1} others)" if len(reasons) > 1 else "")
 
 
 def _read(environment: str, robot: str, payload: bytes, time: datetime, *, vouched: bool) -> ReceivedReport:
     if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
-        raise Invalid("a robot's or environment's name cannot be used")
+        raise Invalid("invalid name of robot or environment")
     return ReceivedReport(environment, robot, report_from_status(RobotStatus.from_json(payload)), time, vouched)

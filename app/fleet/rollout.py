@@ -1,10 +1,9 @@
-"""Roll-outs in two stages: robots fetch a version first, the channel moves when enough have it, and moves back when too
-many fail.
+"""Rollouts in two stages: robots fetch a version first; the channel moves if enough are ready, and back if many fail.
 
-Shares are of the channel's robots that are online. Robots that say that they failed count as well where they are not
-online any more: what broke them may have been the map. Robots of which no report came with authority do not count:
-anybody can make them up on an open router. What was said before a stage began does not count in it; that is
-known from what was stored then, so that a clock that is set back hides no failure.
+Shares refer to the channel's online robots. Robots that reported a failure also count if they are offline now, since
+the map may be the cause. Robots without an authenticated report do not count: on an open router anyone can invent them.
+Reports from before a stage do not count in it; they are compared with those stored at its begin, so that a clock that
+is set back hides no failure.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from app.store.values import rfc3339
 
 
 def next_step(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> RolloutStep | None:
-    """The next step of a roll-out, None for waiting on. robots: of its channel; only those vouched for count."""
+    """Return the next step of a rollout, None to wait. robots: of its channel; only authenticated ones count."""
     robots = [robot for robot in robots if robot.vouched]
     begun = rollout.started if rollout.moved is None else rollout.moved
     failed = [r for r in robots if r.has_failed_with(rollout.root)]
@@ -34,18 +33,20 @@ def next_step(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Rollo
             return RolloutStep("end", "done", broken if names else "")
         return None
     if too_many:
-        return RolloutStep("end", "failed", f"{broken} to fetch it: the channel stays")
+        return RolloutStep("end", "failed", f"{broken} to fetch it; the channel does not move")
     ready = [r for r in robots if is_online(r, now) and is_ready(r, rollout.root)]
     online = sum(is_online(r, now) for r in robots)
     enough = rollout.ready is None or (online > 0 and _reaches(len(ready), rollout.ready, online))
     if enough and (rollout.activate_at is None or now >= rollout.activate_at):
-        reason = "its time has come" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
+        reason = "scheduled time reached" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
         return RolloutStep("move", "waiting", reason)
     if rollout.deadline is not None and now >= rollout.deadline:
-        return RolloutStep("end", "expired", f"only {len(ready)} of {online} robots are ready: the channel stays")
+        return RolloutStep(
+            "end", "expired", f"only {len(ready)} of {online} robots are ready; the channel does not move"
+        )
     return None
 
 
 def _reaches(count: int, share: float, total: int) -> bool:
-    """Whether so many are this share of all, the share being the decimal that was asked for: 0.28 of 25 is 7."""
+    """Whether ``count`` reaches a share of ``total``, computed with exact decimals: 0.28 of 25 is 7."""
     return count >= Fraction(repr(share)) * total

@@ -1,6 +1,6 @@
-"""What follows from what robots said: who is online, who lags, whether all of a channel hold its root.
+"""Compute fleet status from stored reports: online, lag, channel convergence.
 
-All times are the server's clock, so that robots' clocks count for nothing.
+All times are by the server's clock; robots' clocks are ignored.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from app.store.fleet_values import Channel, ChannelMove, Robot
 from app.store.values import rfc3339
 
 REPORT_FRESH = timedelta(seconds=180)
-"""A robot that is not on the bus is online for so long after a report."""
+"""Time after a report for which a robot without Zenoh counts as online."""
 
 PRESENCE_FRESH = timedelta(seconds=60)
-"""A presence is renewed every 15 seconds; where nobody renews it, it counts for no longer than this."""
+"""Maximum age of a stored presence; the server renews it every 15 seconds."""
 
 
 def is_online(robot: Robot, now: datetime) -> bool:
-    """By its liveliness on the bus where that is newer than its last report, else by a recent report."""
+    """Whether a robot is online: by its Zenoh liveliness if that is newer than its last report, else by that report."""
     if robot.presence_at is not None:
         if robot.on_bus and now - robot.presence_at < PRESENCE_FRESH:
             return True
@@ -32,11 +32,12 @@ def is_online(robot: Robot, now: datetime) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """How far a robot is behind its channel.
+    """Lag of a robot behind its channel.
 
-    events: of its channel that it has not acted on. differs: whether its root, or the closures in its map, are not the
-    channel's. since: when the
-    first of these events was; None where it does not lag.
+    Attributes:
+        events: number of channel moves that the robot has not applied.
+        differs: whether its root or the closures in its map differ from the channel's.
+        since: time of the first of these events; None if it does not lag.
     """
 
     events: int
@@ -44,7 +45,7 @@ class Lag:
     since: datetime | None
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like."""
+        """Return the members for JSON."""
         return {
             "events": self.events,
             "differs": self.differs,
@@ -53,9 +54,12 @@ class Lag:
 
 
 def robot_lag(robot: Robot, channel: Channel, moves: Sequence[ChannelMove]) -> Lag:
-    """A robot's lag. moves: of the channel, oldest first.
+    """Compute the lag of a robot behind its channel.
 
-    A robot that says no sequence has acted on the newest move that led to the root which it holds.
+    Args:
+        moves: moves of this channel, oldest first.
+
+    A robot that reports no sequence counts as having applied the newest move to the root that it runs.
     """
     active_map = robot.active_map
     if active_map is not None and active_map.shows(channel.root, channel.closures.digest):
@@ -70,11 +74,13 @@ def robot_lag(robot: Robot, channel: Channel, moves: Sequence[ChannelMove]) -> L
 
 @dataclass(frozen=True, slots=True)
 class ChannelConvergence:
-    """How a channel's robots stand: each is one of holding, failed and lagging.
+    """Number of a channel's robots by status; each robot is one of holding, failed and lagging.
 
-    holding: drive on the channel's root with the closures in force. failed: do not, and say that they failed. ready:
-    have the version that is planned, and count in its roll-out (vouched for). since: from when on all of them hold the
-    root; None while any does not.
+    Attributes:
+        holding: robots that run the channel's root with the closures in force.
+        failed: robots that do not and reported a failure.
+        ready: robots with the planned version that count in its rollout (authenticated).
+        since: time since which all robots run the root; None if any does not.
     """
 
     total: int
@@ -86,7 +92,7 @@ class ChannelConvergence:
     since: datetime | None
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-like."""
+        """Return the members for JSON."""
         return {
             "total": self.total,
             "online": self.online,
@@ -99,7 +105,7 @@ class ChannelConvergence:
 
 
 def is_ready(robot: Robot, root: str) -> bool:
-    """Whether a robot has a root, so that it could drive on it at once."""
+    """Whether a robot has fetched or runs a root, so that it can switch to it at once."""
     loaded = robot.report.state in ("ready", "active") and robot.report.root == root
     return loaded or (robot.active_map is not None and robot.active_map.root == root)
 
@@ -107,7 +113,7 @@ def is_ready(robot: Robot, root: str) -> bool:
 def channel_convergence(
     robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None
 ) -> ChannelConvergence:
-    """The proof of convergence of one channel. robots: of its environment; planned: root of what comes next."""
+    """Compute the convergence of a channel. robots: of its environment; planned: root of the planned version."""
     channel_robots = [robot for robot in robots if robot.report.channel == channel.name]
     overlays = channel.closures.digest
     hold, behind = [], []

@@ -1,11 +1,11 @@
-"""VDA 5050 (3.0, sections 6.3 and 6.4): instant actions that bring a map to a vehicle, and what its state says of maps.
+"""VDA 5050 (3.0, sections 6.3 and 6.4): instant actions that install maps on a vehicle, and the maps in its state.
 
-Vehicles of 2.1 understand the same actions. Their states tell of them in ``actionStates`` (``resultDescription``),
-those of 3.0 in ``instantActionStates`` (``actionResult``, and why in ``errors``); 2.0 knows no maps.
+Vehicles of 2.1 accept the same actions. They report results in ``actionStates`` (``resultDescription``), vehicles of
+3.0 in ``instantActionStates`` (``actionResult``, with reasons in ``errors``); 2.0 has no maps.
 
-Only the messages' content: carrying it over MQTT, with its header, is the fleet manager's. An action's id tells what it
-is about (``downloadMap:<mapId>:<mapVersion>:<unique>``), so that a state that says it failed can be understood. A state
-says which map is enabled (the vehicle drives on it) or disabled (it has it); optional fields may be absent or null.
+Covers only the content of messages: the fleet manager adds the header and sends them over MQTT. The id of an action
+contains its purpose (``downloadMap:<mapId>:<mapVersion>:<unique>``), so that a failure in a state can be assigned. In a
+state, maps are enabled (in use) or disabled (stored on the vehicle); optional fields may be absent or null.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _ACTION_ID = re.compile(r"(downloadMap|enableMap):(.+):([0-9]{1,9}):[^:]*", re.D
 
 
 def action(kind: Action, map_id: str, version: int, unique: str, **more: str) -> dict[str, Any]:
-    """One instant action. unique: what no other action has. more: further parameters.
+    """Return an instant action. unique: unique part of its id. more: further parameters.
 
-    The blocking type of an instant action is always NONE in 3.0, whose schema refuses others, and may be so before.
+    The blocking type is NONE: 3.0 allows no other for instant actions, and earlier versions accept it.
     """
     parameters = {"mapId": map_id, "mapVersion": str(version), **more}
     return {
@@ -43,7 +43,11 @@ def action(kind: Action, map_id: str, version: int, unique: str, **more: str) ->
 
 @dataclass(frozen=True, slots=True)
 class VehicleMaps:
-    """What a state says of one map: versions by what they are. failed: of actions of ours that failed, and why."""
+    """Versions of one map in a vehicle's state.
+
+    Attributes:
+        failed: (version, reason) of failed actions of this server.
+    """
 
     map_id: str
     enabled: tuple[str, ...]
@@ -52,7 +56,7 @@ class VehicleMaps:
 
 
 def default_level(version: Version) -> str:
-    """The level whose map is the site's: ``ground``, else the lowest one."""
+    """Return the level whose map id is that of the site: ``ground``, else the lowest one."""
     names = [level.name for level in version.levels]
     if not names or GROUND in names:
         return GROUND
@@ -60,20 +64,20 @@ def default_level(version: Version) -> str:
 
 
 def level_map_id(site: str, level: str | None) -> str:
-    """The ``mapId`` of a floor: VDA 5050 has one for each. level: None for the default level, which is the site's."""
+    """Return the ``mapId`` of a level. level: None for the default level, whose map id is that of the site."""
     return site if level is None else f"{site}/{level}"
 
 
 def site_name(map_id: str) -> str:
-    """The site that a floor's ``mapId`` belongs to: the part before the first slash."""
+    """Return the site of a level's ``mapId``: the part before the first slash."""
     return map_id.partition("/")[0]
 
 
 def merge_levels(floors: Sequence[VehicleMaps]) -> VehicleMaps:
-    """What a vehicle holds of a site, from what its state says of each floor.
+    """Merge the map versions of all levels of a site.
 
-    It runs the oldest version that is enabled on a floor, has those that it has of every floor that it reports, and
-    has failed with those that failed on any.
+    Enabled: the oldest version that is enabled on any level. Disabled: versions present on all reported levels. Failed:
+    versions that failed on any level.
     """
     first, *others = floors
     if not others:
@@ -87,18 +91,18 @@ def merge_levels(floors: Sequence[VehicleMaps]) -> VehicleMaps:
 
 
 def _age(version: str) -> tuple[bool, int, str]:
-    """Sort key of versions, the oldest first; what is no number comes last."""
+    """Return a sort key for versions, oldest first; names that are not numbers come last."""
     number = version.isascii() and version.isdigit() and len(version) < 10
     return not number, int(version) if number else 0, version
 
 
 def read_state(message: Any) -> tuple[VehicleMaps, ...]:
-    """The maps of a state message, by id; what it does not speak of is not there. Invalid says what is wrong with it.
+    """Read the maps of a state message, sorted by id. Raises Invalid.
 
-    A download that failed and whose map is there all the same was followed by one that did not fail.
+    A failed download is ignored if the vehicle has the map, since a later download must have succeeded.
     """
     if not isinstance(message, Mapping):
-        raise Invalid("a state message is a JSON object", [Problem("no object", where="body")])
+        raise Invalid("invalid VDA 5050 state: must be a JSON object", [Problem("must be a JSON object", where="body")])
     enabled: dict[str, list[str]] = {}
     disabled: dict[str, list[str]] = {}
     failed: dict[str, list[tuple[str, str]]] = {}
@@ -111,7 +115,7 @@ def read_state(message: Any) -> tuple[VehicleMaps, ...]:
         (enabled if status == "ENABLED" else disabled).setdefault(map_id, []).append(version)
     for map_id, versions in enabled.items():
         if len(set(versions)) > 1:
-            raise _invalid_state_error(f"several versions of {map_id[:80]} are ENABLED: at most one may be", "maps")
+            raise _invalid_state_error(f"several versions of {map_id[:80]} are ENABLED: only one is allowed", "maps")
     for (kind, map_id, version), why in _failures(message).items():
         if kind == "downloadMap" and version in (*enabled.get(map_id, ()), *disabled.get(map_id, ())):
             continue
@@ -124,9 +128,9 @@ def read_state(message: Any) -> tuple[VehicleMaps, ...]:
 
 
 def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
-    """Of our actions (what, map, version) those that failed, or wait for another try, and why.
+    """Return (action, map, version) -> reason of this server's actions that failed or wait for a retry.
 
-    Vehicles keep what failed in their lists: the same tried again, further down, counts instead.
+    Vehicles keep failed actions in their lists; a later entry for the same action replaces an earlier one.
     """
     descriptions: dict[str, str] = {}
     for k, error in enumerate(_list(message, "errors", MAX_ACTIONS)):
@@ -148,9 +152,9 @@ def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
             for member in ("actionResult", "resultDescription"):
                 text = item.get(member)
                 if text is not None and not isinstance(text, str):
-                    raise _invalid_state_error("must be a text", f"{name}[{k}].{member}")
+                    raise _invalid_state_error("must be a string", f"{name}[{k}].{member}")
                 reasons.insert(0, text)
-            out[about] = next((text for text in reasons if text), "the vehicle does not say why")
+            out[about] = next((text for text in reasons if text), "the vehicle reports no reason")
     return out
 
 
@@ -159,7 +163,7 @@ def _list(message: Mapping[str, Any], name: str, limit: int, within: str = "") -
     if items is None:
         return ()
     if not isinstance(items, list) or len(items) > limit:
-        raise _invalid_state_error(f"must be a list of at most {limit}", within + name)
+        raise _invalid_state_error(f"must be a list of at most {limit} items", within + name)
     for k, item in enumerate(items):
         if not isinstance(item, Mapping):
             raise _invalid_state_error("must be an object", f"{within}{name}[{k}]")
@@ -169,9 +173,9 @@ def _list(message: Mapping[str, Any], name: str, limit: int, within: str = "") -
 def _text(item: Mapping[str, Any], name: str, location: str) -> str:
     value = item.get(name)
     if not isinstance(value, str) or not value or len(value) > 512:
-        raise _invalid_state_error("must be a text", f"{location}.{name}")
+        raise _invalid_state_error("must be a string of 1 to 512 characters", f"{location}.{name}")
     return value
 
 
 def _invalid_state_error(problem: str, location: str) -> Invalid:
-    return Invalid(f"this is no VDA 5050 state: {location} {problem}", [Problem(problem, where=location)])
+    return Invalid(f"invalid VDA 5050 state: {location} {problem}", [Problem(problem, where=location)])

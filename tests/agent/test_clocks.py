@@ -38,7 +38,7 @@ def agent(place: str, gate: Gate, tmp_path: Path) -> Iterator[Make]:
 
 
 @pytest.mark.parametrize("fast", [-60.0, 60.0])
-def test_activation_comes_at_the_servers_time(
+def test_activation_follows_server_time(
     api: Api, place: str, agent: Make, gate: Gate, tmp_path: Path, fast: float
 ) -> None:
     channel = f"environments/{place}/channels/production"

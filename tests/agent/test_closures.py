@@ -15,7 +15,7 @@ from app.agent import agent
 from app.events.messages import RobotStatus
 from tests.agent.conftest import whole
 from tests.agent.fake import Fake, One, run
-from tests.agent.test_luck import event
+from tests.agent.test_bad_server import event
 from tests.events.conftest import eventually
 
 A, B = {"kml/map.kml": b"a" * 5000}, {"kml/map.kml": b"b" * 6000}
@@ -44,7 +44,7 @@ def map_and_closures(one: One) -> tuple[bytes, dict[str, Any]]:
     return (current / "kml" / "map.kml").read_bytes(), json.loads((current / "closures.json").read_text())
 
 
-def test_closure_comes_and_goes_with_an_event(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_closure_event_updates_installed_map(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     hook = f'echo "$FLEETMAP_OVERLAYS" >> {tmp_path}/log; cp "$FLEETMAP_CLOSURES_FILE" {tmp_path}/closures'
     one = robot(hook, poll_seconds=3600.0)
     fake.move("production", 1)
@@ -89,7 +89,7 @@ def test_closures_without_any_changed_file_are_a_switch(fake: Fake, robot: Robot
     assert fake.asked[-1].endswith("formats=kml"), "no file is fetched"
 
 
-def test_closures_that_change_during_a_download_are_no_error(fake: Fake, robot: Robot) -> None:
+def test_closures_changed_during_download_are_no_error(fake: Fake, robot: Robot) -> None:
     assert robot().once()
     fake.put(B)
     changes = 2
@@ -110,7 +110,7 @@ def test_closures_that_change_during_a_download_are_no_error(fake: Fake, robot: 
     assert all("closures=apply" in path for path in fake.asked if "/maps/" in path)
 
 
-def test_file_that_is_gone_with_its_closure_is_no_error(fake: Fake, robot: Robot) -> None:
+def test_file_removed_with_its_closure_is_no_error(fake: Fake, robot: Robot) -> None:
     fake.versions[0] = {**A, "kml/mask.kml": b"m" * 100}
 
     def change(handler: BaseHTTPRequestHandler) -> bool:
@@ -143,7 +143,7 @@ def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkey
     fake.instead = change
     one = robot()
     assert not one.once()
-    assert "other closures than the manifest" in one.detail
+    assert "other closures than its manifest" in one.detail
     assert request_count <= 2 * (agent.MAX_CLOSURE_CHANGES + 1)
     assert whole(one.into)["version"] == 1
     fake.instead = lambda _: False
@@ -188,7 +188,7 @@ def test_server_without_closures_gets_no_new_parameters(fake: Fake, robot: Robot
     assert robot("exit 1").once() is True, "a server that begins to apply closures changes no map"
 
 
-def test_before_switch_is_asked_for_closures(fake: Fake, robot: Robot) -> None:
+def test_before_switch_runs_for_closures(fake: Fake, robot: Robot) -> None:
     assert robot().once()
     fake.close_edges("e7")
     one = robot(before_switch=("grep -q e7 $FLEETMAP_CLOSURES_FILE && exit 75",))
@@ -213,7 +213,7 @@ def test_invalid_closures_are_refused(fake: Fake, robot: Robot, members: dict[st
     fake.more = members
     one = robot()
     assert not one.once()
-    assert "cannot be read" in one.detail
+    assert "invalid manifest" in one.detail
     assert whole(one.into)["version"] == 1
 
 
@@ -228,11 +228,11 @@ def test_status_carries_the_digest() -> None:
 @pytest.mark.parametrize(
     ("members", "text"),
     [
-        ({"closures": "ignore"}, "closures=ignore instead of apply"),
-        ({"closures": "mark"}, "closures=mark instead of apply"),
+        ({"closures": "ignore"}, "closures=ignore instead of closures=apply"),
+        ({"closures": "mark"}, "closures=mark instead of closures=apply"),
         ({"parameters": {"kml": {"level": "L2"}}}, "'level': 'L2'"),
         ({"parameters": {}}, "'crs': 'local'"),
-        ({"missing": []}, "without the optional osm"),
+        ({"missing": []}, "optional formats osm are missing without a reason"),
         ({"closures": 7}, "cannot be read"),
     ],
 )
@@ -276,7 +276,7 @@ def test_other_closures_under_one_sequence_are_refused(fake: Fake, robot: Robot)
     fake.closures = []
     one = robot()
     assert not one.once()
-    assert "under the same number" in one.detail
+    assert "under the same sequence" in one.detail
     assert map_and_closures(one)[0].endswith(b"ae7")
     fake.close_edges()
     assert robot().once()
@@ -343,7 +343,7 @@ def test_closure_reaches_a_robot_that_waits_or_refused(fake: Fake, robot: Robot,
         assert closed(one) == []
 
 
-def test_closure_that_the_robot_cannot_load_is_tried_again_ever_later(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_closure_that_cannot_be_loaded_is_retried_with_backoff(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     assert robot().once()
     fake.put(B)
     loads = "test $FLEETMAP_VERSION = 1 && ! grep -q e7 $FLEETMAP_CLOSURES_FILE"
@@ -360,7 +360,7 @@ def test_closure_that_the_robot_cannot_load_is_tried_again_ever_later(fake: Fake
     assert (tmp_path / "log").read_text().count('"id": "e7"') == 2, "version 2 and version 1, once each"
 
 
-def test_closures_that_change_during_a_preload_are_no_failure(
+def test_closures_changed_during_preload_are_no_failure(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(agent, "CLOSURES_SECONDS", 0.01)

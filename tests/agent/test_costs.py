@@ -26,12 +26,10 @@ def upload(api: Api) -> changes.Upload:
     return upload
 
 
-def test_a_moved_node_costs_less_than_a_kilobyte(api: Api, shared: Path, upload: changes.Upload) -> None:
+def test_delta_of_moved_node_is_below_one_kilobyte(api: Api, shared: Path, upload: changes.Upload) -> None:
     assert changes.moved_node(shared, upload, str(api.http.base_url), ADMIN) <= 1000
 
 
-def test_a_changed_block_of_a_large_grid_costs_little_of_its_picture(
-    api: Api, shared: Path, upload: changes.Upload
-) -> None:
+def test_delta_of_large_grid_is_small_for_changed_block(api: Api, shared: Path, upload: changes.Upload) -> None:
     cost, picture = changes.changed_block(shared, upload, str(api.http.base_url), ADMIN)
     assert cost <= 0.15 * picture

@@ -20,7 +20,7 @@ from tests.cli.conftest import ServerProcess
 from tests.events.conftest import client_config, eventually, free_port
 
 
-def test_a_broken_download_is_gone_on_from(api: Api, place: str, robot: Start, gate: Gate) -> None:
+def test_interrupted_download_is_resumed(api: Api, place: str, robot: Start, gate: Gate) -> None:
     whole_size = len(api.get(f"/maps/{place}/tmap2/network.tmap2.yaml").content)
     gate.cut = whole_size // 2
     one = robot("--once", server=gate.url)
@@ -38,7 +38,7 @@ def test_a_broken_download_is_gone_on_from(api: Api, place: str, robot: Start, g
     assert again.file() == api.get(f"/maps/{place}/tmap2/network.tmap2.yaml").content
 
 
-def test_a_part_of_something_else_is_thrown_away(api: Api, place: str, robot: Start, gate: Gate) -> None:
+def test_partial_download_of_other_content_is_discarded(api: Api, place: str, robot: Start, gate: Gate) -> None:
     gate.cut = 5000
     one = robot("--once", server=gate.url)
     assert one.end() == 1
@@ -80,7 +80,7 @@ def test_kill_at_random_moments_never_leaves_half_a_map(
     assert list((last.into / "partial").iterdir()) == []
 
 
-def test_the_hook_runs_where_it_was_cut_off(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+def test_interrupted_hook_runs_after_restart(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
     one = robot("--poll", "3600", "--on-change", f"touch {tmp_path}/begun; sleep 30")
     eventually((tmp_path / "begun").exists)
     one.kill()
@@ -122,7 +122,7 @@ def test_forged_events_cost_little_and_change_nothing(
     assert one.stop() == 0
 
 
-def test_sigterm_ends_it_in_the_middle_of_a_download(place: str, robot: Start, gate: Gate) -> None:
+def test_sigterm_stops_agent_during_download(place: str, robot: Start, gate: Gate) -> None:
     gate.slow = 0.2
     one = robot("--poll", "3600", server=gate.url)
     one.wait("downloading")
@@ -138,7 +138,7 @@ def line() -> tuple[int, int]:
     return free_port(), free_port()
 
 
-def test_the_server_is_killed_and_comes_back(line: tuple[int, int], tmp_path: Path) -> None:
+def test_agent_survives_killed_server(line: tuple[int, int], tmp_path: Path) -> None:
     port, zenoh = line
     variables = {
         "FLEETMAP_ADMIN_TOKEN": ADMIN,
@@ -190,7 +190,7 @@ def _binds(probe: socket.socket, port: int) -> bool:
     return True
 
 
-def test_the_router_is_killed_and_comes_back(line: tuple[int, int], tmp_path: Path) -> None:
+def test_agent_survives_killed_router(line: tuple[int, int], tmp_path: Path) -> None:
     zenoh = line[1]
     options = BusOptions(listen=f"tcp/127.0.0.1:{zenoh}")
     router = Router(router_configuration(options))

@@ -13,7 +13,7 @@ from tests.api.conftest import Api
 from tests.events.conftest import eventually
 
 
-def test_the_first_sync(api: Api, place: str, robot: Start) -> None:
+def test_first_sync_installs_map(api: Api, place: str, robot: Start) -> None:
     api.upload(place, samples.grid())
     one = robot("--once", formats="tmap2,occupancy_grid")
     assert one.end() == 0, one.lines
@@ -28,7 +28,7 @@ def test_the_first_sync(api: Api, place: str, robot: Start) -> None:
     assert again.saw("switched") is None, "nothing changed"
 
 
-def test_a_change_is_there_within_seconds_by_event_and_as_a_delta(api: Api, place: str, robot: Start) -> None:
+def test_event_triggers_sync_with_delta_within_seconds(api: Api, place: str, robot: Start) -> None:
     one = robot("--poll", "3600")
     one.wait("active", version=1)
     one.wait("connected")
@@ -79,7 +79,7 @@ def test_production_goes_first_and_a_rollback_is_followed(api: Api, place: str, 
     assert one.stop() == 0
 
 
-def test_a_planned_move_is_preloaded(api: Api, place: str, robot: Start) -> None:
+def test_planned_move_is_preloaded(api: Api, place: str, robot: Start) -> None:
     api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
     api.upload(place, {"n.tmap2.yaml": network(1)})
     one = robot("--poll", "3600")
@@ -94,7 +94,7 @@ def test_a_planned_move_is_preloaded(api: Api, place: str, robot: Start) -> None
     assert one.stop() == 0
 
 
-def test_a_missing_channel_is_told(api: Api, place: str, robot: Start) -> None:
+def test_missing_channel_is_reported(api: Api, place: str, robot: Start) -> None:
     one = robot("--once", "--channel", "staging")
     assert one.end() == 1
     assert "staging" in one.wait("failed")["detail"]
@@ -105,7 +105,7 @@ def test_offline_start_keeps_the_map(api: Api, place: str, robot: Start, gate: G
     gate.open = False
     one = robot("--poll", "1", server=gate.url)
     one.wait("holding", version=1)
-    assert "no answer" in one.wait("failed")["detail"]
+    assert "no response" in one.wait("failed")["detail"]
     assert whole(one.into)["version"] == 1
     api.upload(place, {"n.tmap2.yaml": network(1)})
     gate.open = True
@@ -113,7 +113,7 @@ def test_offline_start_keeps_the_map(api: Api, place: str, robot: Start, gate: G
     assert one.stop() == 0
 
 
-def test_a_damaged_file_is_healed(api: Api, place: str, robot: Start) -> None:
+def test_damaged_file_is_fetched_again(api: Api, place: str, robot: Start) -> None:
     one = robot("--once")
     assert one.end() == 0
     path = one.into / "current" / "tmap2" / "network.tmap2.yaml"
@@ -141,10 +141,10 @@ def test_one_folder_has_one_agent_and_one_environment(api: Api, place: str, robo
     assert one.stop() == 0
     other = robot("--once", env="elsewhere")
     assert other.end() == 1
-    assert "not of elsewhere" in str(other.lines)
+    assert "not 'elsewhere'" in str(other.lines)
 
 
-def test_the_hook_has_what_changed(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+def test_hook_gets_changed_files(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
     file = tmp_path / "told"
     command = f'env | grep ^FLEETMAP_ > {file}.new; cat "$FLEETMAP_CURRENT"/tmap2/* > /dev/null && mv {file}.new {file}'
     one = robot("--poll", "3600", "--on-change", command)
@@ -163,7 +163,7 @@ def test_the_hook_has_what_changed(api: Api, place: str, robot: Start, tmp_path:
     assert one.stop() == 0
 
 
-def test_layers_are_asked_for_where_no_event_tells_them(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+def test_changed_layers_come_from_manifest_without_event(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
     command = f"echo $FLEETMAP_LAYERS > {tmp_path}/layers"
     assert robot("--once", "--on-change", command).end() == 0
     api.upload(place, {"n.tmap2.yaml": network(1)})
@@ -172,17 +172,17 @@ def test_layers_are_asked_for_where_no_event_tells_them(api: Api, place: str, ro
     assert (tmp_path / "layers").read_text() == "occupancy topology\n"
 
 
-def test_a_failing_hook_is_told_and_tried_again(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+def test_failing_hook_is_reported_and_retried(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
     one = robot("--poll", "1", "--on-change", f"test -e {tmp_path}/fine || {{ echo no ROS here; exit 3; }}")
     detail = one.wait("failed")["detail"]
-    assert "ended with 3: no ROS here" in detail
+    assert "exited with status 3: no ROS here" in detail
     assert one.standing["version"] == 1
     (tmp_path / "fine").touch()
     one.wait("active", version=1)
     assert one.stop() == 0
 
 
-def test_environment_sh(api: Api, place: str, robot: Start) -> None:
+def test_environment_sh_lists_installed_files(api: Api, place: str, robot: Start) -> None:
     api.upload(place, samples.grid())
     one = robot("--once", formats="tmap2,occupancy_grid")
     assert one.end() == 0
@@ -194,7 +194,7 @@ def test_environment_sh(api: Api, place: str, robot: Start) -> None:
     assert output == f"{current}/tmap2/network.tmap2.yaml|{current}/occupancy_grid/map.yaml||2\n"
 
 
-def test_environment_sh_says_what_the_place_is_called(api: Api, place: str, robot: Start) -> None:
+def test_environment_sh_contains_environment_variables(api: Api, place: str, robot: Start) -> None:
     properties = b"export FARM_NAME='It'\\''s a \"yard\"; $(touch x)'\nexport FIELD_ID=p1\n"
     properties += b"export TMAP_FILE=/nowhere\nexport LD_PRELOAD=/x\n"
     api.upload(place, {"config/properties.sh": properties, "config/topological/n.tmap2.yaml": network(1)})
@@ -238,7 +238,7 @@ def test_two_robots_hold_the_same_root(api: Api, place: str, robot: Start) -> No
         assert one.stop() == 0
 
 
-def test_a_rollout_in_two_stages_waits_for_the_robot(api: Api, place: str, robot: Start) -> None:
+def test_rollout_waits_until_robot_is_ready(api: Api, place: str, robot: Start) -> None:
     api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
     api.upload(place, {"n.tmap2.yaml": network(1)})
     one = robot("--poll", "3600")
@@ -252,7 +252,7 @@ def test_a_rollout_in_two_stages_waits_for_the_robot(api: Api, place: str, robot
     assert one.stop() == 0
 
 
-def test_a_robot_that_fails_takes_the_fleet_back(api: Api, place: str, robot: Start) -> None:
+def test_failing_robot_rolls_channel_back(api: Api, place: str, robot: Start) -> None:
     api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
     api.upload(place, {"n.tmap2.yaml": network(1)})
     one = robot("--poll", "3600", "--on-change", "test $FLEETMAP_VERSION = 1")
@@ -268,7 +268,7 @@ def test_a_robot_that_fails_takes_the_fleet_back(api: Api, place: str, robot: St
     assert one.stop() == 0
 
 
-def test_a_robots_token_is_enough(api: Api, place: str, robot: Start) -> None:
+def test_robot_token_suffices_for_agent(api: Api, place: str, robot: Start) -> None:
     token = api.post("tokens", {"name": "r", "role": "robot", "robot": "robot", "environments": place}).json()
     one = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=token["token"])
     assert one.end() == 0, one.lines

@@ -115,7 +115,7 @@ def current(tmp_path: Path) -> Path:
     return link
 
 
-def test_they_are_found_by_name() -> None:
+def test_bundled_hooks_are_found_by_name() -> None:
     assert set(hooks.bundled_hooks()) == {"nav2", "topological"}
     for path in hooks.bundled_hooks().values():
         subprocess.run(["sh", "-n", path], check=True)
@@ -143,7 +143,9 @@ def test_each_step_is_reported(ros: Path, current: Path) -> None:
     assert steps(ros) == [("map", "done"), ("route graph", "done")]
 
 
-def test_a_grid_or_graph_that_is_gone_is_a_failure(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_fails_when_grid_or_graph_is_missing(
+    ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (current / "occupancy_grid" / "map.yaml").unlink()
     (current / "nav2_route" / "graph.geojson").unlink()
     hook_variables = variables(
@@ -151,15 +153,15 @@ def test_a_grid_or_graph_that_is_gone_is_a_failure(ros: Path, current: Path, mon
     )
     problem = hooks.run("nav2", hook_variables)
     assert problem is not None
-    assert "the grid map is no longer part of the map" in problem
-    assert "the route graph is no longer part of the map" in problem
+    assert "the map no longer has the grid map" in problem
+    assert "the map no longer has a route graph" in problem
     assert steps(ros) == [("map", "failed"), ("speed", "done"), ("route graph", "failed")], "the rest is loaded"
     monkeypatch.setenv("FLEETMAP_NAV2_MAP_SERVER", "")
     monkeypatch.setenv("FLEETMAP_NAV2_ROUTE_SERVER", "")
     assert hooks.run("nav2", hook_variables) is None
 
 
-def test_a_mask_without_a_mask_server_is_no_failure(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_skips_mask_without_mask_server(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ABSENT", "/keepout_filter_mask_server/load_map /speed_filter_mask_server/load_map")
     changed = variables(current, "occupancy_grid/map.yaml", "occupancy_grid/keepout.yaml", "occupancy_grid/speed.yaml")
     assert hooks.run("nav2", changed) is None
@@ -167,10 +169,10 @@ def test_a_mask_without_a_mask_server_is_no_failure(ros: Path, current: Path, mo
     monkeypatch.setenv("FLEETMAP_NAV2_KEEPOUT_SERVER", "/keepout_filter_mask_server")
     problem = hooks.run("nav2", changed)
     assert problem is not None, "an operator who names a server wants it"
-    assert "there is no service /keepout_filter_mask_server/load_map" in problem
+    assert "service /keepout_filter_mask_server/load_map not found" in problem
 
 
-def test_a_mask_that_is_gone_gives_way_to_an_empty_one(ros: Path, current: Path) -> None:
+def test_nav2_hook_replaces_missing_mask_by_empty_one(ros: Path, current: Path) -> None:
     assert hooks.run("nav2", variables(current, "occupancy_grid/keepout.yaml")) is None
     called(ros)
     (current / "occupancy_grid" / "keepout.yaml").unlink()
@@ -186,14 +188,14 @@ def test_a_mask_that_is_gone_gives_way_to_an_empty_one(ros: Path, current: Path)
     assert called(ros) == [], "only once"
 
 
-def test_the_map_server_must_be_there(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_fails_without_map_server(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ABSENT", "/map_server/load_map")
     problem = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
     assert problem is not None
-    assert "there is no service /map_server/load_map: start Nav2, or set FLEETMAP_NAV2_MAP_SERVER" in problem
+    assert "service /map_server/load_map not found: start Nav2, or set FLEETMAP_NAV2_MAP_SERVER" in problem
 
 
-def test_a_grid_of_any_name(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_selects_grid_by_name(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (current / "occupancy_grid" / "map.yaml").rename(current / "occupancy_grid" / "hall.yaml")
     put(current, "occupancy_grid/keepout_filter_info.yaml")
     assert hooks.run("nav2", variables(current, "occupancy_grid/hall.pgm")) is None
@@ -201,17 +203,17 @@ def test_a_grid_of_any_name(ros: Path, current: Path, monkeypatch: pytest.Monkey
     put(current, "occupancy_grid/annex.yaml")
     problem = hooks.run("nav2", variables(current, "occupancy_grid/hall.pgm"))
     assert problem is not None
-    assert "there are the grids annex, hall: name one with FLEETMAP_NAV2_GRID" in problem
+    assert "several grids (annex, hall): choose one with FLEETMAP_NAV2_GRID" in problem
     monkeypatch.setenv("FLEETMAP_NAV2_GRID", "annex")
     assert hooks.run("nav2", variables(current, "occupancy_grid/annex.yaml")) is None
     assert "occupancy_grid/annex.yaml" in called(ros)[0]
     monkeypatch.setenv("FLEETMAP_NAV2_GRID", "cellar")
     problem = hooks.run("nav2", variables(current, "occupancy_grid/annex.yaml"))
     assert problem is not None
-    assert "there is no grid cellar here, only annex, hall" in problem
+    assert "unknown grid cellar: set FLEETMAP_NAV2_GRID to one of annex, hall" in problem
 
 
-def test_another_level(ros: Path, current: Path) -> None:
+def test_align_onto_another_level(ros: Path, current: Path) -> None:
     put(current, "occupancy_grid/L2/map.yaml")
     levels = [
         {"name": "ground", "elevation": 0.0, "files": {"occupancy_grid": ["map.yaml", "keepout.yaml"]}},
@@ -228,7 +230,10 @@ def test_another_level(ros: Path, current: Path) -> None:
     assert "/hooks/empty.yaml" in upper[1], "the mask of the floor below is taken away"
     assert hooks.run("nav2", variables(current, FLEETMAP_LEVEL="ground")) is None
     assert len(called(ros)) == 2, "both again, though no file changed"
-    for level, reason in (("L3", "the map has no level 'L3'; it has ground, L2, roof"), ("roof", "no files of level")):
+    for level, reason in (
+        ("L3", "the map has no level 'L3': choose one of ground, L2, roof"),
+        ("roof", "no files of level"),
+    ):
         problem = hooks.run("nav2", variables(current, FLEETMAP_LEVEL=level))
         assert problem is not None
         assert reason in problem
@@ -275,7 +280,7 @@ def test_closed_edges_are_closed_and_opened_again(ros: Path, current: Path, monk
     assert not any("set_route_graph" in line for line in called(ros)), "an edge that cannot be closed is not set open"
 
 
-def test_nav2_reports_what_was_refused(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_reports_rejected_files(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     changed = variables(current, "occupancy_grid/map.yaml")
     for result, reason in (("1", "does not exist"), ("255", "undefined failure"), ("10", "no result")):
         monkeypatch.setenv("RESULT", result)
@@ -294,15 +299,15 @@ def test_nav2_reports_what_was_refused(ros: Path, current: Path, monkeypatch: py
     assert "/r1/map_server/load_map" in ros.read_text()
 
 
-def test_a_service_that_hangs_is_given_up(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nav2_hook_gives_up_hanging_service(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HANG", "1")
     changed = variables(current, "occupancy_grid/map.yaml", "occupancy_grid/keepout.yaml")
     problem = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "1"})
     assert problem is not None
-    assert "/map_server/load_map gave no answer within 1 seconds" in problem
+    assert "no response from /map_server/load_map within 1 seconds" in problem
     problem = hooks.run("nav2", {**changed, "FLEETMAP_HOOK_SECONDS": "1.5"})
     assert problem is not None
-    assert "no time is left" in problem
+    assert "no time left" in problem
     problem = hooks.run("nav2", {**changed, "FLEETMAP_ROS_SECONDS": "soon"})
     assert problem is not None
     assert "FLEETMAP_ROS_SECONDS must be a number of seconds, got 'soon'" in problem
@@ -318,7 +323,7 @@ def tmap2(*nodes: str, edges: tuple[str, ...] = ("A_B",), name: str = "network")
     return {"name": name, "pointset": "network", "nodes": rows}
 
 
-def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_topological_hook_switches_map(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert hooks.run("topological", variables(current, "occupancy_grid/map.yaml")) is None
     assert ros.read_text() == "", "the network did not change"
     changed = variables(current, "tmap2/network.tmap2.yaml")
@@ -337,10 +342,10 @@ def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("SUCCESS", "False")
     problem = hooks.run("topological", changed)
     assert problem is not None
-    assert "switch_topological_map refused tmap2/network.tmap2.yaml" in problem
+    assert "switch_topological_map rejected tmap2/network.tmap2.yaml" in problem
 
 
-def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> None:
+def test_topological_hook_checks_published_map(ros: Path, current: Path) -> None:
     changed = variables(current, "tmap2/network.tmap2.yaml")
     expected_network = loading.read_network(current / "tmap2" / "network.tmap2.yaml")
     right = {**tmap2("A", "B"), "name": expected_network.name, "pointset": expected_network.pointset}
@@ -353,7 +358,7 @@ def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> 
         published(ros, right, last)
         problem = hooks.run("topological", changed)
         assert problem is not None
-        assert "reported success, but /topological_map_2 does not hold tmap2/network.tmap2.yaml" in problem
+        assert "reported success, but /topological_map_2 does not publish tmap2/network.tmap2.yaml" in problem
         assert reason in problem
         assert "../../" in called(ros)[1], "a manager that puts its own folder before the name is helped"
 
@@ -391,22 +396,22 @@ def edge_of(source: str, target: str) -> dict[str, Any]:
     return {"edge_id": f"{source}_{target}", "node": target, "action": "NavigateToPose", "action_type": "t"}
 
 
-def test_without_ros_it_fails_and_says_so(current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hook_without_ros_fails_with_reason(current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEETMAP_PYTHON", sys.executable)
     problem = hooks.run("nav2", variables(current, "occupancy_grid/map.yaml"))
     assert problem is not None
     assert "source the setup.bash of ROS 2" in problem
 
 
-def test_a_hanging_hook_is_ended(tmp_path: Path) -> None:
+def test_hanging_hook_is_killed(tmp_path: Path) -> None:
     problem = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, seconds=0.5)
     assert problem is not None
-    assert "took more than 0.5 seconds" in problem
+    assert "exceeded 0.5 seconds" in problem
     pid = int((tmp_path / "pid").read_text())
     eventually(lambda: _ended(pid))  # what was killed takes a moment to end on a busy machine
 
 
-def test_a_hook_that_prints_without_end_fills_nothing() -> None:
+def test_hook_with_endless_output_fills_no_memory() -> None:
     before = tracemalloc_peak(lambda: None)
     problems: list[str | None] = []
     peak = tracemalloc_peak(
@@ -427,19 +432,19 @@ def tracemalloc_peak(do: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def test_what_a_hook_leaves_in_the_background_lives_on(tmp_path: Path) -> None:
+def test_background_process_of_hook_survives(tmp_path: Path) -> None:
     background = f"(while [ ! -e {tmp_path}/end ]; do echo x; sleep 0.05; done; touch {tmp_path}/lived) & exit 0"
     assert hooks.run(background, {}, seconds=30) is None
     (tmp_path / "end").touch()
     eventually((tmp_path / "lived").exists)
 
 
-def test_a_hook_ends_with_the_agent(tmp_path: Path) -> None:
+def test_hook_is_killed_when_agent_stops(tmp_path: Path) -> None:
     stopping = threading.Event()
     threading.Timer(0.2, stopping.set).start()
     problem = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, stopping=stopping)
     assert problem is not None
-    assert "was ended with the agent" in problem
+    assert "was stopped with the agent" in problem
     pid = int((tmp_path / "pid").read_text())
     eventually(lambda: _ended(pid))
 
@@ -451,7 +456,7 @@ def _ended(pid: int) -> bool:
         return True
 
 
-def test_an_agent_switches_nav2(api: Api, place: str, robot: Start, ros: Path) -> None:
+def test_agent_loads_map_into_nav2(api: Api, place: str, robot: Start, ros: Path) -> None:
     api.upload(place, samples.grid())
     formats = "tmap2,occupancy_grid"
     published(ros, yaml.safe_load(network()))

@@ -61,7 +61,7 @@ def without_server(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_base_is_small() -> None:
+def test_base_install_is_small() -> None:
     assert names(PROJECT["dependencies"]) == {
         "typer", "rich", "httpx", "eclipse-zenoh", "cryptography", "backports-zstd",
     }  # fmt: skip
@@ -76,7 +76,7 @@ def test_help_needs_no_server(arguments: list[str]) -> None:
     assert process.returncode == 0, process.stderr
 
 
-def test_a_robot_syncs_without_the_server_packages(api: Api, place: str, tmp_path: Path) -> None:
+def test_agent_syncs_without_server_packages(api: Api, place: str, tmp_path: Path) -> None:
     process = without_server(
         "agent", "-s", api.url, "-e", place, "-f", "tmap2", "--into", str(tmp_path / "r"), "--once"
     )
@@ -85,7 +85,7 @@ def test_a_robot_syncs_without_the_server_packages(api: Api, place: str, tmp_pat
 
 
 @pytest.mark.parametrize("arguments", [["serve"], ["migrate"]])
-def test_other_commands_say_what_to_install(arguments: list[str], tmp_path: Path) -> None:
+def test_missing_package_names_what_to_install(arguments: list[str], tmp_path: Path) -> None:
     process = without_server(*arguments)
     assert process.returncode == 1
     assert 'pip install "fleet-map-server[server]"' in process.stderr, process.stderr
@@ -119,7 +119,7 @@ def file_of(module: str) -> Path | None:
     return next((p for p in (base / "__init__.py", base.with_suffix(".py")) if p.is_file()), None)
 
 
-def test_all_that_a_robot_imports_is_checked_for_python_3_10() -> None:
+def test_agent_imports_are_checked_for_python_3_10() -> None:
     checked = {p for name in robot_modules() for p in ([ROOT / name] if name.endswith(".py") else [])}
     checked |= {p for name in robot_modules() for p in (ROOT / name).rglob("*.py")}
     for path in sorted(checked):
@@ -141,7 +141,7 @@ def braces(pattern: str) -> list[str]:
     return [head + one + tail for one in inner.split(",")] if brace else [pattern]
 
 
-def test_the_server_code_is_imported_after_a_check_of_the_python() -> None:
+def test_server_code_is_imported_after_python_check() -> None:
     robot = {file_of(f"app.cli.{p.stem}") for p in (ROOT / "app" / "cli").glob("*.py")}
     robot |= {ROOT / name for name in robot_modules()}
     count = 0
@@ -180,7 +180,7 @@ def test_times_are_read_on_any_python(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "2026-11-22", "2026-11-22T10:00:00", "2026-13-22T10:00:00Z", "20261122T100000Z"])
-def test_what_is_no_time_is_refused(text: str) -> None:
+def test_invalid_time_is_refused(text: str) -> None:
     with pytest.raises(ValueError):
         signed_manifest.read_time(text)
 
@@ -193,14 +193,14 @@ def test_hooks_are_part_of_the_package() -> None:
     }  # fmt: skip
 
 
-def test_the_unit_keeps_the_maps_where_the_robot_can_read_them() -> None:
+def test_systemd_unit_keeps_maps_readable() -> None:
     unit = (ROOT / "docker" / "fleetmap-agent.service").read_text()
     assert "\nStateDirectoryMode=0755\n" in unit
     assert "\nUser=" in unit
     assert "\nDynamicUser=" not in unit, "its state is below /var/lib/private, which nobody else may enter"
 
 
-def test_router_addresses_are_told_for_who_asks() -> None:
+def test_announced_router_address_depends_on_request_host() -> None:
     from app.api.health import advertised_router
 
     assert advertised_router("", "tcp/127.0.0.1:7447", "127.0.0.1") == "tcp/127.0.0.1:7447"

@@ -77,7 +77,7 @@ def test_polytunnels_come_with_their_drawn_masks(site: Callable[[str], str], rob
 
 
 @pytest.mark.parametrize("level", ["ground", "upper"])
-def test_accepted_report_stops_a_robot_and_frees_it_at_its_end(
+def test_accepted_closure_blocks_robot_until_its_end(
     api: Api, site: Callable[[str], str], robot: Start, tmp_path: Path, level: str
 ) -> None:
     """A robot reports an edge, an editor accepts with one call; nobody calls anything when the time is over."""

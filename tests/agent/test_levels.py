@@ -101,7 +101,7 @@ def test_optional_format_that_is_missing_is_reported(fake: Fake, robot: Robot) -
     assert one.once()
     assert "&optional=kml,lif" in next(path for path in fake.asked if "/manifest" in path)
     assert fake.statuses[-1]["state"] == "active"
-    assert fake.statuses[-1]["detail"] == "without optional kml (needs a datum), lif"
+    assert fake.statuses[-1]["detail"] == "missing optional formats: kml (needs a datum), lif"
     fake.more = {}
     fake.put({**SITE, "kml/map.kml": b"k"})
     one = robot(optional=("kml",))
@@ -110,7 +110,7 @@ def test_optional_format_that_is_missing_is_reported(fake: Fake, robot: Robot) -
     assert (one.into / "current" / "kml" / "map.kml").exists()
     one = robot()
     assert not one.once()
-    assert "with ['kml'] further" in one.detail, "a format that was not requested is refused"
+    assert "unexpected kml" in one.detail, "a format that was not requested is refused"
 
 
 def test_required_format_that_is_missing_refuses_the_version(fake: Fake, robot: Robot) -> None:
@@ -119,7 +119,7 @@ def test_required_format_that_is_missing_refuses_the_version(fake: Fake, robot: 
     fake.more = {"missing": [{"format": "tmap2", "detail": "there is no network"}]}
     one = robot()
     assert not one.once()
-    assert "required format tmap2: there is no network" in one.detail
+    assert "required format tmap2 is not available: there is no network" in one.detail
     assert whole(one.into)["version"] == 1
 
 
@@ -167,7 +167,7 @@ def test_invalid_levels_are_refused(fake: Fake, robot: Robot, levels: list[Any])
     fake.more = {"levels": levels}
     one = robot()
     assert not one.once()
-    assert "cannot be read" in one.detail
+    assert "invalid manifest" in one.detail
 
 
 def test_agent_level_loads_a_level_and_remembers_it(fake: Fake, robot: Robot, tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_agent_level_refuses_what_it_cannot_load(fake: Fake, robot: Robot, tmp_p
         load(one.into, "L3")
     load(one.into, "L2")
     (tmp_path / "bad").touch()
-    with pytest.raises(Unavailable, match="level ground is not loaded"):
+    with pytest.raises(Unavailable, match="could not load level ground"):
         load(one.into, "ground")
     assert (one.into / "level").read_text() == "L2\n", "the robot is still on this one"
     (one.into / "hooks.json").write_text("[")
@@ -205,7 +205,7 @@ def test_agent_level_refuses_what_it_cannot_load(fake: Fake, robot: Robot, tmp_p
     (tmp_path / "bad").unlink()
     fake.instead = lambda h: h.send_error(503) or True
     robot(f"test ! -e {tmp_path}/bad").once()
-    with pytest.raises(NotFound, match="holds no map yet"):
+    with pytest.raises(NotFound, match=r"no map in .* yet"):
         load(one.into, "L2")
 
 
@@ -217,7 +217,7 @@ def test_agent_level_runs_no_commands_of_another_user(
     (tmp_path / "run").unlink()
     owner = one.into.stat().st_uid
     os.chown(one.into / "hooks.json", 12345, -1) if owner == 0 else monkeypatch.setattr(os, "geteuid", lambda: 12345)
-    with pytest.raises(Conflict, match="would run as you"):
+    with pytest.raises(Conflict, match="run this command as that user"):
         load(one.into, "L2")
     assert not (tmp_path / "run").exists()
 
@@ -230,7 +230,7 @@ def test_map_without_the_robots_level_is_refused(fake: Fake, robot: Robot) -> No
     fake.levels = {path: level for path, level in LEVELS.items() if level == "ground"}
     one = robot("true")
     assert not one.once()
-    assert "on level 'L2', which version 2 does not have (levels: ground)" in one.detail
+    assert "version 2 has no level 'L2', which the robot is on (levels: ground)" in one.detail
     assert whole(one.into)["version"] == 1, "the map of the floor that the robot stands on"
     load(one.into, "ground")
     assert robot("true").once()
@@ -276,5 +276,5 @@ def test_old_server_lists_no_levels(fake: Fake, robot: Robot) -> None:
     one = robot("true")
     assert one.once()
     assert json.loads((one.into / "current" / "levels.json").read_text()) == {"levels": []}
-    with pytest.raises(NotFound, match="the server lists no levels"):
+    with pytest.raises(NotFound, match="the map has no levels"):
         load(one.into, "ground")

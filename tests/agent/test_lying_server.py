@@ -23,7 +23,7 @@ from app.errors import Conflict
 from app.signing import Keys
 from tests.agent.conftest import whole
 from tests.agent.fake import Fake, One, run, send
-from tests.agent.test_luck import event
+from tests.agent.test_bad_server import event
 from tests.events.conftest import eventually
 
 A, B = {"kml/map.kml": b"a" * 50_000}, {"kml/map.kml": b"b" * 60_000}
@@ -187,21 +187,21 @@ def other_environment(fake: Fake, _: Path) -> None:
     ("attack", "word"),
     [
         (replay_old_manifest, "possible rollback"),
-        (replay_old_file, "other bytes than the manifest"),
-        (foreign_sequence, "which the server does not tell"),
+        (replay_old_file, "differs from the manifest"),
+        (foreign_sequence, "which the server does not list"),
         (trusted_sequence, "more than 1000000000 ahead"),
         (trusted_epoch, "ahead of 0"),
-        (unsigned, "not signed"),
-        (unknown_key, "which the server does not tell"),
-        (expired, "has expired"),
-        (endless_file, "other bytes than the manifest"),
-        (endless_manifest, "more than"),
+        (unsigned, "no valid signature"),
+        (unknown_key, "which the server does not list"),
+        (expired, "manifest expired"),
+        (endless_file, "differs from the manifest"),
+        (endless_manifest, "exceeds"),
         (one_byte_a_second, "bytes in"),
-        (hundred_bytes_a_second, "less than 4096 a second"),
-        (cut_off, "no answer"),
-        (one_bit, "other bytes than the manifest"),
-        (hostile_name, "cannot be"),
-        (other_environment, "of the environment 'elsewhere'"),
+        (hundred_bytes_a_second, "less than 4096 bytes per second"),
+        (cut_off, "no response"),
+        (one_bit, "differs from the manifest"),
+        (hostile_name, "invalid or duplicate file path"),
+        (other_environment, "belongs to environment 'elsewhere'"),
     ],
 )
 def test_attack_is_refused_reported_and_healed(
@@ -262,22 +262,20 @@ def test_frozen_server_is_reported(fake: Fake, robot: Robot, monkeypatch: pytest
 
         fake.instead = frozen
         fake.put(B)
-        eventually(lambda: "no fresh signed answer since" in fake.statuses[-1].get("detail", ""))
+        eventually(lambda: "no new signed response since" in fake.statuses[-1].get("detail", ""))
         assert fake.statuses[-1]["state"] == "failed"
         assert whole(one.into)["version"] == 1
         fake.instead = lambda _: False
         eventually(lambda: fake.statuses[-1]["state"] == "active" and fake.statuses[-1]["version"] == 2)
 
 
-def test_server_that_gives_less_than_the_bus_announced_is_reported(
-    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_server_behind_its_events_is_reported(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(freshness, "BEHIND_SECONDS", 0.2)
     one = robot(poll_seconds=0.1)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
         one.agent._on_event(event(2))
-        eventually(lambda: "the bus announced sequence 2" in fake.statuses[-1].get("detail", ""))
+        eventually(lambda: "sequence 2 was announced" in fake.statuses[-1].get("detail", ""))
         assert fake.statuses[-1]["state"] == "active", "events are not signed: they make no robot fail"
         fake.put(B)
         eventually(lambda: fake.statuses[-1]["version"] == 2 and "detail" not in fake.statuses[-1])
@@ -298,21 +296,21 @@ def test_expired_map_is_refused_with_the_clock_set_back(fake: Fake, robot: Robot
     fake.more = {"expires": old, "time": (datetime.now(timezone.utc) - timedelta(days=1, hours=1)).isoformat()}
     one = robot(clock=lambda: time.time() - 2 * 86400)
     assert not one.once()
-    assert "has expired" in one.detail
+    assert "manifest expired" in one.detail
     assert whole(one.into)["version"] == 1
     fake.more = {}
     assert robot(clock=lambda: time.time() - 2 * 86400).once()
 
 
-def test_clock_set_forward_heals_when_it_is_put_right(fake: Fake, robot: Robot) -> None:
+def test_clock_set_forward_recovers_when_corrected(fake: Fake, robot: Robot) -> None:
     year = 365 * 86400
     one = robot(clock=lambda: time.time() + year)
     assert not one.once()
-    assert "has expired" in one.detail
+    assert "manifest expired" in one.detail
     assert robot().once()
 
 
-def test_server_whose_clock_was_ahead_blocks_no_robot(fake: Fake, robot: Robot) -> None:
+def test_server_clock_that_was_ahead_blocks_no_robot(fake: Fake, robot: Robot) -> None:
     for ahead in (timedelta(hours=11), timedelta(days=400)):
         now = datetime.now(timezone.utc) + ahead
         fake.more = {"time": now.isoformat(), "expires": (now + timedelta(days=1)).isoformat()}
@@ -331,7 +329,7 @@ def test_unset_clock_is_replaced_by_signed_time(fake: Fake, robot: Robot) -> Non
     fake.more = {"expires": (datetime.now(timezone.utc) - timedelta(hours=1)).isoformat()}
     one = robot(clock=lambda: 1000.0)
     assert not one.once()
-    assert "has expired" in one.detail
+    assert "manifest expired" in one.detail
 
 
 # --- order ---
@@ -368,7 +366,7 @@ def test_endorsed_key_resets_the_marks(fake: Fake, robot: Robot) -> None:
     assert json.loads((one.into / "state.json").read_text())["marks"]["latest"]["sequence"] == 2
 
 
-def test_state_survives(tmp_path: Path) -> None:
+def test_state_survives_restart(tmp_path: Path) -> None:
     state = AgentState("field", marks={"latest": Mark(2, 7, "0" * 64)}, working="1-abc", newest_time=12.5)
     save(tmp_path / "state.json", state)
     assert load(tmp_path / "state.json", "field") == state
@@ -397,7 +395,7 @@ def test_delta_that_cannot_be_decoded_falls_back_to_the_file(fake: Fake, robot: 
     assert "complete files" in switched["detail"]
 
 
-def test_hook_that_prints_a_gigabyte_is_taken_back(fake: Fake, robot: Robot) -> None:
+def test_hook_printing_a_gigabyte_is_rolled_back(fake: Fake, robot: Robot) -> None:
     assert robot("true").once()
     fake.put(B)
     one = robot("test $FLEETMAP_VERSION = 1 || { head -c 1000000000 /dev/zero | tr '\\0' x; echo the end; exit 3; }")
@@ -407,12 +405,12 @@ def test_hook_that_prints_a_gigabyte_is_taken_back(fake: Fake, robot: Robot) -> 
     assert whole(one.into)["version"] == 1
 
 
-def test_hook_that_is_killed_is_taken_back(fake: Fake, robot: Robot) -> None:
+def test_killed_hook_is_rolled_back(fake: Fake, robot: Robot) -> None:
     assert robot("true").once()
     fake.put(B)
     one = robot("test $FLEETMAP_VERSION = 1 || kill -9 $$")
     assert not one.once()
-    assert "ended with -9" in one.detail
+    assert "exited with status -9" in one.detail
     assert whole(one.into)["version"] == 1
 
 
@@ -431,7 +429,7 @@ def test_second_agent_of_a_directory_is_refused(fake: Fake, robot: Robot) -> Non
     one = robot(poll_seconds=3600.0)
     with run(one):
         eventually(lambda: one.saw("active", version=1))
-        with pytest.raises(Conflict, match="another agent keeps"):
+        with pytest.raises(Conflict, match="another agent uses"):
             robot().once()
         fake.put(B)
         one.agent._on_event(event(2))
@@ -439,7 +437,7 @@ def test_second_agent_of_a_directory_is_refused(fake: Fake, robot: Robot) -> Non
     assert robot().once(), "and afterwards it is free"
 
 
-def test_many_forged_events_do_not_make_it_busy(fake: Fake, robot: Robot) -> None:
+def test_many_forged_events_keep_agent_idle(fake: Fake, robot: Robot) -> None:
     one = robot(poll_seconds=3600.0)
     with run(one):
         eventually(lambda: one.saw("active", version=1))

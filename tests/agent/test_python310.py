@@ -52,7 +52,7 @@ def fleetmap(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=python.parent, capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_the_install_has_all_a_robot_needs(python310: Path, tmp_path: Path) -> None:
+def test_agent_install_on_python_3_10_is_complete(python310: Path, tmp_path: Path) -> None:
     assert fleetmap(python310, "--version").stdout.startswith("fleetmap ")
     assert "--on-change" in fleetmap(python310, "agent", "--help").stdout
     ended = fleetmap(python310, "agent", "--ros-package", str(tmp_path))
@@ -74,15 +74,15 @@ def test_the_install_has_all_a_robot_needs(python310: Path, tmp_path: Path) -> N
         ["check", "."], ["convert", ".", "--to", "kml", "-o", "-"], ["generate", "cave", "--to", "kml", "-o", "-"],
     ],
 )  # fmt: skip
-def test_commands_of_the_server_name_the_python_they_need(python310: Path, arguments: list[str]) -> None:
+def test_server_commands_name_required_python(python310: Path, arguments: list[str]) -> None:
     ended = fleetmap(python310, *arguments)
     assert ended.returncode == 1
     assert f"fleetmap {arguments[0]}" in ended.stderr
-    assert "needs Python 3.11 or newer, and this is 3.10." in ended.stderr
+    assert "requires Python 3.11 or newer, this is 3.10." in ended.stderr
     assert "Traceback" not in ended.stderr
 
 
-def test_an_agent_on_3_10_follows_a_server(
+def test_agent_on_python_3_10_follows_server(
     python310: Path, api: Api, place: str, robot: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Events over Zenoh, a delta, the signature, the status: a real agent process of the installed packages."""
@@ -100,12 +100,12 @@ def test_an_agent_on_3_10_follows_a_server(
 OWN = sorted(p for p in Path(__file__).parent.rglob("test_*.py") if not SERVER.search(p.read_text()))
 
 
-def test_the_agents_own_tests_are_found() -> None:
-    assert {"test_hooks.py", "test_luck.py", "test_grids.py", "test_node.py"} <= {p.name for p in OWN}
+def test_agent_tests_are_found() -> None:
+    assert {"test_hooks.py", "test_bad_server.py", "test_grids.py", "test_node.py"} <= {p.name for p in OWN}
 
 
 @pytest.mark.parametrize("file", OWN, ids=lambda path: path.stem)
-def test_the_agents_own_tests_pass_on_3_10(python310: Path, file: Path, tmp_path: Path) -> None:
+def test_agent_tests_pass_on_python_3_10(python310: Path, file: Path, tmp_path: Path) -> None:
     """Tests of this folder that need no server, one file a test."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTEST_", "FLEETMAP_"))}
     ended = subprocess.run(

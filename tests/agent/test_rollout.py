@@ -10,7 +10,7 @@ from tests.api.conftest import Api
 from tests.events.conftest import eventually
 
 
-def test_a_fleet_moves_together_and_back(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+def test_fleet_follows_rollout_and_rollback(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
     url = f"environments/{place}/channels/production"
 
     def channel() -> Any:

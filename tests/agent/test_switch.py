@@ -108,7 +108,7 @@ def test_before_switch_sees_both_maps(fake: Fake, robot: Robot, tmp_path: Path) 
     assert (tmp_path / "changed").read_text() == "kml/map.kml topology\n"
 
 
-def test_newer_map_replaces_the_one_that_waits(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_newer_map_replaces_pending_one(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     assert robot().once()
     fake.put(B)
     (tmp_path / "status").write_text("75")
@@ -128,7 +128,7 @@ def test_newer_map_replaces_the_one_that_waits(fake: Fake, robot: Robot, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("command", "word"), [("echo no; exit 7", "ended with 7: no"), ("sleep 60", "took more than 0.2")]
+    ("command", "word"), [("echo no; exit 7", "exited with status 7: no"), ("sleep 60", "exceeded 0.2")]
 )
 def test_before_switch_refuses_a_version(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, word: str
@@ -162,7 +162,7 @@ def test_once_ends_while_before_switch_delays(fake: Fake, robot: Robot) -> None:
 # --- after ---
 
 
-def test_failed_hook_puts_the_last_good_version_back(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_failed_hook_restores_last_working_version(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     assert robot(loads(taken)).once()
     fake.put(B)
@@ -182,7 +182,7 @@ def test_failed_hook_puts_the_last_good_version_back(fake: Fake, robot: Robot, t
     assert taken.read_bytes() == C["kml/map.kml"]
 
 
-def test_failed_hook_is_tried_again_ever_later(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_failed_hook_is_retried_with_backoff(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     assert robot("true").once()
     fake.put(B)
     log = f"echo $FLEETMAP_VERSION >> {tmp_path}/log"
@@ -208,7 +208,7 @@ def test_first_version_stays_if_its_hook_fails(fake: Fake, robot: Robot) -> None
     assert robot("true").once()
 
 
-def test_version_is_kept_for_going_back(fake: Fake, robot: Robot) -> None:
+def test_previous_version_is_kept_for_rollback(fake: Fake, robot: Robot) -> None:
     assert robot("true").once()
     for number in range(5):
         fake.put({"kml/map.kml": bytes([number]) * 4000})
@@ -216,12 +216,12 @@ def test_version_is_kept_for_going_back(fake: Fake, robot: Robot) -> None:
         assert whole(robot().into)["version"] == 1
 
 
-def test_hook_that_fails_for_both_versions(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_hook_failing_for_both_versions_is_reported(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     assert robot("true").once()
     fake.put(B)
     one = robot(f"test -e {tmp_path}/mended")
     assert not one.once()
-    assert "nor has it taken version 1 again" in one.detail
+    assert "version 1 could not be loaded again either" in one.detail
     assert whole(one.into)["version"] == 1
     assert state(one)["activated"] is None
     fake.move("latest", 1)
@@ -231,7 +231,7 @@ def test_hook_that_fails_for_both_versions(fake: Fake, robot: Robot, tmp_path: P
     assert again.saw("hook", version=1), "what the robot has loaded is unknown: it loads again"
 
 
-def test_planned_version_is_fetched_while_the_standing_one_fails(fake: Fake, robot: Robot) -> None:
+def test_planned_version_is_fetched_when_current_one_fails(fake: Fake, robot: Robot) -> None:
     fake.move("production", 1)
     assert robot("true").once()
     fake.put(B)
@@ -253,7 +253,7 @@ def test_planned_version_is_fetched_while_the_standing_one_fails(fake: Fake, rob
     assert whole(one.into)["version"] == 3
 
 
-def test_planned_version_is_fetched_while_the_manifest_cannot_be_had(fake: Fake, robot: Robot) -> None:
+def test_planned_version_is_fetched_when_manifest_is_unavailable(fake: Fake, robot: Robot) -> None:
     fake.move("production", 1)
     assert robot().once()
     fake.put(B)
@@ -265,7 +265,7 @@ def test_planned_version_is_fetched_while_the_manifest_cannot_be_had(fake: Fake,
     assert fake.statuses[-1]["version"] == 2
 
 
-def test_hooks_that_were_cut_off_run_without_a_server(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+def test_interrupted_hooks_run_without_server(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     assert robot("true").once()
     path = robot().into / "state.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "activated": None}))
@@ -322,9 +322,7 @@ def test_kill_at_random_moments_of_hooks_ends_consistently(fake: Fake, tmp_path:
 
 
 @pytest.mark.parametrize(("status", "reported"), [(409, "failed"), (404, "failed"), (503, "downloading")])
-def test_planned_version_that_cannot_be_given_is_reported_once(
-    fake: Fake, robot: Robot, status: int, reported: str
-) -> None:
+def test_unavailable_planned_version_is_reported_once(fake: Fake, robot: Robot, status: int, reported: str) -> None:
     fake.move("production", 1)
     assert robot().once()
     fake.put(B)
@@ -351,4 +349,4 @@ def test_server_that_is_busy_during_a_preload_is_no_failure_of_the_version(fake:
     assert not robot().once()
     last = fake.statuses[-1]
     assert (last["state"], last["version"]) == ("downloading", 2)
-    assert "answered 500" in last["detail"]
+    assert "returned status 500" in last["detail"]

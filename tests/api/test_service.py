@@ -466,7 +466,7 @@ def test_tokens_do_not_reach_the_log(api: Api, bare: str, caplog: pytest.LogCapt
 def test_first_start_prints_a_token_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     settings = settings_for(tmp_path, admin_token=None)
     with running(settings) as api:
-        (token,) = re.findall(r"only this once: (\S+)", capfd.readouterr().out)
+        (token,) = re.findall(r"shown only once: (\S+)", capfd.readouterr().out)
         assert len(token) >= 22
         api.as_(token).get("tokens")
     with running(settings) as api:

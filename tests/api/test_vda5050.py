@@ -213,7 +213,7 @@ def test_state_with_nulls_is_read() -> None:
     ]
     assert read_state({**maps("a", ("1", "DISABLED")), "actionStates": states}) == (
         VehicleMaps("a", (), ("1",), ()),
-        VehicleMaps("x:y", (), (), (("7", "the vehicle does not say why"),)),
+        VehicleMaps("x:y", (), (), (("7", "the vehicle reports no reason"),)),
     )
 
 
@@ -237,7 +237,7 @@ def test_state_of_version_3_0_is_read() -> None:
     message = maps("a", ("1", "ENABLED"), instantActionStates=states, errors=errors, zoneActionStates=None)
     assert read_state(message) == (
         VehicleMaps("a", ("1",), (), (("3", "404"), ("4", "no room"))),
-        VehicleMaps("b", (), (), (("6", "the vehicle does not say why"), ("7", "UNKNOWN_MAP_ID"))),
+        VehicleMaps("b", (), (), (("6", "the vehicle reports no reason"), ("7", "UNKNOWN_MAP_ID"))),
     )
 
 

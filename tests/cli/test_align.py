@@ -27,7 +27,7 @@ def hall(fleetmap: Fleetmap, maps: Path, name: str) -> None:
         assert result.status == 0, result.err
 
 
-def test_a_grid_is_laid_onto_another(fleetmap: Fleetmap, maps: Path) -> None:
+def test_align_moves_grid_onto_another(fleetmap: Fleetmap, maps: Path) -> None:
     hall(fleetmap, maps, "halls")
     result = fleetmap("align", "halls", "map", "--grid", "other", "--dry-run")
     assert result.status == 0, result.err
@@ -47,7 +47,7 @@ def test_a_grid_is_laid_onto_another(fleetmap: Fleetmap, maps: Path) -> None:
     assert "keep their place" in again.err
 
 
-def test_by_points(fleetmap: Fleetmap, maps: Path) -> None:
+def test_align_by_points(fleetmap: Fleetmap, maps: Path) -> None:
     hall(fleetmap, maps, "points")
     pairs = ("--pair", "4,-1=0,0", "--pair", "5,-1=1,0", "--pair", "4,3=0,4", "--pair", "0,0=9,9")
     result = fleetmap("align", "points", "--grid", "other", *pairs)
@@ -59,7 +59,7 @@ def test_by_points(fleetmap: Fleetmap, maps: Path) -> None:
     assert "do not fit" in refused.err
 
 
-def test_onto_a_slice_of_objects_and_what_is_refused(fleetmap: Fleetmap, maps: Path, tmp_path: Path) -> None:
+def test_align_onto_objects_and_invalid_options(fleetmap: Fleetmap, maps: Path, tmp_path: Path) -> None:
     hall(fleetmap, maps, "sliced")
     lines = ["[-3,2.05],[9,2.05]", "[-3,9.95],[9,9.95]", "[-2.95,2],[-2.95,10]", "[8.95,2],[8.95,10]",
              "[1.05,2],[1.05,7]", "[1,7.05],[4,7.05]"]  # fmt: skip
@@ -82,10 +82,10 @@ def test_onto_a_slice_of_objects_and_what_is_refused(fleetmap: Fleetmap, maps: P
     assert result.json["alignment"]["origin"] == pytest.approx([-3.0, 2.0, 0.0], abs=0.1)
     assert fleetmap("align", "sliced", *slice_, "-O", "colour=1").status == 1
     for wrong, says in (
-        ((), "name what the grid is laid onto"),
-        (("map", "--pair", "0,0=1,1"), "or give --pair"),
-        (("map", "-O", "height=1"), "a stored grid has no parameters"),
-        (("--pair", "0,0=1,1", "-O", "height=1"), "not to points"),
+        ((), "missing reference"),
+        (("map", "--pair", "0,0=1,1"), "or --pair"),
+        (("map", "-O", "height=1"), "grids have no parameters"),
+        (("--pair", "0,0=1,1", "-O", "height=1"), "cannot be combined with --pair"),
         (("map", "--angle", "400"), "0<=x<=180"),
     ):
         refused = fleetmap("align", "sliced", *wrong)
@@ -94,11 +94,13 @@ def test_onto_a_slice_of_objects_and_what_is_refused(fleetmap: Fleetmap, maps: P
     for text in ("0,0", "0,0=1", "a,b=c,d", "0,0=nan,1", "0,0=1,1=2,2"):
         refused = fleetmap("align", "sliced", "--pair", text)
         assert refused.status == 1
-        assert "--pair needs" in refused.err
+        assert "--pair must" in refused.err
     assert "stored grids" in fleetmap("align", "sliced", "map", "--grid", "moon").err
 
 
-def test_the_list_is_the_servers(fleetmap: Fleetmap, offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_derive_lists_derivations_of_server(
+    fleetmap: Fleetmap, offline: Fleetmap, monkeypatch: pytest.MonkeyPatch
+) -> None:
     listed = fleetmap("derive", "--json")
     assert listed.status == 0
     assert "location_to_imagery" not in {row["id"] for row in listed.json}, "this server has no provider"
@@ -106,11 +108,11 @@ def test_the_list_is_the_servers(fleetmap: Fleetmap, offline: Fleetmap, monkeypa
     monkeypatch.setattr("app.cli.client.MAX_ATTEMPTS", 1)
     absent = fleetmap("derive", "--json", "--server", "http://127.0.0.1:9")
     assert absent.json == listed.json
-    assert "no answer from http://127.0.0.1:9" in absent.err
+    assert "no response from http://127.0.0.1:9" in absent.err
     assert "location_to_imagery" in absent.err
     monkeypatch.delenv("FLEETMAP_SERVER")
     alone = offline("derive")
     assert "occupancy_to_topology" in alone.out
-    assert "no server is named" in alone.err
+    assert "no server set" in alone.err
     monkeypatch.setenv("FLEETMAP_TOKEN", "wrong")
     assert fleetmap("derive", "--server", "http://127.0.0.1:9").status == 0

@@ -21,25 +21,25 @@ def a_map(folder: Path, image: str = "map.pgm", yaw: float = 0.0) -> Path:
     return path
 
 
-def test_a_good_map_passes(offline: Fleetmap, tmp_path: Path) -> None:
+def test_check_accepts_valid_map(offline: Fleetmap, tmp_path: Path) -> None:
     a_map(tmp_path)
     result = offline("check", tmp_path)
     assert result.status == 0, result.err
-    assert "map.yaml (occupancy_grid): nothing to complain of" in result.out
+    assert "map.yaml (occupancy_grid): no problems" in result.out
 
 
-def test_doubts_are_told_and_pass(offline: Fleetmap, tmp_path: Path) -> None:
+def test_check_reports_warnings_and_succeeds(offline: Fleetmap, tmp_path: Path) -> None:
     a_map(tmp_path, yaw=0.5)
     result = offline("check", tmp_path)
     assert result.status == 0
     assert "warning: map.yaml: origin: " in result.out
 
 
-def test_a_map_that_nav2_would_refuse_fails(offline: Fleetmap, tmp_path: Path) -> None:
+def test_check_fails_for_map_that_nav2_rejects(offline: Fleetmap, tmp_path: Path) -> None:
     path = a_map(tmp_path, image="other.pgm")
     result = offline("check", path, tmp_path / "map.pgm")
     assert result.status == 1
-    assert "map.yaml (occupancy_grid): would be refused" in result.out
+    assert "map.yaml (occupancy_grid): would be rejected" in result.out
     assert "error: map.yaml: image: " in result.out
     answer = offline("check", path, tmp_path / "map.pgm", "--json")
     assert answer.status == 1
@@ -61,17 +61,17 @@ def test_each_map_of_a_folder_is_checked(offline: Fleetmap, tmp_path: Path) -> N
     }
 
 
-def test_what_is_no_map_is_said(offline: Fleetmap, tmp_path: Path) -> None:
+def test_check_reports_files_that_are_not_maps(offline: Fleetmap, tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("nothing here")
     result = offline("check", tmp_path / "note.txt")
     assert result.status == 1
     assert "none of the files is a map" in result.err
     named = offline("check", tmp_path / "note.txt", "--format", "nav2_route")
     assert named.status == 1
-    assert "would be refused" in named.out
+    assert "would be rejected" in named.out
 
 
-def test_the_picture_beside_a_named_file_is_read(offline: Fleetmap, tmp_path: Path) -> None:
+def test_check_reads_image_beside_named_file(offline: Fleetmap, tmp_path: Path) -> None:
     folder = tmp_path / "maps"
     folder.mkdir()
     path = a_map(folder, image="/home/somebody/map.pgm")
@@ -104,7 +104,7 @@ MODEL = """<sdf version="1.9"><model name="crate"><static>true</static><link nam
 CONFIG = """<model><name>crate</name><sdf version="1.9">model.sdf</sdf></model>"""
 
 
-def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Path) -> None:
+def test_companions_are_those_of_the_format(shared: Path, tmp_path: Path) -> None:
     """A building's floor plans, a world's models below it, a picture's world file; nothing else of the folder."""
     crate = tmp_path / "models" / "crate"
     crate.mkdir(parents=True)
@@ -128,8 +128,8 @@ def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Pat
     assert [f.path.name for f in named] == ["field.png", "other.pgw"], "what the user names stays"
 
 
-def test_a_wrong_option_of_a_generator_lists_its_own(offline: Fleetmap, tmp_path: Path) -> None:
+def test_unknown_generator_option_lists_accepted_ones(offline: Fleetmap, tmp_path: Path) -> None:
     result = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
     assert result.status == 1
-    assert "typo: no such parameter of orchard; accepted: crown_diameter," in result.err
+    assert "typo: unknown parameter of orchard: use one of crown_diameter," in result.err
     assert "tmap2 accepts action," in result.err

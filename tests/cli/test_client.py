@@ -93,7 +93,7 @@ def local(tmp_path: Path, name: str, content: bytes) -> LocalFile:
 Talk = Callable[..., tuple[Client, Script]]
 
 
-def test_an_upload_whose_answer_is_lost_is_sent_again_under_the_same_key(talk: Talk, tmp_path: Path) -> None:
+def test_upload_with_lost_response_is_repeated_with_same_key(talk: Talk, tmp_path: Path) -> None:
     client, script = talk(None, None, reply(201, {"version": 1}))
     files = [local(tmp_path, "a/b.yaml", b"x" * 100_000), local(tmp_path, "ü.kml", b"y")]
     assert client.upload("/environments/e/versions", files, {"mode": "merge"}) == (201, {"version": 1})
@@ -108,28 +108,28 @@ def test_an_upload_whose_answer_is_lost_is_sent_again_under_the_same_key(talk: T
     assert all(file._stream is None for file in files)
 
 
-def test_a_lost_answer_is_told_in_the_end(talk: Talk, tmp_path: Path) -> None:
+def test_client_reports_lost_response_after_all_attempts(talk: Talk, tmp_path: Path) -> None:
     client, script = talk(None)
-    with pytest.raises(RequestFailed, match="no answer from"):
+    with pytest.raises(RequestFailed, match="no response from"):
         client.upload("/environments/e/versions", [local(tmp_path, "a", b"1")], {})
     assert len(script.asked) == clients.MAX_ATTEMPTS
 
 
-def test_what_must_not_happen_twice_is_asked_once(talk: Talk) -> None:
+def test_request_without_key_is_not_repeated(talk: Talk) -> None:
     client, script = talk(None)
     with pytest.raises(RequestFailed, match="no answer"):
         client.post("/environments", {"name": "farm"})
     assert len(script.asked) == 1
 
 
-def test_a_busy_server_is_waited_for_as_it_says(talk: Talk) -> None:
+def test_client_waits_for_retry_after(talk: Talk) -> None:
     busy = reply(503, {"title": "Unavailable", "detail": "too much"}, Retry_After="0")
     client, script = talk(busy, busy, reply(200, [1]))
     assert client.get("/formats") == [1]
     assert len(script.asked) == 3
 
 
-def test_a_job_is_followed_and_the_map_asked_for_again(talk: Talk) -> None:
+def test_client_waits_for_job_and_requests_map_again(talk: Talk) -> None:
     client, script = talk(
         reply(202, {"id": "7"}, Location="/api/v1/jobs/7"),
         reply(200, {"id": "7", "state": "running", "progress": 0.5, "detail": "deriving"}),
@@ -147,7 +147,7 @@ def test_a_job_is_followed_and_the_map_asked_for_again(talk: Talk) -> None:
     assert not got.path.exists()
 
 
-def test_a_job_that_fails_tells_its_problem(talk: Talk) -> None:
+def test_client_raises_problem_of_failed_job(talk: Talk) -> None:
     problem = {"title": "Missing layer", "status": 422, "detail": "there is no network"}
     client, _ = talk(
         reply(202, {"id": "7"}, Location="/api/v1/jobs/7"),
@@ -157,7 +157,7 @@ def test_a_job_that_fails_tells_its_problem(talk: Talk) -> None:
         pass
 
 
-def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
+def test_missing_token_gets_hint(talk: Talk) -> None:
     client, script = talk(reply(401, {"title": "Token required", "detail": "give a token"}, "application/problem+json"))
     with pytest.raises(RequestFailed) as caught:
         client.get("/formats")
@@ -169,12 +169,12 @@ def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
     assert script.asked[-1][2]["Authorization"] == "Bearer secret-token"
 
 
-def test_a_missing_environment_gets_a_hint(talk: Talk) -> None:
+def test_missing_environment_gets_hint(talk: Talk) -> None:
     problem = {"title": "Not found", "detail": "there is no environment 'x'"}
     client, _ = talk(reply(404, problem, "application/problem+json"), reply(200, [{"name": "other"}]))
     with pytest.raises(RequestFailed) as caught:
         client.get("/environments/x")
-    assert caught.value.hint == "`fleetmap environment list` lists all."
+    assert caught.value.hint == "List all with `fleetmap environment list`."
 
 
 def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk) -> None:
@@ -189,16 +189,16 @@ def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk)
         client.get("/environments/fram-7")  # the list is refused as well: the first error is told
 
 
-def test_another_kind_of_server_is_recognised(talk: Talk) -> None:
+def test_foreign_server_is_recognised(talk: Talk) -> None:
     client, _ = talk(reply(200, b"<html>", "text/html"))
     with pytest.raises(RequestFailed, match="no JSON"):
         client.get("/formats")
     client, _ = talk(reply(404, b"<html>", "text/html"))
-    with pytest.raises(RequestFailed, match="answered 404"):
+    with pytest.raises(RequestFailed, match="returned status 404"):
         client.get("/formats")
 
 
-def test_pages_are_followed_as_far_as_they_are_wanted(talk: Talk) -> None:
+def test_pages_are_followed_up_to_limit(talk: Talk) -> None:
     def pages() -> list[Answer]:
         first = reply(200, [1, 2], Link='</api/v1/versions?before=2>; rel="next"')
         return [first, reply(200, [3])]
@@ -211,14 +211,14 @@ def test_pages_are_followed_as_far_as_they_are_wanted(talk: Talk) -> None:
 
 
 @pytest.mark.parametrize("given", ['attachment; filename="../../etc/passwd"', "attachment; filename=..", "attachment"])
-def test_the_server_chooses_no_place_on_this_machine(talk: Talk, given: str) -> None:
+def test_file_name_of_server_has_no_folder(talk: Talk, given: str) -> None:
     client, _ = talk(reply(200, b"x", "text/plain", Content_Disposition=given))
     with client.download("/maps/farm/kml") as got:
         assert "/" not in got.name
         assert got.name not in ("", ".", "..")
 
 
-def test_an_archive_is_unpacked_below_its_folder_or_not_at_all(tmp_path: Path) -> None:
+def test_archive_is_unpacked_only_below_its_folder(tmp_path: Path) -> None:
     import zipfile
 
     with zipfile.ZipFile(tmp_path / "good.zip", "w") as archive:

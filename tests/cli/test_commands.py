@@ -93,7 +93,7 @@ def test_all_environments_are_listed(fleetmap: Fleetmap, network: Path) -> None:
     assert len(fleetmap("versions", "--limit", "1", "--json").json) == 1
 
 
-def test_which_map_am_i_on(fleetmap: Fleetmap, network: Path) -> None:
+def test_where_lists_environments_at_position(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "south-field", "--datum", "-33.9,18.4").status == 0
     result = fleetmap("where", "-33.9,18.40002")
     assert result.status == 0, result.err
@@ -115,7 +115,7 @@ def test_which_map_am_i_on(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("where").status == 2
 
 
-def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
+def test_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "planned")
     result = fleetmap("promote", "planned", "2", "--channel", "staging", "--at", "2099-01-31T06:00:00Z", "--json")
     assert result.status == 0, result.err
@@ -126,16 +126,18 @@ def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
     assert "past" in past.err
 
 
-def test_a_promotion_in_two_stages(fleetmap: Fleetmap, network: Path) -> None:
+def test_promotion_in_two_stages_is_planned_and_cancelled(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "staged")
     result = fleetmap(
         "promote", "staged", "1", "--ready", "0.9", "--failed", "0.2", "--deadline", "2099-01-31T06:00:00Z"
     )
-    assert result.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have it"
+    assert (
+        result.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have fetched it"
+    )
     body = fleetmap("promote", "staged", "1", "--ready", "0.9", "--window", "60", "--json").json
     assert body["version"] is None
     assert (body["rollout"]["state"], body["rollout"]["ready"], body["rollout"]["window"]) == ("waiting", 0.9, 60.0)
-    assert "nothing is planned" in fleetmap("promote", "staged", "--cancel").out
+    assert "cancelled the planned move" in fleetmap("promote", "staged", "--cancel").out
     assert fleetmap("promote", "staged", "--cancel").status == 1, "there is nothing to cancel any more"
     assert fleetmap("promote", "staged", "--cancel", "--ready", "0.5").status == 2
     assert fleetmap("promote", "staged", "1").out.strip() == "staged: production points to version 1"
@@ -145,7 +147,7 @@ def test_a_promotion_in_two_stages(fleetmap: Fleetmap, network: Path) -> None:
     assert "ready, failed" in alone.err
 
 
-def test_a_grid_gets_its_name_and_a_merge_deletes_nothing(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_import_sets_grid_name_and_merge_deletes_nothing(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "merged").status == 0
     (tmp_path / "mask.yaml").write_text(
         "image: mask.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
@@ -167,7 +169,7 @@ def test_a_grid_gets_its_name_and_a_merge_deletes_nothing(fleetmap: Fleetmap, ne
     assert all(f"name: {node}" in text for node in "ABC")
 
 
-def test_export_gives_the_whole_site(fleetmap: Fleetmap, tmp_path: Path) -> None:
+def test_export_writes_complete_site(fleetmap: Fleetmap, tmp_path: Path) -> None:
     assert fleetmap("generate", "office", "--seed", "7", "-e", "tower").status == 0
     folder = tmp_path / "site"
     options = ("-O", "level=*", "-O", "grid=*")
@@ -185,7 +187,7 @@ def test_export_gives_the_whole_site(fleetmap: Fleetmap, tmp_path: Path) -> None
     assert one.read_bytes() == (folder / "L2" / "map.yaml").read_bytes()
 
 
-def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
+def test_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
     refused = fleetmap("import", network, "-e", "rehearsal", "--dry-run")
     assert refused.status == 1
     assert "does not create it" in refused.err
@@ -197,7 +199,7 @@ def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("versions", "rehearsal", "--json").json[0]["version"] == 1
 
 
-def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: Path) -> None:
+def test_damaged_file_is_refused_with_its_position(fleetmap: Fleetmap, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
     result = fleetmap("import", bad, "-e", "damaged", "-f", "tmap2")
@@ -211,7 +213,7 @@ def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: 
     assert fleetmap("import", bad.with_name("network.tmap2.yaml"), "-e", "damaged").status == 1
 
 
-def test_the_same_problem_without_a_server(offline: Fleetmap, tmp_path: Path) -> None:
+def test_offline_problem_equals_server_problem(offline: Fleetmap, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
     result = offline("convert", bad, "--format", "tmap2", "--to", "geojson", "-o", tmp_path / "out.geojson")
@@ -220,7 +222,7 @@ def test_the_same_problem_without_a_server(offline: Fleetmap, tmp_path: Path) ->
     assert not (tmp_path / "out.geojson").exists()
 
 
-def test_a_new_environment_takes_its_datum(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_import_sets_datum_of_new_environment(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "placed", "--datum", "52.5,5.5,30").status == 0
     out = tmp_path / "datum.yaml"
     assert fleetmap("export", "placed", "datum", "-o", out).status == 0
@@ -255,7 +257,7 @@ def test_parameters_of_generators_have_types_units_defaults_and_bounds(offline: 
     assert "did you mean orchard?" in offline("generate", "orchrd", "--parameters").err
 
 
-def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
+def test_token_create_list_and_delete(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "guarded").status == 0
     token = fleetmap("token", "create", "field robot", "--role", "viewer", "--environments", "guard*", "--json").json
     assert fleetmap("versions", "guarded", "--token", token["token"]).status == 0
@@ -293,7 +295,7 @@ def test_link_gives_a_map_without_a_token(fleetmap: Fleetmap, network: Path) -> 
 def test_robot_token_names_its_robot(fleetmap: Fleetmap) -> None:
     assert fleetmap("token", "create", "mower-9", "--role", "robot", "--json").json["robot"] == "mower-9"
     result = fleetmap("token", "create", "the red one", "--role", "robot", "--robot", "mower-9")
-    assert (result.status, "sets the status of the robot mower-9" in result.err) == (0, True)
+    assert (result.status, "reports the status of robot mower-9" in result.err) == (0, True)
     for wrong in (("the red one", "--role", "robot"), ("x", "--role", "robot", "--robot", "a b")):
         refused = fleetmap("token", "create", *wrong)
         assert (refused.status, refused.out) == (1, "")
@@ -304,17 +306,26 @@ def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, t
     assert fleetmap("import", network).status == 2
     assert fleetmap("export", "story", "kml", "-o", "-", "--json").status == 2
     assert fleetmap("nonsense").status == 2
-    assert fleetmap("import", tmp_path / "absent", "-e", "x").status == 1
-    assert "absent does not exist" in fleetmap("import", tmp_path / "absent", "-e", "x").err
+    absent = fleetmap("import", tmp_path / "absent", "-e", "x")
+    assert absent.status == 1
+    assert f"no file or folder '{tmp_path}/absent'" in absent.err
+    assert "--environment" not in absent.err
     missing = fleetmap("versions", "no-such-place")
     assert missing.status == 1
-    assert "lists all" in missing.err
+    assert "List all with" in missing.err
     named = fleetmap("import", network, "-e", "My Farm")
     assert named.status == 1
     assert "try my-farm" in named.err
 
 
-def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_import_with_environment_as_argument_proposes_its_option(fleetmap: Fleetmap, network: Path) -> None:
+    assert fleetmap("environment", "create", "strawberry").status == 0
+    mistaken = fleetmap("import", "strawberry", network)
+    assert mistaken.status == 1
+    assert "no file or folder 'strawberry': set an environment with --environment strawberry" in mistaken.err
+
+
+def test_unknown_parameter_is_refused(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "opted").status == 0
     for result in (
         fleetmap("export", "opted", "tmap2", "-o", tmp_path / "x", "-O", "colour=red"),
@@ -326,7 +337,7 @@ def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Pat
     assert not (tmp_path / "x").exists()
 
 
-def test_the_demo_comes_once_and_its_commands_work(fleetmap: Fleetmap, server: str, tmp_path: Path) -> None:
+def test_demo_is_installed_once_and_its_commands_work(fleetmap: Fleetmap, server: str, tmp_path: Path) -> None:
     if shutil.which("curl") is None:
         (pytest.fail if os.environ.get("CI") else pytest.skip)("curl is not installed")
     first = fleetmap("demo", "--json").json

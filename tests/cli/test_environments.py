@@ -68,7 +68,7 @@ def originals(folder: Path, expected: Wanted) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_folder_imports_with_one_command_and_its_maps_come_back(
+def test_folder_import_and_export_keep_its_maps(
     name: str, shared: Path, fleetmap: Fleetmap, same: Same, tmp_path: Path
 ) -> None:
     folder = template(shared, name)
@@ -89,13 +89,11 @@ def test_a_folder_imports_with_one_command_and_its_maps_come_back(
         assert same(expected.format, originals(folder, expected), read(out)) == []
     again = fleetmap("import", folder)
     assert again.status == 0, again.err
-    assert f"{name}: nothing changed, version 1 stays" in again.out
+    assert f"{name}: no changes, still version 1" in again.out
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_folder_converts_without_a_server(
-    name: str, shared: Path, offline: Fleetmap, same: Same, tmp_path: Path
-) -> None:
+def test_folder_converts_without_server(name: str, shared: Path, offline: Fleetmap, same: Same, tmp_path: Path) -> None:
     folder = template(shared, name)
     for expected in FOLDERS[name]:
         out = tmp_path / f"{expected.format}-{expected.option}"
@@ -105,7 +103,7 @@ def test_a_folder_converts_without_a_server(
         assert same(expected.format, originals(folder, expected), read(out)) == []
 
 
-def test_a_network_becomes_another_format_and_comes_back_offline(
+def test_network_converts_to_another_format_and_back_offline(
     shared: Path, offline: Fleetmap, same: Same, tmp_path: Path
 ) -> None:
     original = template(shared, "riseholme_park_farm_vineyard") / "config/topological/network.tmap2.yaml"

@@ -33,7 +33,7 @@ def post_status(server: str, robot: str, body: dict[str, Any]) -> None:
         assert answer.status == 200
 
 
-def test_environment_life(fleetmap: Fleetmap) -> None:
+def test_environment_create_rename_delete_and_purge(fleetmap: Fleetmap) -> None:
     result = fleetmap("environment", "create", "life", "--datum", "53.25,-0.5", "--title", "A life", "--tag", "x")
     assert (result.status, result.out) == (0, "life: created, version 1\n"), result.err
     assert fleetmap("environment", "create", "life").status == 1
@@ -45,7 +45,7 @@ def test_environment_life(fleetmap: Fleetmap) -> None:
     assert "newest version" in shown
     assert "53.3, -0.5, heading 12.5°" in fleetmap("environment", "datum", "life", "53.3,-0.5,12.5").out
     assert fleetmap("environment", "datum", "life", "--json").json["heading"] == 12.5
-    assert "now called life-2" in fleetmap("environment", "rename", "life", "life-2").out
+    assert "renamed to life-2" in fleetmap("environment", "rename", "life", "life-2").out
     assert fleetmap("environment", "rename", "life-2").status == 2
     assert (
         fleetmap("environment", "create", "life-3", "--clone", "life-2@1", "--json").json["datum"]["latitude"] == 53.25
@@ -74,7 +74,7 @@ def test_channels_and_robots(fleetmap: Fleetmap, server: str, network: Path) -> 
     assert "version" in fleetmap("channels", "show", "manned", "production").out
     assert fleetmap("promote", "manned", "1", "--at", "2099-01-31T06:00:00Z", "-c", "staging").status == 0
     assert "2099-01-31 06:00" in fleetmap("channels", "manned").out
-    assert "nothing is planned" in fleetmap("channels", "cancel", "manned", "staging").out
+    assert "cancelled the planned move" in fleetmap("channels", "cancel", "manned", "staging").out
     assert [row["robot"] for row in fleetmap("robots", "-e", "manned", "--json").json] == ["mower-3"]
     assert "mower-3" in fleetmap("robots").out
     shown = fleetmap("robots", "show", "mower-3")
@@ -84,7 +84,7 @@ def test_channels_and_robots(fleetmap: Fleetmap, server: str, network: Path) -> 
     assert fleetmap("robots", "-e", "manned", "--json").json == []
 
 
-def test_overlays(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_overlays_are_reported_and_decided(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     assert fleetmap("import", network, "-e", "blocked").status == 0
     overlay = fleetmap("overlays", "create", "blocked", "--edge", "A_B", "--detail", "fallen tree", "--json").json
     assert (overlay["state"], overlay["edge"]) == ("pending", "A_B")
@@ -128,7 +128,7 @@ def test_jobs_and_keys(fleetmap: Fleetmap) -> None:
     assert fleetmap("keys", "show", "nonsense").status == 1
 
 
-def test_json_stands_before_or_after_the_command(fleetmap: Fleetmap, network: Path) -> None:
+def test_json_option_is_accepted_before_or_after_command(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "either").status == 0
     expected = fleetmap("channels", "list", "either", "--json").json
     for arguments in (

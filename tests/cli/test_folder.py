@@ -29,7 +29,7 @@ def template(tmp_path: Path) -> Path:
     return root
 
 
-def test_a_template_gives_its_config_and_scripts_alone(template: Path) -> None:
+def test_template_folder_yields_only_config_and_scripts(template: Path) -> None:
     content = folder.collect(template)
     assert content.is_template
     assert names(content) == [
@@ -40,19 +40,19 @@ def test_a_template_gives_its_config_and_scripts_alone(template: Path) -> None:
     ]
 
 
-def test_the_config_folder_itself_gives_the_same_names(template: Path) -> None:
+def test_config_folder_yields_same_names(template: Path) -> None:
     assert names(folder.collect(template / "config")) == names(folder.collect(template))
     assert folder.collect(template / "config").root == template
 
 
-def test_any_other_folder_gives_all_its_files_but_no_version_control(tmp_path: Path) -> None:
+def test_other_folder_yields_all_files_without_version_control(tmp_path: Path) -> None:
     put(tmp_path, "building.yaml", "plans/office.png", ".git/HEAD", "config/robot.yaml")
     content = folder.collect(tmp_path)
     assert not content.is_template
     assert names(content) == ["building.yaml", "config/robot.yaml", "plans/office.png"]
 
 
-def test_links_out_of_the_folder_are_left_out_and_told(template: Path, tmp_path: Path) -> None:
+def test_links_out_of_folder_are_skipped_and_reported(template: Path, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("not for the server")
     (template / "config/world").mkdir()
     (template / "config/world/linked.kml").symlink_to(tmp_path / "secret")
@@ -68,7 +68,7 @@ def test_links_out_of_the_folder_are_left_out_and_told(template: Path, tmp_path:
     assert "dangling" in notes
 
 
-def test_nothing_to_upload_is_said(tmp_path: Path) -> None:
+def test_folder_without_files_is_reported(tmp_path: Path) -> None:
     put(tmp_path, ".git/HEAD")
     with pytest.raises(Invalid, match="no files"):
         folder.collect(tmp_path)
@@ -84,17 +84,17 @@ def test_nothing_to_upload_is_said(tmp_path: Path) -> None:
         ("Größe.v2", "gr-e-v2"),
     ],
 )
-def test_a_folder_name_becomes_valid(text: str, name: str) -> None:
+def test_environment_name_is_derived_from_folder_name(text: str, name: str) -> None:
     assert folder.environment_name(text) == name
 
 
 @pytest.mark.parametrize("text", ["", "...", "robots", "Server", "日本"])
-def test_a_name_that_cannot_be_used_asks_for_another(text: str) -> None:
+def test_unusable_folder_name_requires_environment_option(text: str) -> None:
     with pytest.raises(Invalid, match="--environment"):
         folder.environment_name(text)
 
 
-def test_names_and_folders_are_those_of_the_server() -> None:
+def test_copied_names_and_folders_match_server() -> None:
     from app import upload_reader
     from app.store import base
 

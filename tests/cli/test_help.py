@@ -66,7 +66,7 @@ def test_help_is_as_wide_as_the_terminal(
     assert "[default: production]" in " ".join(output.replace("│", " ").split()), "brackets are no markup"
 
 
-def test_only_the_command_that_runs_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_requested_command_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
     assert needed_command(["--json", "robots", "list"]) == "robots"
     assert needed_command(["--help"]) is None
     assert list(get_command(build("robots")).commands) == ["robots"]  # type: ignore[attr-defined]
@@ -105,7 +105,7 @@ def test_settings_take_sizes_with_units(monkeypatch: pytest.MonkeyPatch, tmp_pat
             Settings(cache_bytes=wrong)  # type: ignore[arg-type]
 
 
-def test_unknown_variables_are_warned_of(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_unknown_variables_raise_warnings(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FLEETMAP_MAX_UPLOAD_BYTE", "1")
     monkeypatch.setenv("FLEETMAP_TOKEN", "a client's")
@@ -123,7 +123,7 @@ def test_unknown_variables_are_warned_of(offline: Fleetmap, monkeypatch: pytest.
     assert "FLEETMAP_MAX_UPLOAD_BYTE" not in result.err, "a client does not know the server's settings"
 
 
-def test_known_variables_are_those_of_settings_and_options(everything: Any) -> None:
+def test_accepted_variables_match_settings_and_options(everything: Any) -> None:
     read = {p.envvar for _, command in leaves(everything) for p in command.params if getattr(p, "envvar", None)}
     assert read <= variables.CLIENT | variables.AGENT
 

@@ -38,7 +38,7 @@ def network(tmp_path: Path) -> Path:
         ("barn", None),
     ],
 )
-def test_slip_is_told_from_sibling(name: str, meant: str | None) -> None:
+def test_slip_distinguishes_misspelling_from_sibling(name: str, meant: str | None) -> None:
     assert slip(name, EXISTING) == meant
 
 
@@ -70,14 +70,14 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         assert result.status == 1, arguments
         assert proposal in result.err, (arguments, result.err)
     for arguments, proposal in (
-        (("frmats",), "there is no command frmats (did you mean formats?)"),
-        (("convrt",), "there is no command convrt (did you mean convert?)"),
-        (("zzz",), "there is no command zzz"),
-        (("overlays", "acept", "proposals", "1"), "there is no command acept (did you mean accept?)"),
-        (("formats", "--jsn"), "there is no option --jsn (did you mean --json?)"),
-        (("check", "--jsn=1", "x"), "there is no option --jsn (did you mean --json?)"),
-        (("--versoin",), "there is no option --versoin (did you mean --version?)"),
-        (("formats", "-z"), "there is no option -z"),
+        (("frmats",), "unknown command frmats (did you mean formats?)"),
+        (("convrt",), "unknown command convrt (did you mean convert?)"),
+        (("zzz",), "unknown command zzz"),
+        (("overlays", "acept", "proposals", "1"), "unknown command acept (did you mean accept?)"),
+        (("formats", "--jsn"), "unknown option --jsn (did you mean --json?)"),
+        (("check", "--jsn=1", "x"), "unknown option --jsn (did you mean --json?)"),
+        (("--versoin",), "unknown option --versoin (did you mean --version?)"),
+        (("formats", "-z"), "unknown option -z"),
         (("overlays", "list", "proposals", "--state", "pendng"), "did you mean pending?"),
         (("jobs", "list", "--state", "rnning"), "did you mean running?"),
         (("token", "create", "x", "--role", "edtor"), "did you mean editor?"),
@@ -87,7 +87,7 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         assert proposal in " ".join(result.err.split()), (arguments, result.err)
 
 
-def test_environment_that_looks_like_a_slip_needs_create(fleetmap: Fleetmap, network: Path) -> None:
+def test_misspelled_environment_requires_create(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "meadow-7").status == 0
     for command in (("import", network), ("generate", "cave")):
         refused = fleetmap(*command, "-e", "medaow-7")
@@ -101,7 +101,7 @@ def test_environment_that_looks_like_a_slip_needs_create(fleetmap: Fleetmap, net
     assert fleetmap("import", network, "-e", "medaow-7", "--create").status == 0
 
 
-def test_failed_work_leaves_no_environment_behind(fleetmap: Fleetmap, tmp_path: Path) -> None:
+def test_failed_command_removes_new_environment(fleetmap: Fleetmap, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
     for command in (("import", bad), ("generate", "no-such-site"), ("generate", "orchard", "-O", "rows=-1")):
@@ -111,7 +111,7 @@ def test_failed_work_leaves_no_environment_behind(fleetmap: Fleetmap, tmp_path: 
     assert fleetmap("environment", "create", "stillborn").status == 0, "the name is free"
 
 
-def test_failed_work_takes_a_new_datum_back(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+def test_failed_command_resets_new_datum(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
     bad = tmp_path / "bad.tmap2.yaml"
     bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
     assert fleetmap("import", network, "-e", "moved").status == 0
@@ -119,4 +119,4 @@ def test_failed_work_takes_a_new_datum_back(fleetmap: Fleetmap, network: Path, t
     assert fleetmap("import", bad, "-e", "moved", "--datum", "53.2,-0.5").status == 1
     after = fleetmap("environment", "show", "moved", "--json").json
     assert (after["datum"], after["root"]) == (before["datum"], before["root"])
-    assert "take back the datum" in fleetmap("versions", "moved").out
+    assert "reset the datum" in fleetmap("versions", "moved").out

@@ -19,11 +19,11 @@ from app.cli.versions import change_line, counts
         ({"problem": "is bad"}, "is bad"),
     ],
 )
-def test_a_problem_names_its_place_as_compilers_do(problem: dict[str, object], line: str) -> None:
+def test_problem_place_has_compiler_format(problem: dict[str, object], line: str) -> None:
     assert output.problem_place(problem) == line
 
 
-def test_texts_of_files_cannot_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_characters_of_files_are_removed(capsys: pytest.CaptureFixture[str]) -> None:
     hostile = "\x1b[2J[red]node[/red]\u202e\r\n"
     output.print_result(hostile)
     output.show_table(["name"], [[hostile]])
@@ -42,7 +42,9 @@ def test_many_problems_are_cut_short(capsys: pytest.CaptureFixture[str]) -> None
     assert "20 more" in stderr
 
 
-def test_bars_are_for_terminals_alone(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_bar_is_shown_only_on_terminals(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def work() -> str:
         capsys.readouterr()
         with output.progress_bar("uploading", total=10, count_bytes=True) as bar:
@@ -56,7 +58,7 @@ def test_bars_are_for_terminals_alone(capsys: pytest.CaptureFixture[str], monkey
     assert "uploading" in work() or "done" in work()
 
 
-def test_sizes_and_counts_in_words() -> None:
+def test_size_and_counts_are_formatted() -> None:
     assert [output.size(n) for n in (0, 999, 1500, 2_000_000, 3_000_000_000)] == [
         "0 B",
         "999 B",
@@ -86,7 +88,7 @@ def test_files_with_the_same_warning_share_a_line(capsys: pytest.CaptureFixture[
     assert "10 more warnings" in stderr
 
 
-def test_a_table_keeps_names_whole_and_wraps_long_texts(
+def test_table_keeps_names_on_one_line_and_wraps_texts(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, reason = "riseholme_general_east_pathway", "upload an OSM file or a drawing with layer=topology " * 3

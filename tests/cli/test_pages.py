@@ -108,7 +108,7 @@ def test_tutorials_work_as_pasted(place: Place) -> None:
     output = place.run("\n".join(block for page in TUTORIALS for block in blocks(read(page))))
     assert "my-farm: version 2\n" in output
     assert "versions 2 → 3: objects 1 changed; topology 6 changed" in output, "the tutorial shows these lines"
-    assert "my-farm: version 4 holds what version 2 holds" in output
+    assert "my-farm: version 4 has the content of version 2" in output
     assert re.search(r"^production +3 .*1 of 1", output, re.MULTILINE)
     assert '"edge": "Lane/0_Lane/1"' in output
     assert (place.folder / "maps" / "current").readlink().name.startswith("2-")

@@ -29,7 +29,7 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
     process = start(tmp_path, "--workers", workers)
     try:
         process.ready()
-        token = process.wait_for(r"administrator's token, shown only this once: (\S+)")[1]
+        token = process.wait_for(r"administrator's token, shown only once: (\S+)")[1]
         listed = offline("token", "list", "--server", process.address, "--token", token, "--json")
         assert [row["role"] for row in listed.json] == ["admin"]
     finally:
@@ -38,13 +38,13 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
     try:
         again.ready()
         assert offline("token", "list", "--server", again.address, "--token", token).status == 0
-        assert not any("shown only this once" in line for line in again.lines)
+        assert not any("shown only once" in line for line in again.lines)
         assert not any(token in line for line in again.lines)
     finally:
         assert again.stop(signal.SIGINT) == 0
 
 
-def test_a_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetmap) -> None:
+def test_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetmap) -> None:
     process = start(tmp_path, FLEETMAP_ADMIN_TOKEN="given-by-the-operator")
     try:
         process.ready()
@@ -56,7 +56,7 @@ def test_a_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetm
     assert not any("given-by-the-operator" in line for line in process.lines)
 
 
-def test_a_mounted_secret_is_a_setting(tmp_path: Path, offline: Fleetmap) -> None:
+def test_mounted_secret_is_read_as_setting(tmp_path: Path, offline: Fleetmap) -> None:
     (tmp_path / "secrets").mkdir()
     (tmp_path / "secrets" / "fleetmap_admin_token").write_text("mounted-as-a-secret\n")
     process = start(tmp_path, FLEETMAP_SECRETS_DIR=str(tmp_path / "secrets"))
@@ -67,7 +67,7 @@ def test_a_mounted_secret_is_a_setting(tmp_path: Path, offline: Fleetmap) -> Non
         process.stop()
 
 
-def test_the_demo_prints_commands_that_work_at_every_start(tmp_path: Path) -> None:
+def test_serve_demo_prints_working_commands_at_every_start(tmp_path: Path) -> None:
     for _ in range(2):
         process = start(tmp_path, "--demo")
         try:
@@ -83,7 +83,7 @@ def test_the_demo_prints_commands_that_work_at_every_start(tmp_path: Path) -> No
     assert (tmp_path / "data" / "demo-token").stat().st_mode & 0o077 == 0
 
 
-def test_a_taken_port_is_said_in_one_line(tmp_path: Path, offline: Fleetmap) -> None:
+def test_taken_port_is_reported_in_one_line(tmp_path: Path, offline: Fleetmap) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         result = offline("serve", "--port", str(port), "--data-dir", tmp_path / "data")
@@ -109,7 +109,7 @@ def test_unusable_settings_are_usage_errors(
     assert named in " ".join(result.err.split())
 
 
-def test_https_by_two_flags(tmp_path: Path) -> None:
+def test_serve_uses_https_with_certificate_and_key(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     certificate, key = authority.sign("server")
     trusting = ssl.create_default_context(cafile=authority.pem)
@@ -135,19 +135,19 @@ def test_https_by_two_flags(tmp_path: Path) -> None:
         assert process.stop() == 0
 
 
-def test_files_that_cannot_be_used_end_the_start(tmp_path: Path, offline: Fleetmap) -> None:
+def test_unusable_files_prevent_start(tmp_path: Path, offline: Fleetmap) -> None:
     data = ("--data-dir", tmp_path / "data", "--port", "0")
     certificate, key = Authority(tmp_path).sign("server")
     other = Authority(tmp_path / "other").sign("server")[1]
     result = offline("serve", *data, "--tls-certificate", certificate, "--tls-key", other)
     assert result.status == 2
-    assert "--tls-certificate and --tls-key cannot be used" in " ".join(result.err.split())
+    assert "invalid --tls-certificate or --tls-key" in " ".join(result.err.split())
     result = offline("serve", "--demo", *data, "--tls-certificate", certificate, "--tls-key", key)
     assert result.status == 2
     (tmp_path / "users").write_text("r1\n")
     result = offline("serve", *data, "--zenoh-users", tmp_path / "users")
     assert result.status == 1
-    assert "line 1: not NAME:PASSWORD" in " ".join(result.err.split())
+    assert "line 1: must be NAME:PASSWORD" in " ".join(result.err.split())
 
 
 def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +159,7 @@ def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pyt
         assert (f"--{name.replace('_', '-')} " in output) == (name not in ("admin_token", "zenoh_password")), name
 
 
-def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:
+def test_workers_stop_with_parent_process(tmp_path: Path) -> None:
     process = start(tmp_path, "--workers", "2")
     address = process.ready()
     process.process.kill()
@@ -184,7 +184,7 @@ def test_migrate_brings_a_database_up_and_hides_its_password(offline: Fleetmap, 
     assert "hidden-word" not in result.err + result.out
 
 
-def test_a_database_of_a_newer_release_is_left_alone(offline: Fleetmap, tmp_path: Path) -> None:
+def test_database_of_newer_release_is_not_changed(offline: Fleetmap, tmp_path: Path) -> None:
     assert offline("migrate", "--data-dir", tmp_path / "data").status == 0
     with contextlib.closing(sqlite3.connect(tmp_path / "data" / "fleetmap.sqlite3")) as database:
         database.execute("UPDATE alembic_version SET version_num = 'of-tomorrow'")

@@ -28,11 +28,11 @@ def loaded(statement: str) -> list[str]:
 
 
 @pytest.mark.parametrize("statement", ["import app.cli.server, app.main", f"import {', '.join(PRELOADED_MODULES)}"])
-def test_start_loads_nothing_that_only_others_need(statement: str) -> None:
+def test_start_imports_only_required_modules(statement: str) -> None:
     assert loaded(statement) == []
 
 
-def test_postgresql_loads_its_part_when_it_is_used() -> None:
+def test_postgresql_driver_is_imported_on_use() -> None:
     compiled = (
         "from sqlalchemy.dialects import postgresql\n"
         "from app.store import tables\n"
@@ -49,7 +49,7 @@ def collecting() -> Iterator[None]:
 
 @pytest.mark.parametrize("workers", ["1", "2"])
 @pytest.mark.usefixtures("collecting")
-def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_are_prepared_in_background(workers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
 
     def check(_: Any) -> None:
@@ -66,7 +66,7 @@ def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, mon
 
 
 @pytest.mark.usefixtures("collecting")
-def test_application_collects_again(tmp_path: Path) -> None:
+def test_application_reenables_garbage_collection(tmp_path: Path) -> None:
     gc.disable()
     server.application(Settings(data_dir=tmp_path))
     assert gc.isenabled()

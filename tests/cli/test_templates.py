@@ -25,20 +25,20 @@ def version(fleetmap: Fleetmap, name: str) -> int:
     return int(fleetmap("versions", name, "--json").json[0]["version"])
 
 
-def test_the_sets_need_no_server(offline: Fleetmap) -> None:
+def test_template_sets_need_no_server(offline: Fleetmap) -> None:
     assert "outdoor" in offline("template").out
     sets = {s["name"]: s for s in offline("template", "--json").json}
     assert sets["outdoor"]["formats"]["tmap2"]["verts_radius"] == 1.5
 
 
-def test_a_set_and_values_of_an_environment(fleetmap: Fleetmap, farm: str, tmp_path: Path) -> None:
+def test_template_sets_and_values_are_stored_and_reset(fleetmap: Fleetmap, farm: str, tmp_path: Path) -> None:
     first = version(fleetmap, farm)
     result = fleetmap("template", farm, "--set", "outdoor", "-m", "it is a field")
     assert (result.status, result.out.splitlines()) == (
         0,
         [f"{farm}: version {first + 1}", "  templates: set: default → outdoor"],
     )
-    assert "nothing changed" in fleetmap("template", farm, "--set", "outdoor").out
+    assert "no changes" in fleetmap("template", farm, "--set", "outdoor").out
     result = fleetmap("template", farm, "tmap2", "-O", "action=NavigateToPose", "--option", "xy_goal_tolerance=0.4")
     assert result.status == 0, result.err
     assert "tmap2 action: none → NavigateToPose, tmap2 xy_goal_tolerance: none → 0.4" in result.out
@@ -60,11 +60,11 @@ def test_a_set_and_values_of_an_environment(fleetmap: Fleetmap, farm: str, tmp_p
     assert "outdoor" in fleetmap("versions", farm).out
 
 
-def test_taking_back(fleetmap: Fleetmap, farm: str) -> None:
+def test_template_unset_resets_values(fleetmap: Fleetmap, farm: str) -> None:
     first = fleetmap("versions", farm, "--json").json[0]
     fleetmap("template", farm, "tmap2", "-O", "action=a", "-O", "osm=true", "--set", "ros2")
     dry = fleetmap("template", farm, "tmap2", "--unset", "-O", "action", "--dry-run")
-    assert dry.out.splitlines() == [f"{farm}: this would make a version", "  templates: tmap2 action: a → none"]
+    assert dry.out.splitlines() == [f"{farm}: this would create a version", "  templates: tmap2 action: a → none"]
     fleetmap("template", farm, "tmap2", "--unset", "-O", "action")
     template = fleetmap("template", farm, "tmap2", "--json").json
     assert (template["values"], template["set"]) == ({"osm": True}, "ros2")
@@ -73,12 +73,12 @@ def test_taking_back(fleetmap: Fleetmap, farm: str) -> None:
     fleetmap("template", farm, "--set", "indoor")
     assert fleetmap("template", farm, "--unset", "-m", "as it was").status == 0
     assert fleetmap("versions", farm, "--json").json[0]["root"] == first["root"]
-    assert "nothing changed" in fleetmap("template", farm, "--unset").out
+    assert "no changes" in fleetmap("template", farm, "--unset").out
     old = fleetmap("template", farm, "tmap2", "--version", str(first["version"] + 1), "--json").json
     assert old["values"] == {"action": "a", "osm": True}
 
 
-def test_what_is_wrong_is_told(fleetmap: Fleetmap, farm: str) -> None:
+def test_template_errors_are_reported(fleetmap: Fleetmap, farm: str) -> None:
     wrong = fleetmap("template", farm, "tmap2", "-O", "colour=red")
     assert wrong.status == 1
     assert "colour: no such parameter of tmap2" in wrong.err

@@ -83,9 +83,7 @@ def answers(api: Api) -> list[bytes]:
     return [api.get(address).content for address in addresses]
 
 
-def test_verify_says_what_is_damaged_and_changes_nothing(
-    server: tuple[Api, Path], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_verify_lists_damage_and_changes_nothing(server: tuple[Api, Path], capfd: pytest.CaptureFixture[str]) -> None:
     api, folder = server
     good = answers(api)
     status, report = verify(folder, capfd)
@@ -113,7 +111,7 @@ def test_verify_says_what_is_damaged_and_changes_nothing(
     assert verify(folder, capfd)[0] == 0
 
 
-def test_files_are_healed_from_originals_and_archives(
+def test_verify_repairs_files_from_originals_and_archives(
     server: tuple[Api, Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     api, folder = server
@@ -137,7 +135,7 @@ def test_files_are_healed_from_originals_and_archives(
 
 
 @pytest.mark.parametrize("how", ["folder", "address"])
-def test_a_replica_heals_everything(
+def test_verify_repairs_everything_from_replica(
     server: tuple[Api, Path], other: tuple[Api, Path], capfd: pytest.CaptureFixture[str], how: str
 ) -> None:
     api, folder = server

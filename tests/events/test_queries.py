@@ -33,7 +33,7 @@ def api(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Api]:
         yield api
 
 
-def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session) -> None:
+def test_maps_over_zenoh_equal_http(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "asked"})
     api.upload("asked", {"network.tmap2.yaml": samples.tmap2()})
     api.upload("asked", samples.grid())
@@ -70,10 +70,10 @@ def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session)
         assert str(refused.encoding) == "application/problem+json"
     for key in ("fleetmap/*/*/version", "fleetmap/asked/latest/maps/**", "**"):
         problem = json.loads(bytes(get(key).payload))
-        assert (problem["status"], "without wildcards" in problem["detail"]) == (422, True)
+        assert (problem["status"], "wildcards are unsupported" in problem["detail"]) == (422, True)
 
 
-def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Session) -> None:
+def test_environments_by_position_equal_http(api: Api, session: zenoh.Session) -> None:
     for name, files in (("fenced", {"datum.yaml": samples.DATUM}), ("bare", None)):
         api.post(
             "environments", {"name": name, "datum": {"latitude": samples.LATITUDE, "longitude": samples.LONGITUDE}}
@@ -109,7 +109,7 @@ def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Ses
         assert "lat" in problem["detail"]
 
 
-def test_a_map_in_the_making_keeps_nobody_waiting(
+def test_conversion_does_not_block_other_queries(
     api: Api, session: zenoh.Session, port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     api.post("environments", {"name": "busy"})
@@ -137,7 +137,7 @@ def test_a_map_in_the_making_keeps_nobody_waiting(
     assert not [r for r in caplog.records if r.levelname == "ERROR"], "who left before the answer is no error"
 
 
-def test_whole_site_over_zenoh_is_the_bytes_of_http(api: Api, session: zenoh.Session) -> None:
+def test_complete_site_over_zenoh_equals_http(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "tower"})
     api.upload("tower", samples.grid())
     api.upload("tower", samples.grid(width=12), grid="nav", level="a/b 2")
@@ -156,7 +156,7 @@ def test_whole_site_over_zenoh_is_the_bytes_of_http(api: Api, session: zenoh.Ses
     assert json.loads(bytes(reply.err.payload))["status"] == 404
 
 
-def test_what_is_too_large_for_zenoh_is_not_even_read(
+def test_file_too_large_for_zenoh_is_not_read(
     api: Api, session: zenoh.Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     api.post("environments", {"name": "large"})
@@ -175,7 +175,7 @@ def test_what_is_too_large_for_zenoh_is_not_even_read(
     assert "1099511627776 bytes, more than is sent over Zenoh (67108864): fetch it over HTTP" in problem["detail"]
 
 
-def test_damaged_data_is_an_alarm_over_zenoh_too(
+def test_damaged_data_is_logged_as_critical_for_zenoh_queries(
     api: Api, session: zenoh.Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     api.post("environments", {"name": "rotten"})
@@ -192,7 +192,7 @@ def test_damaged_data_is_an_alarm_over_zenoh_too(
     assert "a secret" not in caplog.text
 
 
-def test_keys_with_wildcards_are_nobodys_status(
+def test_status_keys_with_wildcards_are_ignored(
     api: Api, session: zenoh.Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     api.post("environments", {"name": "wild"})
@@ -211,6 +211,6 @@ def test_keys_with_wildcards_are_nobodys_status(
     assert not [r for r in caplog.records if r.levelname == "ERROR"]
 
 
-def test_the_server_is_alive(api: Api, session: zenoh.Session) -> None:
+def test_server_has_liveliness_token(api: Api, session: zenoh.Session) -> None:
     tokens = [str(r.ok.key_expr) for r in session.liveliness().get("fleetmap/server", timeout=5.0) if r.ok]
     assert tokens == ["fleetmap/server"]

@@ -29,7 +29,7 @@ def network(k: int) -> bytes:
     return samples.tmap2({"a": (0.0, float(k)), "b": (5.0, 1.0)}, (("a", "b"),))
 
 
-def test_a_commit_is_told(api: Api, session: zenoh.Session) -> None:
+def test_commit_publishes_event(api: Api, session: zenoh.Session) -> None:
     ear = Listener(session, "fleetmap/*/events")
     api.post("environments", {"name": "farm"})
     version = api.upload("farm", {"datum.yaml": samples.DATUM}, message="measured").json()
@@ -61,7 +61,7 @@ def test_late_joiners_get_history(api: Api, session: zenoh.Session) -> None:
     assert first.sequences() == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_killed_router_comes_back_and_nothing_is_lost(api: Api, session: zenoh.Session, tmp_path: Path) -> None:
+def test_killed_router_is_restarted_without_loss(api: Api, session: zenoh.Session, tmp_path: Path) -> None:
     ear = Listener(session, "fleetmap/rough/events")
     api.post("environments", {"name": "rough"})
     ear.wait(lambda e: e.sequences() == [1])
@@ -82,7 +82,7 @@ def router_of(api: Api) -> int:
     return int(process.stdout.split()[-1])
 
 
-def test_a_restarted_server_tells_what_it_had_not_told(tmp_path: Path, port: int) -> None:
+def test_restarted_server_publishes_pending_events(tmp_path: Path, port: int) -> None:
     with running(settings_for(tmp_path, zenoh_mode="off")) as api:
         api.post("environments", {"name": "quiet"})
         assert api.get("/readyz").json()["events"] == {"state": "off"}
@@ -100,7 +100,7 @@ def test_a_restarted_server_tells_what_it_had_not_told(tmp_path: Path, port: int
                 session.close()  # type: ignore[no-untyped-call]
 
 
-def test_a_taken_port_is_told_and_maps_are_served(tmp_path: Path) -> None:
+def test_server_reports_taken_router_port_and_serves_maps(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -114,7 +114,7 @@ def test_a_taken_port_is_told_and_maps_are_served(tmp_path: Path) -> None:
             assert api.upload("deaf", {"n.tmap2.yaml": samples.tmap2()}).status_code == 201
 
 
-def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_router_start_backs_off_when_port_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each try is a process."""
     started: list[Router] = []
 
@@ -137,7 +137,7 @@ def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch)
         bus.close()
 
 
-def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_relay_uses_external_router(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Mode client: the router is somebody else's, and comes later than the server."""
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
@@ -153,11 +153,11 @@ def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixt
                 Listener(session, "fleetmap/patient/events").wait(lambda e: e.sequences() == [1])
             finally:
                 session.close()  # type: ignore[no-untyped-call]
-            assert f"events go out over Zenoh at {endpoint}" in caplog.text
+            assert f"event relay: connected to Zenoh at {endpoint}" in caplog.text
         finally:
             router.close()
         bus_state = eventually(lambda: (e := api.get("/readyz").json()["events"])["state"] == "down" and e, 30)
-        assert bus_state["detail"] == f"the router at {endpoint} is gone: it is looked for"
+        assert bus_state["detail"] == f"lost the connection to the router at {endpoint}: reconnecting"
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_statuses_are_checked(payload: bytes, word: str) -> None:
         RobotStatus.from_json(payload)
 
 
-def test_a_status_comes_through() -> None:
+def test_status_over_zenoh_is_stored() -> None:
     status = {"channel": "production", "version": 3, "root": "0" * 64, "state": "active", "sequence": 7}
     assert RobotStatus.from_json(json.dumps(status)).as_dict() == status
     more = status | {"state": "failed", "detail": "no room", "holds": {"version": 2, "root": "a" * 64}}
@@ -200,7 +200,7 @@ class Deaf:
         """Nothing is open."""
 
 
-def test_a_database_that_is_away_is_told_once(
+def test_database_outage_is_logged_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.01)
@@ -222,15 +222,13 @@ def test_a_database_that_is_away_is_told_once(
     try:
         eventually(lambda: relay_state(tmp_path, "router") == {"state": "connected"})
         assert bus.put == [1]
-        assert caplog.text.count("NO EVENTS GO OUT: the database is away") == 1
+        assert caplog.text.count("event relay: down: the database is away") == 1
     finally:
         relay.close()
         store.close()
 
 
-def test_what_a_router_logs_does_not_stop_it(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_router_logs_do_not_block_it(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     """Zenoh logs to standard output, which is a pipe that is read once."""
     monkeypatch.setenv("RUST_LOG", "zenoh=trace")
     port = free_port()
@@ -251,7 +249,7 @@ def test_what_a_router_logs_does_not_stop_it(
     assert len(capfd.readouterr().err) > 2**16, "more than a pipe holds"
 
 
-def test_who_connects_and_says_nothing_keeps_nobody_out() -> None:
+def test_idle_connections_do_not_block_others() -> None:
     port = free_port()
     router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}")))
     assert router.problem is None
@@ -264,7 +262,7 @@ def test_who_connects_and_says_nothing_keeps_nobody_out() -> None:
             assert list(session.info.routers_zid())
 
 
-def test_a_huge_message_is_dropped_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_router_drops_only_huge_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.events.bus.MESSAGE_BYTES", 2**20)
     port = free_port()
     router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}", max_reply_bytes=2**19)))
@@ -282,7 +280,7 @@ def test_a_huge_message_is_dropped_and_nothing_else(monkeypatch: pytest.MonkeyPa
         subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
-def test_router_that_dies_while_it_starts_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_router_dying_at_start_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[Router] = []
 
     def failing_once(configuration: str) -> Router:

@@ -106,7 +106,7 @@ def text_of(data: bytes) -> str:
 SMALL = cdr.Grid(3, 2, 0.5, (-1.0, 2.0, math.pi / 2), bytes([0, 100, 255, 50, 0, 0]))
 
 
-def test_a_grid_is_these_bytes() -> None:
+def test_occupancy_grid_encodes_to_expected_bytes() -> None:
     """Worked out by hand from the message's definition."""
     sine, cosine = math.sin(math.pi / 4), math.cos(math.pi / 4)
     expected = (
@@ -120,7 +120,7 @@ def test_a_grid_is_these_bytes() -> None:
     assert cdr.occupancy_grid(SMALL, WHEN, "map") == expected
 
 
-def test_an_update_and_a_text_are_these_bytes() -> None:
+def test_grid_update_and_string_encode_to_expected_bytes() -> None:
     message = cdr.occupancy_grid_update(1, 0, 2, 1, bytes([100, 255]), WHEN, "odom")
     assert message == (
         bytes.fromhex("00010000") + struct.pack("<iI", 1777608000, 250_000_000) + bytes.fromhex("05000000") + b"odom\0"
@@ -129,7 +129,7 @@ def test_an_update_and_a_text_are_these_bytes() -> None:
     assert cdr.string("grün") == bytes.fromhex("00010000 06000000") + "grün".encode() + b"\0"
 
 
-def test_rosbags_reads_the_same_and_hashes_the_types_so() -> None:
+def test_messages_and_type_hashes_match_rosbags() -> None:
     typesys = pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.LATEST)
     text = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data\n"
@@ -177,11 +177,11 @@ def test_keys_and_tokens() -> None:
     [("farm", "farm"), ("north-field", "north_field"), ("3rd--floor-", "level_3rd_floor"), ("_x", "level_x"),
      ("Erdgeschoß", "Erdgescho"), ("---", "level")],
 )  # fmt: skip
-def test_names_that_ros_takes(name: str, token: str) -> None:
+def test_topic_names_are_valid_for_ros(name: str, token: str) -> None:
     assert ros_names.token(name, "level") == token
 
 
-def test_which_environments() -> None:
+def test_environment_selectors_are_parsed() -> None:
     chosen = ros_names.parse_selectors(" farm=/, hall=/site/hall ,north-*,")
     assert [ros_names.namespace_of(n, chosen) for n in ("farm", "hall", "north-1", "south")] == [
         "/", "/site/hall", "/north_1", None,
@@ -271,7 +271,7 @@ def api(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Api]:
         yield api
 
 
-def test_a_map_its_changes_and_its_network(api: Api, session: zenoh.Session) -> None:
+def test_ros2_publishes_map_updates_and_network(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "farm"})
     early = Heard(session, f"5/map/{GRID}")
     version = api.upload("farm", picture((2, 3))).json()
@@ -361,7 +361,7 @@ def test_each_level_has_its_topic_and_the_lowest_needs_no_name(api: Api, session
     eventually(lambda: ground.samples and grid_of(bytes(ground.samples[-1].payload))["cells"][2, 2] == 100)
 
 
-def test_the_channel_says_what_goes_out(api: Api, session: zenoh.Session) -> None:
+def test_ros2_publishes_version_of_channel(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "west-hall"})
     heard = Heard(session, f"5/west_hall/map/{GRID}")
     api.upload("west-hall", picture((1, 1)))
@@ -391,14 +391,14 @@ def test_another_frame_is_a_new_map_and_no_update(api: Api, session: zenoh.Sessi
     assert not changes.samples
 
 
-def test_what_was_not_chosen_or_not_stored_stays_here(
+def test_ros2_publishes_only_selected_and_stored_content(
     api: Api, session: zenoh.Session, caplog: pytest.LogCaptureFixture
 ) -> None:
     api.post("environments", {"name": "secret"})
     api.upload("secret", picture())
     api.post("environments", {"name": "quiet"})
     api.upload("quiet", picture(width=250, height=170))  # more bytes than go over Zenoh
-    eventually(lambda: "/quiet/map is left out: 42500 bytes" in caplog.text)
+    eventually(lambda: "skipped /quiet/map: 42500 bytes" in caplog.text)
     api.upload("quiet", {"network.tmap2.yaml": samples.tmap2()})
     Heard(session, f"5/quiet/topological_map_2/{STRING}").wait()
     topics = {t.split("/")[9] for t in tokens(session, "@ros2_lv/5/*/*/*/MP/**")}
@@ -407,7 +407,7 @@ def test_what_was_not_chosen_or_not_stored_stays_here(
     assert "topological_map_2" not in {t.rpartition("%")[2] for t in topics if t.startswith("%tower")}, "no derived one"
 
 
-def test_a_killed_router_takes_nothing_away(api: Api, session: zenoh.Session, port: int) -> None:
+def test_ros2_topics_survive_killed_router(api: Api, session: zenoh.Session, port: int) -> None:
     api.post("environments", {"name": "rough-hall"})
     api.upload("rough-hall", picture((1, 1)))
     early = Heard(session, f"5/rough_hall/map/{GRID}")
@@ -424,7 +424,7 @@ def test_a_killed_router_takes_nothing_away(api: Api, session: zenoh.Session, po
         assert grid_of(late.wait(1, 30))["cells"][2, 2] == 100
 
 
-def test_what_can_be_derived_goes_out_where_wanted(tmp_path: Path) -> None:
+def test_ros2_publishes_derived_content_when_enabled(tmp_path: Path) -> None:
     """Of a network alone: a grid that is free along it."""
     port = free_port()
     with running(
@@ -462,7 +462,7 @@ def version(name: str, root: str) -> Any:
     return SimpleNamespace(environment=name, number=1, root=root, time=WHEN, closures=None)
 
 
-def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
+def test_ros2_keeps_last_map_and_retries_when_content_is_unavailable(
     router: tuple[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.2)
@@ -501,7 +501,7 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
         publishing.close()
 
 
-def test_a_mistake_with_one_environment_is_not_the_others(
+def test_ros2_error_of_one_environment_does_not_affect_others(
     router: tuple[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.1)
@@ -526,15 +526,15 @@ def test_a_mistake_with_one_environment_is_not_the_others(
         with zenoh.open(client_config(port)) as session:
             heard = Heard(session, "good/map")
             heard.wait()
-            eventually(lambda: caplog.text.count("ROS 2: bad stays as it is") > 3)
+            eventually(lambda: caplog.text.count("ROS 2: could not update bad") > 3)
             assert ros2_state(tmp_path) == {"state": "connected", "topics": 2}
             assert len(heard.samples) == 1, "the topics of the others stay as they are"
-            assert "stumbled" not in caplog.text
+            assert "unexpected error" not in caplog.text
     finally:
         publishing.close()
 
 
-def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ros2_reports_missing_router_and_connects_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", 0.3)
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
@@ -590,8 +590,8 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
         with zenoh.open(client_config(port)) as session:
             assert grid_of(Heard(session, "a_b/map").wait())["resolution"] == 0.5
             assert grid_of(Heard(session, "a_b/L_1/map").wait())["resolution"] == 0.5
-            eventually(lambda: "/a_b/map of a_b is left out: a-b has that topic" in caplog.text)
-            assert "a level of a-b is left out: another one has its topic /a_b/L_1/map" in caplog.text
+            eventually(lambda: "skipped /a_b/map of a_b: a-b has the same topic" in caplog.text)
+            assert "skipped a level of a-b: another level has the same topic /a_b/L_1/map" in caplog.text
             other.start()  # a second process of the same data folder waits for the first one's end
             time.sleep(0.3)
             assert len(tokens(session, "@/*/@ros2_lv/MP/a_b§map/**")) == 1

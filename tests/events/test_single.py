@@ -38,7 +38,7 @@ class Rounds(LeaderThread):
         self.shut += 1
 
 
-def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_state_of_killed_process_is_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "app.events.leader")
     (tmp_path / "some.json").write_text('{"state": "connected"}')
     slow = threading.Event()
@@ -58,7 +58,7 @@ def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pyte
     assert one.shut == 1
 
 
-def test_the_next_one_goes_on_where_one_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_next_process_takes_over_after_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.events.leader.POLL_SECONDS", 0.05)
     hold = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.flock(f, fcntl.LOCK_EX); print('held', flush=True)"
     other = subprocess.Popen(
@@ -88,7 +88,7 @@ def test_the_next_one_goes_on_where_one_is_killed(tmp_path: Path, monkeypatch: p
         second.close()
 
 
-def test_trouble_is_told_once_and_ends(
+def test_leader_logs_outage_and_recovery_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -106,14 +106,14 @@ def test_trouble_is_told_once_and_ends(
     try:
         eventually(lambda: one.rounds)
         assert caplog.text.count("IT STOPPED: the database is away") == 1
-        assert caplog.text.count("fleetmap-some stumbled") == 1
+        assert caplog.text.count("fleetmap-some: unexpected error") == 1
         assert one.stumbles == 1
         eventually(lambda: read_state(tmp_path, "some") == {"state": "connected"})
     finally:
         one.close()
 
 
-def test_a_full_disk_stops_nothing(
+def test_leader_keeps_running_when_state_file_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: object, **__: object) -> int:
@@ -124,6 +124,6 @@ def test_a_full_disk_stops_nothing(
     one.start()
     try:
         eventually(lambda: one.rounds > 3)
-        assert "some.json cannot be written: No space left on device" in caplog.text
+        assert "could not write some.json: No space left on device" in caplog.text
     finally:
         one.close()

@@ -154,7 +154,7 @@ def test_rollout_without_robots_does_not_move(fleet: Fleet):
     now = fleet.channel()
     assert now.planned is None
     assert now.rollout is not None
-    assert now.rollout.detail == "only 0 of 0 robots are ready: the channel stays"
+    assert now.rollout.detail == "only 0 of 0 robots are ready; the channel does not move"
     assert fleet.tick(101) == (1, "expired")
     assert [e["type"] for e in fleet.events()] == ["channel.planned", "channel.cancelled"]
 

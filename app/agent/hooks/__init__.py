@@ -1,4 +1,4 @@
-"""Commands that are run after a switch: an operator's own, and the ready-made ones beside this file."""
+"""Run hooks: commands of the operator, and the bundled scripts in this folder."""
 
 from __future__ import annotations
 
@@ -16,20 +16,25 @@ from typing import IO
 FOLDER = Path(__file__).resolve().parent
 HOOK_SECONDS = 300.0
 STOP_POLL_SECONDS = 0.5
-"""Between two looks whether the agent is to end."""
+"""Interval between two checks whether the agent stops."""
 
 MAX_OUTPUT_CHARACTERS = 1500
-"""Characters of what a failing hook printed that are told."""
+"""Maximum length of a failed hook's output in a report, taken from its end."""
 
 
 def bundled_hooks() -> dict[str, Path]:
-    """Name -> script."""
+    """Return name -> path of the bundled scripts."""
     return {path.stem: path for path in sorted(FOLDER.glob("*.sh"))}
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a command ended. status: None if it was killed. text: how it ended and what it printed last."""
+    """Outcome of a command.
+
+    Attributes:
+        status: exit status; None if the command was killed.
+        text: how it ended, with the end of its output.
+    """
 
     status: int | None
     text: str
@@ -38,7 +43,7 @@ class Outcome:
 def run(
     command: str, variables: Mapping[str, str], seconds: float = HOOK_SECONDS, stopping: threading.Event | None = None
 ) -> str | None:
-    """Run a hook to its end: None, or what went wrong. A name of a ready-made one runs that; all else is shell."""
+    """Run a hook (name of a bundled one, or a shell command) to its end. Return None, or the problem."""
     outcome = execute(command, variables, seconds, stopping)
     return None if outcome.status == 0 else f"--on-change {command} {outcome.text}"
 
@@ -46,10 +51,10 @@ def run(
 def execute(
     command: str, variables: Mapping[str, str], seconds: float = HOOK_SECONDS, stopping: threading.Event | None = None
 ) -> Outcome:
-    """Run a command, or the ready-made hook of this name, to its end.
+    """Run a shell command, or the bundled hook of this name, to its end.
 
-    It is ended, with all that it started, after so many seconds, or where ``stopping`` is set meanwhile. What it leaves
-    running in the background is left alone, and read from as long as it prints.
+    After ``seconds``, or if ``stopping`` is set, its whole process group is killed. Background processes that a
+    finished command leaves behind keep running, and their output is read.
     """
     script = bundled_hooks().get(command)
     arguments = ["/bin/sh", str(script)] if script else ["/bin/sh", "-c", command]
@@ -63,7 +68,7 @@ def execute(
             start_new_session=True,
         )
     except OSError as error:
-        return Outcome(None, f"cannot be started: {error.strerror}")
+        return Outcome(None, f"could not be started: {error.strerror}")
     output = bytearray()
     reader = threading.Thread(target=_read, args=(process.stdout, output), name="fleetmap-hook", daemon=True)
     reader.start()
@@ -74,21 +79,21 @@ def execute(
             status = process.wait(min(STOP_POLL_SECONDS, max(0.0, end - time.monotonic())))
     if status is None:
         with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)  # with all that it started
+            os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     if status == 0:
-        return Outcome(0, "ended with 0")
+        return Outcome(0, "exited with status 0")
     reader.join(STOP_POLL_SECONDS)
     text = " ".join(bytes(output[-MAX_OUTPUT_CHARACTERS:]).decode(errors="replace").split())
     if status is not None:
-        how = f"ended with {status}"
+        how = f"exited with status {status}"
     else:
-        how = f"took more than {seconds:g} seconds" if time.monotonic() >= end else "was ended with the agent"
+        how = f"exceeded {seconds:g} seconds" if time.monotonic() >= end else "was stopped with the agent"
     return Outcome(status, f"{how}: {text}" if text else how)
 
 
 def _read(stream: IO[bytes], output: bytearray) -> None:
-    """Keep the end of what is printed: a hook that prints without end fills neither disk nor memory."""
+    """Keep only the end of the output, so that endless output fills neither disk nor memory."""
     with stream:
         while chunk := os.read(stream.fileno(), 1 << 16):
             output += chunk

@@ -1,4 +1,4 @@
 #!/bin/sh
-# topological_navigation after a new map: switch_topological_map of its map manager, where the network changed; then a
-# check that the manager publishes this very network. ../ros/fleetmap_ros/loading.py says which variables it takes.
+# Load a new map into topological_navigation: call switch_topological_map of its map manager if the network has changed,
+# then check that the manager publishes this network. Variables: see ../ros/fleetmap_ros/loading.py.
 exec "${FLEETMAP_PYTHON:-python3}" "$(dirname "$0")/../ros/fleetmap_ros/loading.py" topological

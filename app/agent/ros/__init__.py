@@ -1,7 +1,7 @@
-"""The ROS 2 package ``fleetmap_ros``, and how it gets into a workspace.
+"""Copy the ROS 2 package ``fleetmap_ros`` into a workspace.
 
-The package is complete in this folder (``package.xml``, ``setup.py`` …). It imports nothing of this distribution: it
-starts ``fleetmap agent`` as a process, so that the agent may be installed elsewhere (pipx) than rclpy is.
+This folder is the complete package (``package.xml``, ``setup.py`` …). It imports nothing of this distribution and
+starts ``fleetmap agent`` as a process, so that the agent may be installed apart from rclpy (for example with pipx).
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ FILES = ("package.xml", "setup.py", "setup.cfg", "resource", "launch", "config",
 
 
 def copy_package(workspace: Path) -> Path:
-    """Copy the package to ``workspace/fleetmap_ros``, in place of an older copy of it: its folder.
+    """Copy the package to ``workspace/fleetmap_ros``, replacing an older copy; return that folder.
 
-    Raises Conflict if something else is there.
+    Raises Conflict if the folder is not a copy of the package.
     """
     target = workspace / "fleetmap_ros"
     if target.exists():
@@ -26,7 +26,7 @@ def copy_package(workspace: Path) -> Path:
             not (target / "package.xml").is_file()
             or "<name>fleetmap_ros</name>" not in (target / "package.xml").read_text()
         ):
-            raise Conflict(f"{target} exists and is no copy of fleetmap_ros: name another folder")
+            raise Conflict(f"{target} exists and is not a copy of fleetmap_ros: choose another folder")
         shutil.rmtree(target)
     target.mkdir(parents=True)
     ignored = shutil.ignore_patterns("__pycache__", "*.pyc")

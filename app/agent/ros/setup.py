@@ -18,7 +18,7 @@ setup(
     zip_safe=False,
     maintainer="Fleet Map Server",
     maintainer_email="maintainers@fleet-map-server.invalid",
-    description="Keeps a robot's maps at a Fleet Map Server's channel and loads them into Nav2.",
+    description="Keeps a robot's maps up to date with a channel of a Fleet Map Server and loads them into Nav2.",
     license="Apache-2.0",
     entry_points={"console_scripts": ["fleetmap_agent = fleetmap_ros.node:main"]},
 )

@@ -97,7 +97,7 @@ def switch_level(node: Any) -> Any:
     return node.offered["~/switch_level"](None, response)
 
 
-def test_the_agent_runs_while_the_node_is_active(graph: Graph, folder: Path) -> None:
+def test_agent_runs_while_node_is_active(graph: Graph, folder: Path) -> None:
     graph.services["/map_server/load_map"] = load_map()
     token = str(folder.parent / "token")
     formats = ["occupancy_grid?grid=map", "tmap2"]
@@ -124,7 +124,7 @@ def test_the_agent_runs_while_the_node_is_active(graph: Graph, folder: Path) -> 
     assert node.entities == []
 
 
-def test_a_failure_to_load_fails_the_hook(graph: Graph, folder: Path) -> None:
+def test_hook_fails_when_loading_fails(graph: Graph, folder: Path) -> None:
     graph.services["/map_server/load_map"] = load_map(2)
     node = configured(graph, folder)
     node.on_activate(None)
@@ -137,11 +137,11 @@ def test_a_failure_to_load_fails_the_hook(graph: Graph, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("service", "reason"),
     [
-        (lambda request: None, "gave no answer within 0.2 seconds"),
+        (lambda request: None, "no response from /map_server/load_map within 0.2 seconds"),
         (lambda request: 1 / 0, "/map_server/load_map failed: division by zero"),
     ],
 )
-def test_a_service_that_hangs_or_breaks(graph: Graph, folder: Path, service: Any, reason: str) -> None:
+def test_node_reports_hanging_or_failing_service(graph: Graph, folder: Path, service: Any, reason: str) -> None:
     graph.services["/map_server/load_map"] = service
     node = configured(graph, folder, call_seconds=0.2)
     changed = {"FLEETMAP_CURRENT": str(folder / "current"), "FLEETMAP_CHANGED": "occupancy_grid/map.yaml"}
@@ -165,7 +165,7 @@ def test_grids_are_published_from_the_start(graph: Graph, folder: Path) -> None:
     node.stop()
 
 
-def test_the_level_is_switched(graph: Graph, folder: Path) -> None:
+def test_switch_level_service_loads_level(graph: Graph, folder: Path) -> None:
     graph.services["/map_server/load_map"] = load_map()
     node = configured(graph, folder, publish_map=True)
     assert switch_level(node).message == "the node is not active"
@@ -183,7 +183,7 @@ def test_the_level_is_switched(graph: Graph, folder: Path) -> None:
     node.stop()
 
 
-def test_an_agent_that_ends_is_started_again(graph: Graph, folder: Path) -> None:
+def test_node_restarts_stopped_agent(graph: Graph, folder: Path) -> None:
     graph.services["/map_server/load_map"] = load_map()
     (folder.parent / "calls.end").touch()
     node = configured(graph, folder)
@@ -191,7 +191,7 @@ def test_an_agent_that_ends_is_started_again(graph: Graph, folder: Path) -> None
     calls = folder.parent / "calls"
     calls.touch()  # the first process may not have written yet
     eventually(lambda: len(calls.read_text().splitlines()) == 2)
-    assert any("the agent ended with 3" in text for _, text in graph.log)
+    assert any("the agent exited with status 3" in text for _, text in graph.log)
     eventually(lambda: len(graph.latched["/fleetmap_agent/status"]) == 2)
     node._agent._process.send_signal(signal.SIGKILL)
     eventually(lambda: len(calls.read_text().splitlines()) == 3)
@@ -202,8 +202,8 @@ def test_an_agent_that_ends_is_started_again(graph: Graph, folder: Path) -> None
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
-        ({"environment": " "}, "the parameter environment is empty"),
-        ({"formats": [""]}, "the parameter formats is empty"),
+        ({"environment": " "}, "parameter environment is empty"),
+        ({"formats": [""]}, "parameter formats is empty"),
         ({"call_seconds": 0.0}, "call_seconds must be above 0"),
     ],
 )
@@ -220,11 +220,13 @@ def test_parameters_are_checked(graph: Graph, folder: Path, parameters: dict[str
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
-        ({"token_file": "/nowhere/token"}, "the token_file /nowhere/token cannot be read"),
-        ({"fleetmap": "/nowhere/fleetmap"}, "/nowhere/fleetmap cannot be run"),
+        ({"token_file": "/nowhere/token"}, "could not read token_file /nowhere/token"),
+        ({"fleetmap": "/nowhere/fleetmap"}, "could not run /nowhere/fleetmap"),
     ],
 )
-def test_an_agent_that_cannot_start(graph: Graph, folder: Path, parameters: dict[str, Any], reason: str) -> None:
+def test_node_reports_agent_that_cannot_start(
+    graph: Graph, folder: Path, parameters: dict[str, Any], reason: str
+) -> None:
     node = configured(graph, folder, **parameters)
     assert node.on_activate(None) == "failure"
     assert reason in graph.log[-1][1]
@@ -232,7 +234,7 @@ def test_an_agent_that_cannot_start(graph: Graph, folder: Path, parameters: dict
     node.stop()
 
 
-def test_the_topological_map_is_read_back(graph: Graph, folder: Path) -> None:
+def test_topological_map_is_verified_after_switch(graph: Graph, folder: Path) -> None:
     pose = "    pose: {position: {x: 0.0, y: 0.0, z: 0.0}}\n"
     text = f"name: farm\nnodes:\n- meta:\n    node: A\n  node:\n    edges: []\n    name: A\n{pose}pointset: p\n"
     (folder / "current" / "tmap2").mkdir()
@@ -249,27 +251,27 @@ def test_the_topological_map_is_read_back(graph: Graph, folder: Path) -> None:
     graph.latched["/topological_map_2"] = [Message(data="{}")]
     ok, lines = node._loader(variables)
     assert not ok
-    assert "reported success, but /topological_map_2 does not hold" in lines[0]
+    assert "reported success, but /topological_map_2 does not publish" in lines[0]
     node.stop()
 
 
-def test_a_ros_without_a_service_says_what_to_install(graph: Graph, folder: Path) -> None:
+def test_missing_service_type_names_package_to_install(graph: Graph, folder: Path) -> None:
     from app.agent.ros.fleetmap_ros.node import service_type
 
-    with pytest.raises(loading.LoadError, match="has no nav2_msgs/srv/SetRouteGraph: install nav2_msgs"):
+    with pytest.raises(loading.LoadError, match="nav2_msgs/srv/SetRouteGraph not found: install nav2_msgs"):
         service_type("nav2_msgs/srv/SetRouteGraph")
     with pytest.raises(loading.LoadError, match="install absent_msgs"):
         service_type("absent_msgs/srv/X")
 
 
-def test_the_hook_without_a_node_fails(tmp_path: Path) -> None:
+def test_ros_hook_fails_without_node(tmp_path: Path) -> None:
     command = [sys.executable, control.HOOK, tmp_path / "none"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    assert "the node fleetmap_agent does not answer" in ended.stdout
+    assert "no response from the node fleetmap_agent" in ended.stdout
 
 
-def test_the_socket_is_closed_to_others_and_goes_with_the_node(tmp_path: Path) -> None:
+def test_hook_socket_is_private_and_removed_with_node(tmp_path: Path) -> None:
     server = control.HookServer(lambda given: (False, [f"refused {given['FLEETMAP_CURRENT']}"]), lambda *_: None)
     assert server.path.parent.stat().st_mode & 0o077 == 0
     command = f"FLEETMAP_CURRENT=here {server.command}"

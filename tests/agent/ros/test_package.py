@@ -24,7 +24,7 @@ def fleetmap(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_it_is_copied_out_and_replaced(tmp_path: Path) -> None:
+def test_ros_package_is_copied_and_replaced(tmp_path: Path) -> None:
     ended = fleetmap("agent", "--ros-package", str(tmp_path / "src"))
     assert ended.returncode == 0, ended.stderr
     target = tmp_path / "src" / "fleetmap_ros"
@@ -39,15 +39,15 @@ def test_it_is_copied_out_and_replaced(tmp_path: Path) -> None:
     assert not (target / "fleetmap_ros" / "old.py").exists()
 
 
-def test_what_is_no_copy_is_left_alone(tmp_path: Path) -> None:
+def test_foreign_folder_is_not_replaced_by_ros_package(tmp_path: Path) -> None:
     (tmp_path / "fleetmap_ros").mkdir()
     (tmp_path / "fleetmap_ros" / "mine").touch()
-    with pytest.raises(Conflict, match="is no copy of fleetmap_ros"):
+    with pytest.raises(Conflict, match="is not a copy of fleetmap_ros"):
         ros.copy_package(tmp_path)
     assert (tmp_path / "fleetmap_ros" / "mine").exists()
 
 
-def test_it_needs_nothing_of_this_distribution(tmp_path: Path) -> None:
+def test_ros_package_imports_nothing_of_this_distribution(tmp_path: Path) -> None:
     package = ros.copy_package(tmp_path) / "fleetmap_ros"
     declared = {e.text for e in ET.parse(package.parent / "package.xml").getroot().iter("exec_depend")}
     for path in (*package.glob("*.py"), *(package.parent / "launch").glob("*.py")):
@@ -79,7 +79,7 @@ def test_files_agree_on_names_and_version() -> None:
         assert (ros.FOLDER / name).is_file()
 
 
-def test_the_sample_parameters_are_parameters() -> None:
+def test_sample_parameters_are_valid() -> None:
     from app.agent.ros.fleetmap_ros.control import Settings
 
     body = yaml.safe_load((ros.FOLDER / "config" / "fleetmap_agent.yaml").read_text())

@@ -1,6 +1,5 @@
-"""A ROS 2 node that keeps a robot's maps at a Fleet Map Server's channel and loads them.
+"""ROS 2 node that keeps a robot's maps up to date with a channel of a Fleet Map Server and loads them.
 
-``node`` the lifecycle node, the only module with rclpy · ``control`` the agent's process, hooks and levels ·
-``loading`` calls of Nav2 and topological_navigation · ``grids`` map.yaml and PGM as cells · ``hook`` what the agent
-runs after a switch.
+Modules: ``node`` lifecycle node, the only module with rclpy · ``control`` agent process, hooks and levels ·
+``loading`` calls of Nav2 and topological_navigation · ``grids`` map.yaml and PGM to cells · ``hook`` the agent's hook.
 """

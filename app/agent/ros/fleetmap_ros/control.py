@@ -1,4 +1,4 @@
-"""What the node does, without rclpy: the agent's process, the agent's hooks, the level, the grids to publish."""
+"""Parts of the node without rclpy: agent process, hooks, level, grids to publish."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from .loading import LoadError, Names, Nav2, Ros, Site, Steps, TopologicalMap, g
 HOOK = Path(__file__).resolve().parent / "hook.py"
 FIRST_PAUSE_SECONDS = 1.0
 MAX_PAUSE_SECONDS = 60.0
-"""Between two starts of an agent that ends by itself."""
+"""Maximum pause before a stopped agent is restarted."""
 
 STOP_SECONDS = 10.0
 LEVEL_SECONDS = 280.0
 MAX_REQUEST_BYTES = 1 << 20
 
 Log = Callable[[str, str], None]
-"""log(severity, text): severity is ``info``, ``warn`` or ``error``."""
+"""Log function: ``log(severity, text)`` with severity ``info``, ``warn`` or ``error``."""
 
 Publish = Callable[[str, grids.Grid], None]
-"""publish(kind, grid): kind is ``map``, ``keepout`` or ``speed``."""
+"""Publish function: ``publish(kind, grid)`` with kind ``map``, ``keepout`` or ``speed``."""
 
 
 class SettingsError(Exception):
-    """A parameter of the node that cannot be used."""
+    """Invalid parameter of the node."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The node's parameters. Texts are empty where nothing is set."""
+    """Parameters of the node. An empty string means unset."""
 
     environment: str = ""
     server: str = "http://127.0.0.1:8000"
@@ -82,28 +82,28 @@ class Settings:
         """Check the parameters. Raises SettingsError."""
         out: dict[str, Any] = {}
         for name, value in values.items():
-            if isinstance(value, (list, tuple)):  # ROS 2 cannot declare an empty array of texts: [''] stands for it
+            if isinstance(value, (list, tuple)):  # ROS 2 cannot declare an empty string array: [''] replaces it
                 out[name] = tuple(str(item).strip() for item in value if str(item).strip())
             else:
                 out[name] = value.strip() if isinstance(value, str) else value
         settings = cls(**out)
         for name in ("environment", "into", "server", "fleetmap"):
             if not getattr(settings, name):
-                raise SettingsError(f"the parameter {name} is empty: set it in the parameter file")
+                raise SettingsError(f"parameter {name} is empty: set it in the parameter file")
         if not settings.formats:
-            raise SettingsError("the parameter formats is empty: name one format or several, such as occupancy_grid")
+            raise SettingsError("parameter formats is empty: list at least one format, such as occupancy_grid")
         if settings.call_seconds <= 0:
-            raise SettingsError(f"the parameter call_seconds must be above 0, got {settings.call_seconds}")
+            raise SettingsError(f"parameter call_seconds must be above 0, got {settings.call_seconds}")
         return settings
 
     @property
     def folder(self) -> Path:
-        """Where the agent keeps the maps."""
+        """Map directory of the agent."""
         return Path(self.into).expanduser().absolute()
 
     @property
     def names(self) -> Names:
-        """Nodes and grids; a mask server that is not the default one has to be there."""
+        """Names of nodes and grids; a mask server other than the default one is required."""
         values = {
             "map_server": self.map_server,
             "keepout_server": self.keepout_server,
@@ -120,7 +120,7 @@ class Settings:
         return Names(**values, required=frozenset(n for n, v in values.items() if v and v != getattr(default, n)))
 
     def command(self, hook: str) -> list[str]:
-        """The agent's command line. hook: its ``--on-change``."""
+        """Return the agent's command line. hook: value of ``--on-change``."""
         out = [
             *shlex.split(self.fleetmap),
             "agent",
@@ -142,36 +142,39 @@ class Settings:
         return [*out, *self.arguments]
 
     def variables(self) -> dict[str, str]:
-        """Environment of the agent: the token never stands in a command line. Raises SettingsError."""
+        """Return the environment variables of the agent, with the token, which must not be in a command line.
+
+        Raises SettingsError if the token file cannot be read.
+        """
         if not self.token_file:
             return dict(os.environ)
         try:
             token = Path(self.token_file).expanduser().read_text().strip()
         except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError(f"the token_file {self.token_file} cannot be read: {error}") from None
+            raise SettingsError(f"could not read token_file {self.token_file}: {error}") from None
         return {**os.environ, "FLEETMAP_TOKEN": token}
 
 
 class Loader:
-    """Loads what the agent has switched to, and hands the grids to be published to ``publish``."""
+    """Loads the maps that the agent has switched to, and passes grids to ``publish``. Thread-safe."""
 
     def __init__(self, ros: Ros, settings: Settings, publish: Publish) -> None:
         self._ros, self._settings, self._publish = ros, settings, publish
         self._lock = threading.Lock()
 
     def __call__(self, variables: Mapping[str, str]) -> tuple[bool, list[str]]:
-        """Load by a hook's variables: whether all steps succeeded, and a line for each."""
+        """Load the map of these hook variables. Return whether all steps succeeded, and a line per step."""
         lines: list[str] = []
         with self._lock:
             try:
                 return self.load(Site.from_environment(variables), lines, variables.get("FLEETMAP_HOOK_STATUS")), lines
             except KeyError as error:
-                return False, [*lines, f"the hook has no variable {error.args[0]}"]
+                return False, [*lines, f"missing hook variable {error.args[0]}"]
             except (LoadError, OSError) as error:
                 return False, [*lines, str(error)]
 
     def load(self, site: Site, lines: list[str], status_file: str | None = None) -> bool:
-        """Run all steps that the parameters ask for."""
+        """Run all steps that the parameters enable. Return whether all succeeded."""
         write = reporter(status_file, lines.append)
         ok = True
         if self._settings.nav2:
@@ -183,7 +186,7 @@ class Loader:
         return ok and not steps.failed
 
     def publish(self, site: Site, steps: Steps) -> None:
-        """Publish the level's grids that the parameters ask for."""
+        """Publish the level's grids that the parameters enable."""
         names = self._settings.names
         kinds: dict[str, str | None] = {"map": None} if self._settings.publish_map else {}
         kinds |= {"keepout": names.keepout_grid, "speed": names.speed_grid} if self._settings.publish_masks else {}
@@ -196,9 +199,9 @@ class Loader:
         path = site.path("occupancy_grid", f"{name}.yaml")
         if not (site.folder / path).is_file():
             if kind == "map":
-                raise LoadError(f"there is no {path} to publish: the parameter grid names another")
-            self._publish(kind, grids.Grid(1, 1, 0.01, (0.0, 0.0, 0.0), b"\0"))  # latched: the old mask would stay
-            return f"no {path}: an empty mask"
+                raise LoadError(f"no grid {path} to publish: set the parameter grid to an existing one")
+            self._publish(kind, grids.Grid(1, 1, 0.01, (0.0, 0.0, 0.0), b"\0"))  # replaces the latched old mask
+            return f"published an empty mask: the map has no {path}"
         try:
             grid = grids.read_map(site.folder / path)
         except grids.GridError as error:
@@ -208,7 +211,7 @@ class Loader:
 
 
 class HookServer:
-    """A Unix socket on which the agent's hook asks for loading. Only this user reaches it."""
+    """Unix socket that receives load requests of the agent's hook. Accessible to this user only."""
 
     def __init__(self, loader: Callable[[Mapping[str, str]], tuple[bool, list[str]]], log: Log) -> None:
         self._loader, self._log = loader, log
@@ -222,11 +225,11 @@ class HookServer:
 
     @property
     def command(self) -> str:
-        """The agent's ``--on-change``."""
+        """Value of the agent's ``--on-change``."""
         return f"{shlex.quote(sys.executable)} {shlex.quote(str(HOOK))} {shlex.quote(str(self.path))}"
 
     def close(self) -> None:
-        """End: a hook that comes later fails, and the agent repeats it."""
+        """Close the socket. A later hook fails, and the agent repeats it."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -253,7 +256,7 @@ class HookServer:
             body = json.loads(data)
             variables = {str(name): str(value) for name, value in body.items()}
         except (ValueError, AttributeError):
-            return False, ["the hook's request cannot be read"]
+            return False, ["invalid request of the hook"]
         ok, lines = self._loader(variables)
         for line in lines:
             self._log("info" if ok else "warn", line)
@@ -262,7 +265,11 @@ class HookServer:
 
 @dataclass
 class AgentProcess:
-    """``fleetmap agent`` as a process that is started again if it ends. event: called with each of its lines."""
+    """Process ``fleetmap agent``, restarted if it stops.
+
+    Attributes:
+        event: called with each JSON line that it prints.
+    """
 
     settings: Settings
     hook: str
@@ -274,14 +281,14 @@ class AgentProcess:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def start(self) -> None:
-        """Start it. Raises SettingsError if the token cannot be read or the command is not there."""
+        """Start the process. Raises SettingsError if the token cannot be read or the command is not found."""
         self._stopping.clear()
         process = self._spawn()
         self._thread = threading.Thread(target=self._watch, args=(process,), name="fleetmap-agent", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End it: by SIGTERM, and after some seconds by SIGKILL."""
+        """Stop the process with SIGTERM, after STOP_SECONDS with SIGKILL."""
         self._stopping.set()
         with self._lock:
             process = self._process
@@ -310,7 +317,7 @@ class AgentProcess:
             )
         except OSError as error:
             raise SettingsError(
-                f"{command[0]} cannot be run ({error.strerror}): install the agent (pipx install fleet-map-server), or "
+                f"could not run {command[0]} ({error.strerror}): install the agent (pipx install fleet-map-server), or "
                 "set the parameter fleetmap"
             ) from None
         with self._lock:
@@ -327,7 +334,7 @@ class AgentProcess:
             status = process.wait()
             if self._stopping.is_set():
                 return
-            self.log("error", f"the agent ended with {status}; it is started again in {pause:g} seconds")
+            self.log("error", f"the agent exited with status {status}; restarting it in {pause:g} seconds")
             if self._stopping.wait(pause):
                 return
             pause = min(MAX_PAUSE_SECONDS, pause * 2)
@@ -340,7 +347,7 @@ class AgentProcess:
                 process.terminate()
 
     def _line(self, line: str) -> bool:
-        """Hand on a line; whether the agent is in good health."""
+        """Log a line of the agent and pass it to ``event``. Return whether it reports no error."""
         try:
             body = json.loads(line)
         except ValueError:
@@ -355,7 +362,7 @@ class AgentProcess:
 
 
 def switch_level(settings: Settings, level: str) -> tuple[bool, str]:
-    """Load another level by ``fleetmap agent-level``, which runs the agent's hooks: whether it worked, and a line."""
+    """Load another level with ``fleetmap agent-level``, which runs the agent's hooks. Return success and a message."""
     if not level:
         return False, "set the parameter level first"
     command = [*shlex.split(settings.fleetmap), "agent-level", str(settings.folder), level]
@@ -366,17 +373,17 @@ def switch_level(settings: Settings, level: str) -> tuple[bool, str]:
     except subprocess.TimeoutExpired:
         return False, f"level {level} was not loaded within {LEVEL_SECONDS:g} seconds"
     except OSError as error:
-        return False, f"{command[0]} cannot be run: {error.strerror}"
+        return False, f"could not run {command[0]}: {error.strerror}"
     text = " ".join((ended.stderr or ended.stdout).split())[-1000:]
     return (
         (True, f"level {level} is loaded")
         if ended.returncode == 0
-        else (False, text or f"it ended with {ended.returncode}")
+        else (False, text or f"{command[0]} exited with status {ended.returncode}")
     )
 
 
 def initial_site(settings: Settings) -> Site | None:
-    """The current map of a robot that starts, on the level that it was on; None if there is none yet."""
+    """Return the installed map and the stored level at start-up; None if there is no map yet."""
     current = settings.folder / "current"
     try:
         folder = current.resolve(strict=True)

@@ -1,4 +1,4 @@
-"""``map.yaml`` and its PGM as the cells of a nav_msgs/msg/OccupancyGrid, by the rules of Nav2's map server.
+"""Convert ``map.yaml`` and its PGM to cells of a nav_msgs/msg/OccupancyGrid, like Nav2's map server.
 
 Source: navigation2, ``nav2_map_server/src/map_io.cpp``.
 """
@@ -14,19 +14,21 @@ MAX_CELLS = 2**31
 MAX_SIDE = 32767
 MODES = ("trinary", "scale", "raw")
 UNKNOWN = 255
-"""The byte of -1, an unknown cell."""
+"""Byte of an unknown cell, -1 as int8."""
 
 
 class GridError(Exception):
-    """A grid that Nav2's map server would not load either."""
+    """Invalid grid, which Nav2's map server would not load either."""
 
 
 @dataclass(frozen=True)
 class Grid:
     """Cells of an occupancy grid.
 
-    cells: a byte each (255 is -1), row by row from the bottom, x fastest. resolution: metres a cell.
-    origin: x, y (metres) and yaw (radians) of the lower left corner.
+    Attributes:
+        resolution: metres per cell.
+        origin: x, y (metres) and yaw (radians) of the lower left corner.
+        cells: one byte per cell (255 is -1), row by row from the bottom, x fastest.
     """
 
     width: int
@@ -37,22 +39,22 @@ class Grid:
 
 
 def read_map(path: Path) -> Grid:
-    """Read a grid. Raises GridError, which names the file."""
+    """Read a grid. Raises GridError with the path."""
     try:
         return _read_map(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise GridError(f"{path} cannot be published: {error}") from None
+        raise GridError(f"could not publish {path}: {error}") from None
 
 
 def _read_map(path: Path) -> Grid:
-    import yaml  # python3-yaml, which ROS 2 needs itself
+    import yaml  # python3-yaml is a dependency of ROS 2
 
     try:
         body: Any = yaml.safe_load(path.read_bytes())
     except yaml.YAMLError as error:
-        raise ValueError(f"no YAML: {error}") from None
+        raise ValueError(f"invalid YAML: {error}") from None
     if not isinstance(body, dict):
-        raise TypeError("no map.yaml")
+        raise TypeError("not a map.yaml")
     mode = str(body.get("mode", "trinary"))
     if mode not in MODES:
         raise ValueError(f"unknown mode {mode[:80]!r}: must be {', '.join(MODES)}")
@@ -70,11 +72,11 @@ def _read_map(path: Path) -> Grid:
 
 
 def cell_values(mode: str, occupied: float, free: float, largest: int, *, negate: bool) -> bytes:
-    """The cell of each of 256 grey values. largest: the value of white."""
+    """Return the cell value of each of 256 grey values. largest: grey value of white."""
     out = bytearray()
     for value in range(256):
         shade = min(value, largest) / largest
-        if mode == "raw":  # the map server reads the pixel as the cell
+        if mode == "raw":  # the pixel is the cell value
             grey = round(shade * 255)
             out.append(grey if grey <= 100 else UNKNOWN)
             continue
@@ -91,33 +93,33 @@ def cell_values(mode: str, occupied: float, free: float, largest: int, *, negate
 
 
 def read_pgm(data: bytes) -> tuple[int, int, int, bytes]:
-    """Read a PGM, binary (P5) or text (P2), of at most 8 bits: width, height, value of white, pixels from the top.
+    """Read a PGM, binary (P5) or text (P2), of at most 8 bits.
 
-    Raises ValueError.
+    Returns width, height, value of white, and pixels row by row from the top. Raises ValueError.
     """
     kind = data[:2]
     if kind not in (b"P5", b"P2"):
-        raise ValueError("the image is no PGM: ask for occupancy_grid?file_type=pgm")
+        raise ValueError("the image is not a PGM: request occupancy_grid?file_type=pgm")
     numbers, start = _header(data)
     width, height, largest = numbers
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_CELLS):
-        raise ValueError(f"the image has {width} × {height} pixels")
+        raise ValueError(f"image size {width} × {height} must be from 1 to {MAX_SIDE} on each side")
     if not 0 < largest <= 255:
-        raise ValueError(f"the image has {largest + 1} grey values; at most 256 are read")
+        raise ValueError(f"the image has {largest + 1} grey values: the maximum is 256")
     if kind == b"P5":
         pixels = data[start : start + width * height]
     else:
         words = data[start:].split()
         if any(not word.isdigit() or int(word) > largest for word in words[: width * height]):
-            raise ValueError("a pixel is no number from 0 to the largest value")
+            raise ValueError(f"pixels must be numbers from 0 to {largest}")
         pixels = bytes(int(word) for word in words[: width * height])
     if len(pixels) != width * height:
-        raise ValueError(f"the image has {len(pixels)} of {width * height} pixels")
+        raise ValueError(f"the image has only {len(pixels)} of {width * height} pixels")
     return width, height, largest, pixels
 
 
 def _header(data: bytes) -> tuple[tuple[int, int, int], int]:
-    """The three numbers after the magic, with comments between them, and where the pixels start."""
+    """Return the three numbers of the header, which may contain comments, and the offset of the pixels."""
     numbers: list[int] = []
     at = 2
     while len(numbers) < 3:
@@ -130,6 +132,6 @@ def _header(data: bytes) -> tuple[tuple[int, int, int], int]:
         while at < len(data) and data[at : at + 1].isdigit():
             at += 1
         if at == start or at - start > 9:
-            raise ValueError("the image's header is cut off or no PGM's")
+            raise ValueError("the PGM header is truncated or invalid")
         numbers.append(int(data[start:at]))
     return (numbers[0], numbers[1], numbers[2]), at + 1

@@ -1,6 +1,6 @@
-"""What the agent runs after a switch: it hands its variables to the node, and ends as the node reports.
+"""Hook of the agent: send the hook variables to the node and exit with its result.
 
-Standard library only: the agent runs it by ``python3 hook.py SOCKET``.
+Standard library only. The agent runs it as ``python3 hook.py SOCKET``.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ MAX_ANSWER_BYTES = 1 << 20
 
 
 def main(path: str, variables: Mapping[str, str]) -> int:
-    """Ask the node to load: the exit status."""
+    """Request the node to load the map. Return the exit status."""
     request = {name: variables[name] for name in (f"FLEETMAP_{one}" for one in NAMES) if name in variables}
     if "FLEETMAP_CHANGED_FILE" in request:
-        request.pop("FLEETMAP_CHANGED", None)  # the file is complete
+        request.pop("FLEETMAP_CHANGED", None)  # may be truncated; the file is complete
     answer = bytearray()
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
@@ -31,9 +31,9 @@ def main(path: str, variables: Mapping[str, str]) -> int:
         body = json.loads(answer)
         ok, lines = body["ok"] is True, [str(line) for line in body["lines"]]
     except OSError as error:
-        ok, lines = False, [f"the node fleetmap_agent does not answer at {path}: {error.strerror or error}"]
+        ok, lines = False, [f"no response from the node fleetmap_agent at {path}: {error.strerror or error}"]
     except (ValueError, KeyError, TypeError):
-        ok, lines = False, ["the node fleetmap_agent ended before it had loaded the map"]
+        ok, lines = False, ["the node fleetmap_agent stopped before it had loaded the map"]
     for line in lines:
         print(line)
     return 0 if ok else 1

@@ -1,12 +1,12 @@
 """Load a robot's new map into Nav2 and topological_navigation.
 
-The agent's hooks ``nav2`` and ``topological`` run this file with the machine's own ``python3`` (standard library only,
-no installed package); the ROS 2 node ``fleetmap_ros`` imports it. What is to be called is decided here, once; how it is
-called is a ``Ros``: the command ``ros2``, or rclpy.
+The agent's hooks ``nav2`` and ``topological`` run this file with the system's ``python3`` (standard library only, no
+installed package); the ROS 2 node ``fleetmap_ros`` imports it. This module decides which services to call; a ``Ros``
+calls them with the command ``ros2`` or rclpy.
 
-Each step is one printed line, and one JSON line ``{"step", "result", "detail"}`` in the file that FLEETMAP_HOOK_STATUS
-names; ``result`` is ``done``, ``skipped`` or ``failed``. What was loaded last is kept in ``hooks/nav2.json`` beside
-``current``: a closed edge is opened again, and a mask that is no longer part of the map gives way to an empty one.
+Each step prints one line and appends one JSON line ``{"step", "result", "detail"}`` to the file FLEETMAP_HOOK_STATUS;
+``result`` is ``done``, ``skipped`` or ``failed``. ``hooks/nav2.json`` beside ``current`` stores what was loaded last,
+so that closed edges are opened again and a mask that the map no longer has is replaced by an empty one.
 
 Sources: navigation2: ``nav2_msgs/srv/{LoadMap,SetRouteGraph,DynamicEdges}.srv``, ``nav2_map_server/src/map_server.cpp``
 and ``nav2_route/src/plugins/edge_cost_functions/dynamic_edges_scorer.cpp``; topological_navigation, ``manager2.py``.
@@ -31,22 +31,22 @@ from typing import IO, Any, Protocol
 
 CALL_SECONDS = 60.0
 WAIT_SECONDS = 5.0
-"""How long a service may take to be discovered."""
+"""Time limit for the discovery of a service."""
 
 TOTAL_SECONDS = 240.0
-"""All calls of a hook together: less than the agent gives a hook, so that it reports what it did."""
+"""Time limit for all calls of a hook: less than the agent's limit for a hook, so that the hook can still report."""
 
 SETTLE_SECONDS = 2.0
-"""A latched topic first delivers its history: its last message is the one before a pause of this length."""
+"""Pause after which a latched topic has delivered its history; the message before it is the newest."""
 
 MAX_OUTPUT_BYTES = 8192
-"""Bytes of an answer kept from its start, and as many from its end: LoadMap's answer contains the map."""
+"""Number of bytes of a response kept from its start and from its end: LoadMap's response contains the map."""
 
 MAX_CHUNKS = 64
-"""Chunks of 64 kB that wait to be read."""
+"""Maximum number of queued chunks of 64 KiB."""
 
 MAX_EDGE_ID = 65535
-"""DynamicEdges has 16 bits for an edge."""
+"""Maximum edge id of DynamicEdges, which has 16 bits."""
 
 GROUND = "ground"
 LOAD_MAP = "nav2_msgs/srv/LoadMap"
@@ -54,28 +54,28 @@ SET_ROUTE_GRAPH = "nav2_msgs/srv/SetRouteGraph"
 DYNAMIC_EDGES = "nav2_msgs/srv/DynamicEdges"
 WRITE_TOPOLOGICAL_MAP = "topological_navigation_msgs/srv/WriteTopologicalMap"
 RESULTS = {1: "the map does not exist", 2: "invalid map data", 3: "invalid map metadata", 255: "undefined failure"}
-"""LoadMap's results other than 0."""
+"""Error results of LoadMap."""
 
 Report = Callable[[str, str, str], None]
-"""report(step, result, detail)."""
+"""Report function: ``report(step, result, detail)``."""
 
 
 class LoadError(Exception):
-    """A step that failed, with what to do about it."""
+    """Failed step; the text says what to do."""
 
 
 class SkippedStep(Exception):
-    """A step that was not needed or not possible, and need not be."""
+    """Skipped step: not needed, or not possible and not required."""
 
 
 class Ros(Protocol):
-    """Calls of services, and one latched topic."""
+    """Service calls, and one latched topic."""
 
     def has_service(self, name: str, type: str) -> bool:
-        """Whether a service is offered; waits some seconds for it to be discovered."""
+        """Whether a service is available; waits some seconds for its discovery."""
 
     def call(self, name: str, type: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Call a service: its answer's ``result`` or ``success``. Raises LoadError."""
+        """Call a service and return ``result`` or ``success`` of its response. Raises LoadError."""
 
     def last_text(self, topic: str) -> str:
         """Read the newest message of a latched std_msgs/msg/String. Raises LoadError."""
@@ -83,9 +83,10 @@ class Ros(Protocol):
 
 @dataclass(frozen=True)
 class Names:
-    """Names of nodes; an empty one is never called.
+    """Names of nodes and grids; a node with an empty name is never called.
 
-    required: those that the operator named: their absence is an error.
+    Attributes:
+        required: names set by the operator; an absent node is an error.
     """
 
     map_server: str = "/map_server"
@@ -102,7 +103,7 @@ class Names:
 
     @classmethod
     def from_environment(cls, variables: Mapping[str, str]) -> Names:
-        """The names of the environment variables that docs/how-to/nav2.md lists."""
+        """Read the names from environment variables, listed in docs/how-to/nav2.md."""
         given = {
             "map_server": variables.get("FLEETMAP_NAV2_MAP_SERVER"),
             "keepout_server": variables.get("FLEETMAP_NAV2_KEEPOUT_SERVER"),
@@ -121,10 +122,13 @@ class Names:
 
 @dataclass
 class Site:
-    """A version's folder, and what of it is to be loaded.
+    """Map to load.
 
-    folder: the version's own, so that a switch in between does not mix two maps. changed: ``format/file`` of what
-    changed; None: all of it. memory: folder for what was loaded last.
+    Attributes:
+        folder: version folder rather than ``current``, so that a switch in between does not mix two maps.
+        memory: folder that stores what was loaded last.
+        changed: changed files as ``format/file``; None: all files.
+        level: level of the robot; empty: the default level.
     """
 
     folder: Path
@@ -135,7 +139,7 @@ class Site:
 
     @classmethod
     def from_environment(cls, variables: Mapping[str, str]) -> Site:
-        """The agent's variables for a hook."""
+        """Read the agent's hook variables. Raises KeyError if one is missing."""
         current = Path(variables["FLEETMAP_CURRENT"])
         listed = Path(variables.get("FLEETMAP_CHANGED_FILE", ""))
         text = listed.read_text() if listed.is_file() else variables.get("FLEETMAP_CHANGED", "")
@@ -146,7 +150,7 @@ class Site:
 
     @property
     def prefix(self) -> str:
-        """Folder of the level's files below a format's: ``L2/``, or nothing for the default level. Raises LoadError."""
+        """Folder of the level's files below a format: ``L2/``; empty for the default level. Raises LoadError."""
         if self._prefix is None:
             self._prefix = self._find_prefix()
         return self._prefix
@@ -157,9 +161,9 @@ class Site:
             return ""
         names, files = self._levels()
         if names and level not in names:
-            raise LoadError(f"the map has no level {level!r}; it has {', '.join(names)}")
+            raise LoadError(f"the map has no level {level!r}: choose one of {', '.join(names)}")
         folders = {name.partition("/")[0] for name in files.get(level, ()) if "/" in name}
-        if len(folders) == 1:  # the folder's name is the level's, percent-encoded where it has to be
+        if len(folders) == 1:  # the folder name is the level name, percent-encoded if needed
             return folders.pop() + "/"
         below = any(name.startswith(f"{level}/") for name in files.get(level, ()))
         if below or any((folder / level).is_dir() for folder in self.folder.iterdir() if folder.is_dir()):
@@ -169,7 +173,7 @@ class Site:
         raise LoadError(f"the map has no files of level {level!r}")
 
     def _levels(self) -> tuple[list[str], dict[str, list[str]]]:
-        """Names of levels, and their files, of ``levels.json``; nothing where the agent wrote none."""
+        """Return level names and files by level of ``levels.json``; empty if there is no such file."""
         try:
             lines = json.loads((self.folder / "levels.json").read_bytes())["levels"]
             files = {
@@ -178,19 +182,19 @@ class Site:
         except FileNotFoundError:
             return [], {}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise LoadError(f"{self.folder / 'levels.json'} cannot be read: {error}") from None
+            raise LoadError(f"could not read {self.folder / 'levels.json'}: {error}") from None
         return list(files), files
 
     def path(self, format: str, name: str) -> str:
-        """A file of the chosen level: ``format/[level/]name``."""
+        """Return the path of a file of the level: ``format/[level/]name``."""
         return f"{format}/{self.prefix}{name}"
 
     def has_changed(self, *paths: str) -> bool:
-        """Whether one of these files changed."""
+        """Whether one of these files has changed."""
         return self.changed is None or any(path in self.changed for path in paths)
 
     def recall(self) -> dict[str, Any]:
-        """What Nav2 was given last; empty if nothing is known."""
+        """Read what was loaded last; empty if unknown."""
         try:
             state = json.loads((self.memory / "nav2.json").read_bytes())
         except (OSError, ValueError):
@@ -198,7 +202,7 @@ class Site:
         return state if isinstance(state, dict) else {}
 
     def remember(self, **members: Any) -> None:
-        """Keep what Nav2 was given."""
+        """Store what was loaded."""
         self.memory.mkdir(exist_ok=True)
         new = self.memory / ".nav2.json.new"
         new.write_text(json.dumps({**self.recall(), **members}) + "\n")
@@ -206,13 +210,13 @@ class Site:
 
 
 class Steps:
-    """Runs steps and reports each: one that fails does not keep the others away."""
+    """Runs steps and reports each; a failed step does not prevent the next ones."""
 
     def __init__(self, report: Report) -> None:
         self._report, self.failed = report, False
 
     def run(self, name: str, step: Callable[[], str | None]) -> bool:
-        """Run a step that returns what it did, None if there was nothing to do. Whether it did not fail."""
+        """Run a step, which returns a description or None if nothing was to do. Return False if it failed."""
         try:
             detail = step()
         except SkippedStep as skipped:
@@ -237,7 +241,7 @@ class Nav2:
         self._ros, self._site, self._names = ros, site, names
 
     def load(self, report: Report) -> bool:
-        """Load what changed; report each step. Whether all succeeded."""
+        """Load changed files and report each step. Return whether all succeeded."""
         steps = Steps(report)
         if not steps.run("level", self._level):
             return False
@@ -264,15 +268,15 @@ class Nav2:
             self._site.remember(map=path)
             return f"{server} loaded {path}"
         if self._is_on_another_level("map", path):
-            raise LoadError(f"level {self._site.level} has no grid; Nav2 keeps that of another level")
+            raise LoadError(f"level {self._site.level} has no grid; Nav2 keeps the one of another level")
         if self._changed(path):
-            raise LoadError(f"the grid {name or 'map'} is no longer part of the map; Nav2 keeps the one before")
+            raise LoadError(f"the map no longer has the grid {name or 'map'}; Nav2 keeps the previous one")
         if self._names.grid and grids:
-            raise LoadError(f"there is no grid {name} here, only {', '.join(grids)}: see FLEETMAP_NAV2_GRID")
+            raise LoadError(f"unknown grid {name}: set FLEETMAP_NAV2_GRID to one of {', '.join(grids)}")
         return None
 
     def _mask(self, kind: str) -> str | None:
-        """Load a filter mask; an empty one if the map has none any more."""
+        """Load a filter mask; load an empty one if the map no longer has it."""
         server, name = getattr(self._names, f"{kind}_server"), getattr(self._names, f"{kind}_grid")
         if not server:
             return None
@@ -282,7 +286,7 @@ class Nav2:
             if not self._is_due(kind, path):
                 return None
             if f"{kind}_server" not in self._names.required and not self._ros.has_service(service, LOAD_MAP):
-                raise SkippedStep(f"there is no {service}: Nav2 does not use the mask {path}")
+                raise SkippedStep(f"service {service} not found; Nav2 does not use the mask {path}")
             self._load_map(server, f"{kind}_server", path)
             self._site.remember(**{kind: path})
             return f"{server} loaded {path}"
@@ -290,10 +294,10 @@ class Nav2:
             return None
         if f"{kind}_server" not in self._names.required and not self._ros.has_service(service, LOAD_MAP):
             self._site.remember(**{kind: None})
-            raise SkippedStep(f"there is no {service}, and the map has no mask {name} any more")
+            raise SkippedStep(f"service {service} not found, and the map no longer has the mask {name}")
         self._load_map(server, f"{kind}_server", str(self._empty_mask()))
         self._site.remember(**{kind: None})
-        return f"{server} loaded an empty mask: the map has no {path} any more"
+        return f"{server} loaded an empty mask: the map no longer has {path}"
 
     def _route(self) -> str | None:
         server = self._names.route_server
@@ -303,9 +307,9 @@ class Nav2:
         file = self._site.folder / path
         if not file.is_file():
             if self._is_on_another_level("route", path):
-                raise LoadError(f"level {self._site.level} has no route graph; Nav2 keeps that of another level")
+                raise LoadError(f"level {self._site.level} has no route graph; Nav2 keeps the one of another level")
             if self._changed(path):
-                raise LoadError("the route graph is no longer part of the map; Nav2 keeps the one before")
+                raise LoadError("the map no longer has a route graph; Nav2 keeps the previous one")
             return None
         saved_state = self._site.recall()
         blocked, remembered = blocked_edges(file), set(saved_state.get("closed_edges") or ())
@@ -313,7 +317,7 @@ class Nav2:
         if not is_due and blocked == remembered:
             return None
         done = []
-        if blocked and (is_due or blocked - remembered):  # first: no route over a closed edge is found in between
+        if blocked and (is_due or blocked - remembered):  # before the graph, so that no route uses a closed edge
             self._adjust(blocked, set())
             self._site.remember(closed_edges=sorted(blocked | remembered))
             done.append(f"{len(blocked)} edges closed")
@@ -322,7 +326,7 @@ class Nav2:
                 f"{server}/set_route_graph", SET_ROUTE_GRAPH, {"graph_filepath": str(file)}, "route_server"
             )
             if answer.get("success") is not True:
-                raise LoadError(f"{server}/set_route_graph refused {path}: see the log of the route server")
+                raise LoadError(f"{server}/set_route_graph rejected {path}: check the log of the route server")
             self._site.remember(route=path)
             done.append(f"{server} loaded {path}")
         if opened := remembered - blocked:
@@ -332,33 +336,33 @@ class Nav2:
         return ", ".join(done)
 
     def _adjust(self, closed: set[int], opened: set[int]) -> None:
-        """Close and open edges by DynamicEdges. Raises LoadError."""
+        """Close and open edges with DynamicEdges. Raises LoadError."""
         service = self._names.dynamic_edges or f"{self._names.route_server}/DynamicEdgesScorer/adjust_edges"
         if beyond := [edge for edge in closed | opened if not 0 <= edge <= MAX_EDGE_ID]:
-            raise LoadError(f"DynamicEdges cannot close edge {beyond[0]}: ids above {MAX_EDGE_ID} do not fit")
+            raise LoadError(f"DynamicEdges cannot close edge {beyond[0]}: ids must be at most {MAX_EDGE_ID}")
         if not self._ros.has_service(service, DYNAMIC_EDGES):
             if not closed:
-                return  # the route server runs without the scorer: it knows of no closed edge
+                return  # without the scorer the route server has no closed edges
             raise LoadError(
-                f"there is no {service}, and the graph has {len(closed)} closed edges: add DynamicEdgesScorer to the "
-                "route server's edge_cost_functions, or ask for nav2_route without closures=mark"
+                f"service {service} not found, and the graph has {len(closed)} closed edges: add DynamicEdgesScorer to "
+                "the route server's edge_cost_functions, or request nav2_route without closures=mark"
             )
         request = {"closed_edges": sorted(closed), "opened_edges": sorted(opened), "adjust_edges": []}
         if self._ros.call(service, DYNAMIC_EDGES, request).get("success") is not True:
-            raise LoadError(f"{service} refused to close or open edges")
+            raise LoadError(f"{service} rejected the request to close or open edges")
 
     def _is_on_another_level(self, kind: str, path: str) -> bool:
-        """Whether Nav2 was given a file of another level before."""
+        """Whether Nav2 has loaded a file of another level."""
         saved_state = self._site.recall().get(kind)
         return bool(saved_state) and str(saved_state).rpartition("/")[0] != path.rpartition("/")[0]
 
     def _changed(self, path: str) -> bool:
-        """Whether a file, or one that belongs to it, is named as changed."""
+        """Whether a file or its image is listed as changed."""
         stem = path.rpartition(".")[0]
         return self._site.changed is not None and self._site.has_changed(path, f"{stem}.pgm", f"{stem}.png")
 
     def _is_due(self, kind: str, path: str) -> bool:
-        """Whether a file changed, or another one is loaded."""
+        """Whether a file has changed, or another one is loaded."""
         saved_state = self._site.recall()
         return self._site.changed is None or self._changed(path) or (kind in saved_state and saved_state[kind] != path)
 
@@ -367,16 +371,16 @@ class Nav2:
         result = self._call(f"{server}/load_map", LOAD_MAP, {"map_url": url}, role).get("result")
         if result != 0:
             reason = RESULTS.get(result, "no result") if isinstance(result, int) else "no result"
-            raise LoadError(f"{server}/load_map refused {path}: {reason} (result={result})")
+            raise LoadError(f"{server}/load_map rejected {path}: {reason} (result={result})")
 
     def _call(self, service: str, type: str, request: Mapping[str, Any], role: str) -> Mapping[str, Any]:
         if not self._ros.has_service(service, type):
             variable = f"FLEETMAP_NAV2_{role.upper()}"
-            raise LoadError(f"there is no service {service}: start Nav2, or set {variable} (empty: do not load)")
+            raise LoadError(f"service {service} not found: start Nav2, or set {variable} (empty: do not load)")
         return self._ros.call(service, type, request)
 
     def _empty_mask(self) -> Path:
-        """A mask of one free cell: it restricts nothing."""
+        """Write a mask of one free cell, which restricts nothing, and return its path."""
         self._site.memory.mkdir(exist_ok=True)
         (self._site.memory / "empty.pgm").write_bytes(b"P5\n1 1\n255\n\xfe")
         path = self._site.memory / "empty.yaml"
@@ -388,31 +392,31 @@ class Nav2:
 
 
 def grid_names(site: Site) -> list[str]:
-    """Names of the level's grids."""
+    """Return the names of the level's grids."""
     folder = site.folder / site.path("occupancy_grid", "")
     return sorted(p.stem for p in folder.glob("*.yaml") if not p.stem.endswith("_filter_info"))
 
 
 def map_grid(grids: Sequence[str], names: Names) -> str | None:
-    """Name of the grid for the map server; None if there is none. Raises LoadError if several fit."""
+    """Return the name of the grid for the map server; None if there is none. Raises LoadError if it is ambiguous."""
     if names.grid:
         return names.grid
     if "map" in grids:
         return "map"
     maps = [g for g in grids if g not in ("nogo", names.keepout_grid, names.speed_grid)]
     if len(maps) > 1:
-        raise LoadError(f"there are the grids {', '.join(maps)}: name one with FLEETMAP_NAV2_GRID (of the node: grid)")
+        raise LoadError(f"several grids ({', '.join(maps)}): choose one with FLEETMAP_NAV2_GRID (node parameter: grid)")
     return maps[0] if maps else None
 
 
 def blocked_edges(path: Path) -> set[int]:
-    """Ids of a route graph's edges whose metadata says ``blocked``. Raises LoadError."""
+    """Return the ids of route graph edges with ``blocked`` in their metadata. Raises LoadError."""
     try:
         features = json.loads(path.read_bytes())["features"]
         edges = [f["properties"] for f in features if "startid" in f["properties"]]
         return {int(e["id"]) for e in edges if (e.get("metadata") or {}).get("blocked") is True}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise LoadError(f"{path} is no route graph: {error}") from None
+        raise LoadError(f"{path} is not a route graph: {error}") from None
 
 
 # --- topological_navigation ---
@@ -420,7 +424,7 @@ def blocked_edges(path: Path) -> set[int]:
 
 @dataclass(frozen=True)
 class Network:
-    """What tells two networks apart: name, point set, nodes and edges."""
+    """Identity of a network: name, point set, node names and edge ids."""
 
     name: str
     pointset: str
@@ -428,7 +432,7 @@ class Network:
     edges: frozenset[str]
 
     def difference(self, other: Network) -> str | None:
-        """How another network differs from this one, in a few words; None if it does not."""
+        """Describe the first difference of another network from this one; None if they are equal."""
         for word, ours, theirs in (("name", self.name, other.name), ("pointset", self.pointset, other.pointset)):
             if ours != theirs:
                 return f"its {word} is {theirs[:80]!r}, not {ours[:80]!r}"
@@ -447,7 +451,7 @@ class TopologicalMap:
         self._ros, self._site, self._names = ros, site, names
 
     def load(self, report: Report) -> bool:
-        """Switch to a changed network and see that it is published. Whether it succeeded."""
+        """Switch to a changed network and check that it is published. Return whether it succeeded."""
         steps = Steps(report)
         return steps.run("topological map", self._switch)
 
@@ -456,7 +460,7 @@ class TopologicalMap:
         names = sorted(p.name for p in folder.glob("*.yaml"))
         if not names:
             raise LoadError(
-                f"there is no tmap2 in {folder.parent if self._site.prefix else folder}: add it to --formats"
+                f"no tmap2 file in {folder.parent if self._site.prefix else folder}: add tmap2 to --formats"
             )
         return self._site.path("tmap2", "network.tmap2.yaml" if "network.tmap2.yaml" in names else names[0])
 
@@ -472,24 +476,22 @@ class TopologicalMap:
         network = read_network(file)
         service = f"{self._names.manager}/switch_topological_map"
         if not self._ros.has_service(service, WRITE_TOPOLOGICAL_MAP):
-            raise LoadError(
-                f"there is no service {service}: start the map manager, or set FLEETMAP_TOPOLOGICAL_MANAGER"
-            )
+            raise LoadError(f"service {service} not found: start the map manager, or set FLEETMAP_TOPOLOGICAL_MANAGER")
         problem = None
-        # Some managers put their own folder before the name: from any folder, enough ``..`` lead to the same file.
+        # Some managers prefix the name with their own folder: enough ``..`` reach the same file from any folder.
         for name in (str(file), "../" * 40 + str(file).lstrip("/")):
             answer = self._ros.call(service, WRITE_TOPOLOGICAL_MAP, {"filename": name, "no_alias": False})
             if answer.get("success") is not True:
-                raise LoadError(f"{service} refused {path}: see the log of the map manager")
+                raise LoadError(f"{service} rejected {path}: check the log of the map manager")
             problem = network.difference(parse_network(self._ros.last_text(self._names.topic)))
             if problem is None:
                 self._site.remember(topological_map=path)
                 return f"{self._names.manager} publishes {path}: {len(network.nodes)} nodes, {len(network.edges)} edges"
-        raise LoadError(f"{service} reported success, but {self._names.topic} does not hold {path}: {problem}")
+        raise LoadError(f"{service} reported success, but {self._names.topic} does not publish {path}: {problem}")
 
 
 def parse_network(text: str) -> Network:
-    """The network of the manager's JSON; an empty one if it is none."""
+    """Parse the network in the manager's JSON. Raises LoadError."""
     try:
         body = json.loads(text)
         nodes = [n["node"] for n in body.get("nodes") or ()]
@@ -500,11 +502,14 @@ def parse_network(text: str) -> Network:
             frozenset(str(e["edge_id"]) for n in nodes for e in n.get("edges") or ()),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise LoadError(f"the map manager publishes no tmap2: {type(error).__name__}: {error}") from None
+        raise LoadError(f"the map manager does not publish a tmap2: {type(error).__name__}: {error}") from None
 
 
 def read_network(path: Path) -> Network:
-    """The network of a tmap2 file as the server writes it: one scalar a line, two blanks for each depth."""
+    """Read the network of a tmap2 file as the server writes it: one scalar per line, indented by two spaces per depth.
+
+    Raises LoadError.
+    """
     name, pointset, part = "", "", ""
     nodes: set[str] = set()
     edges: set[str] = set()
@@ -528,12 +533,12 @@ def read_network(path: Path) -> Network:
             elif part == "node" and indent == 6 and key == "edge_id":
                 edges.add(_scalar(value))
     if not nodes:
-        raise LoadError(f"{path} has no nodes, or is not as the server writes it")
+        raise LoadError(f"{path} has no nodes, or was not written by a Fleet Map Server")
     return Network(name, pointset, frozenset(nodes), frozenset(edges))
 
 
 def _scalar(text: str) -> str:
-    """A YAML scalar in one line as text."""
+    """Parse a YAML scalar in one line."""
     if len(text) >= 2 and text[0] == text[-1] == "'":
         return text[1:-1].replace("''", "'")
     if len(text) >= 2 and text[0] == text[-1] == '"':
@@ -548,7 +553,7 @@ def _scalar(text: str) -> str:
 
 
 class Ros2Command:
-    """The command ``ros2``, with a limit for each call and one for all."""
+    """Service calls with the command ``ros2``; time limits per call and for all calls."""
 
     def __init__(
         self,
@@ -562,7 +567,7 @@ class Ros2Command:
 
     @classmethod
     def from_environment(cls, variables: Mapping[str, str]) -> Ros2Command:
-        """Limits of FLEETMAP_ROS_SECONDS, FLEETMAP_HOOK_SECONDS and FLEETMAP_ROS_WAIT_SECONDS. Raises LoadError."""
+        """Read FLEETMAP_ROS_SECONDS, FLEETMAP_HOOK_SECONDS and FLEETMAP_ROS_WAIT_SECONDS. Raises LoadError."""
         return cls(
             _seconds(variables, "FLEETMAP_ROS_SECONDS", CALL_SECONDS),
             _seconds(variables, "FLEETMAP_HOOK_SECONDS", TOTAL_SECONDS),
@@ -570,8 +575,8 @@ class Ros2Command:
         )
 
     def has_service(self, name: str, type: str) -> bool:
-        """Whether ``ros2 service type`` finds it within some seconds."""
-        del type  # a service of this name with another type fails with the call
+        """Whether ``ros2 service type`` finds the service within FLEETMAP_ROS_WAIT_SECONDS."""
+        del type  # a wrong type makes the call fail
         if name not in self._services:
             end = time.monotonic() + self._wait_seconds
             while (status := self._run(["ros2", "service", "type", name])[0]) != 0 and time.monotonic() < end:
@@ -580,18 +585,18 @@ class Ros2Command:
         return self._services[name]
 
     def call(self, name: str, type: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """``ros2 service call``."""
+        """Run ``ros2 service call`` and return ``result`` or ``success`` of the response. Raises LoadError."""
         status, text = self._run(["ros2", "service", "call", name, type, flow_yaml(request)])
         result, success = re.search(r"result=(\d+)", text), re.search(r"success=(True|False)", text)
         if status != 0 or not (result or success):
             error = re.search(r"[^\n]*[Ee]rror[^\n]*", text)
             detail = error[0].strip()[:300] if error else text.strip()[-300:]
-            raise LoadError(f"{name} gave no answer (ros2 ended with {status}): {detail}")
+            raise LoadError(f"no response from {name} (ros2 exited with status {status}): {detail}")
         answer: dict[str, Any] = {"result": int(result[1])} if result else {}
         return answer | ({"success": success[1] == "True"} if success else {})
 
     def last_text(self, topic: str) -> str:
-        """``ros2 topic echo`` until it pauses: its last message."""
+        """Run ``ros2 topic echo`` until it pauses; return the last message. Raises LoadError."""
         arguments = ["ros2", "topic", "echo", "--full-length", "--field", "data"]
         arguments += ["--qos-durability", "transient_local", "--qos-reliability", "reliable"]
         end = time.monotonic() + self._limit()
@@ -611,18 +616,18 @@ class Ros2Command:
             process.wait()
         if not text:
             raise LoadError(
-                f"nothing came on {topic}: is the map manager running? Another name: FLEETMAP_TOPOLOGICAL_TOPIC"
+                f"no message on {topic}: start the map manager, or set FLEETMAP_TOPOLOGICAL_TOPIC to its topic"
             )
         return text
 
     def _limit(self) -> float:
         left = self._end - time.monotonic()
         if left <= 0:
-            raise LoadError("no time is left: the calls before took longer than FLEETMAP_HOOK_SECONDS in all")
+            raise LoadError("no time left: all calls together exceeded FLEETMAP_HOOK_SECONDS")
         return min(self._call_seconds, left)
 
     def _run(self, arguments: list[str]) -> tuple[int, str]:
-        """Run to the end: exit status, and start and end of what was printed. Raises LoadError after the limit."""
+        """Run a command. Return its exit status, and start and end of its output. Raises LoadError after the limit."""
         limit = self._limit()
         end = time.monotonic() + limit
         process, chunks = _start(arguments)
@@ -637,7 +642,9 @@ class Ros2Command:
         except (queue.Empty, subprocess.TimeoutExpired):
             process.kill()
             process.wait()
-            raise LoadError(f"{arguments[3]} gave no answer within {limit:g} seconds (FLEETMAP_ROS_SECONDS)") from None
+            raise LoadError(
+                f"no response from {arguments[3]} within {limit:g} seconds (FLEETMAP_ROS_SECONDS)"
+            ) from None
         return status, (head + bytes(tail)).decode(errors="replace")
 
 
@@ -649,15 +656,15 @@ def _seconds(variables: Mapping[str, str], name: str, default: float) -> float:
 
 
 def _start(arguments: list[str]) -> tuple[subprocess.Popen[bytes], queue.Queue[bytes | None]]:
-    """Start a command: its process, and what it prints as it comes, None at the end. Raises LoadError."""
+    """Start a command. Return its process and a queue of its output, with None at the end. Raises LoadError."""
     try:
         process = subprocess.Popen(  # noqa: S603  arguments are a list, no shell reads them
             arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
     except OSError as error:
-        raise LoadError(f"ros2 cannot be run ({error.strerror}): source the setup.bash of ROS 2 first") from None
+        raise LoadError(f"could not run ros2 ({error.strerror}): source the setup.bash of ROS 2 first") from None
     chunks: queue.Queue[bytes | None] = queue.Queue(MAX_CHUNKS)
-    # Of its own: what a killed command has started may keep the pipe open, and is not waited for.
+    # A separate thread: children of a killed command may keep the pipe open.
     threading.Thread(target=_read, args=(process.stdout, chunks), daemon=True).start()
     return process, chunks
 
@@ -670,7 +677,7 @@ def _read(stream: IO[bytes], chunks: queue.Queue[bytes | None]) -> None:
 
 
 def flow_yaml(value: Any) -> str:
-    """A request as ``ros2 service call`` takes it: YAML in one line."""
+    """Format a request for ``ros2 service call``: YAML in one line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{name}: {flow_yaml(member)}" for name, member in value.items()) + "}"
     if isinstance(value, (list, tuple)):
@@ -683,7 +690,7 @@ def flow_yaml(value: Any) -> str:
 
 
 def _message(line: str) -> str | None:
-    """The text of one line of ``ros2 topic echo``; None for a separator or a warning."""
+    """Parse one line of ``ros2 topic echo``; None for a separator or a warning."""
     text = line.strip()
     if text.startswith("data: "):
         text = _scalar(text.removeprefix("data: "))
@@ -698,7 +705,7 @@ def _print(line: str) -> None:
 
 
 def reporter(status_file: str | None, write: Callable[[str], object] = _print) -> Report:
-    """Print each step, or hand it to ``write``, and append it to the file that FLEETMAP_HOOK_STATUS names."""
+    """Return a function that prints each step (with ``write``) and appends it to ``status_file``."""
 
     def report(step: str, result: str, detail: str) -> None:
         write(f"{step}: {result}: {detail}")
@@ -708,7 +715,7 @@ def reporter(status_file: str | None, write: Callable[[str], object] = _print) -
                 with Path(status_file).open("a") as stream:
                     stream.write(line + "\n")
             except OSError as error:
-                write(f"{status_file} cannot be written: {error.strerror}")
+                write(f"could not write {status_file}: {error.strerror}")
 
     return report
 
@@ -717,14 +724,18 @@ LOADERS: Mapping[str, type[Nav2] | type[TopologicalMap]] = {"nav2": Nav2, "topol
 
 
 def main(arguments: list[str], variables: Mapping[str, str]) -> int:
-    """Run one hook: its exit status."""
+    """Run one hook. Return its exit status."""
     report = reporter(variables.get("FLEETMAP_HOOK_STATUS"))
     try:
         site, ros = Site.from_environment(variables), Ros2Command.from_environment(variables)
         loader = LOADERS[arguments[0]](ros, site, Names.from_environment(variables))
         return 0 if loader.load(report) else 1
     except KeyError as error:
-        report("start", "failed", f"{error.args[0]} is missing: the agent runs this file as `--on-change nav2`")
+        report(
+            "start",
+            "failed",
+            f"missing {error.args[0]}: run this hook from the agent, with `--on-change nav2` or `topological`",
+        )
     except (LoadError, OSError) as error:
         report("start", "failed", str(error))
     return 1

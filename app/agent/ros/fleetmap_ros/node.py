@@ -1,4 +1,4 @@
-"""The lifecycle node ``fleetmap_agent``: parameters, publishers and service clients; all else is in ``control``."""
+"""Lifecycle node ``fleetmap_agent``: parameters, publishers and service clients; the rest is in ``control``."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""Like Nav2's map server: who subscribes later gets the last message."""
+"""QoS of latched topics, as in Nav2's map server: late subscribers get the last message."""
 
 
 THREADS = 4
-"""A thread waits in ``switch_level`` while others take the answers of Nav2's services."""
+"""Number of executor threads: one waits in ``switch_level`` while others receive responses of Nav2's services."""
 
 
 class RclpyRos:
-    """Services and a latched topic by rclpy. Called from threads other than the executor's."""
+    """Service calls and a latched topic with rclpy. Must be called outside the executor's threads."""
 
     def __init__(self, node: Any, call_seconds: float) -> None:
         self._node, self._call_seconds = node, call_seconds
@@ -48,11 +48,11 @@ class RclpyRos:
         self._clients: dict[tuple[str, str], Any] = {}
 
     def has_service(self, name: str, type: str) -> bool:
-        """Whether a service is offered; waits some seconds for it to be discovered."""
+        """Whether a service is available; waits up to WAIT_SECONDS for its discovery."""
         return bool(self._client(name, type).wait_for_service(timeout_sec=WAIT_SECONDS))
 
     def call(self, name: str, type: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Call a service: its answer's ``result`` or ``success``. Raises LoadError."""
+        """Call a service and return ``result`` or ``success`` of its response. Raises LoadError."""
         client = self._client(name, type)
         message = service_type(type).Request()
         for member, value in request.items():
@@ -62,7 +62,7 @@ class RclpyRos:
         future.add_done_callback(lambda _: done.set())
         if not done.wait(self._call_seconds):
             client.remove_pending_request(future)
-            raise LoadError(f"{name} gave no answer within {self._call_seconds:g} seconds (parameter call_seconds)")
+            raise LoadError(f"no response from {name} within {self._call_seconds:g} seconds (parameter call_seconds)")
         if future.exception() is not None:
             raise LoadError(f"{name} failed: {future.exception()}")
         answer = future.result()
@@ -82,7 +82,7 @@ class RclpyRos:
         finally:
             self._node.destroy_subscription(subscription)
         if text is None:
-            raise LoadError(f"nothing came on {topic}: is the map manager running? See the parameter topological_topic")
+            raise LoadError(f"no message on {topic}: start the map manager, or set the parameter topological_topic")
         return text
 
     def close(self) -> None:
@@ -98,16 +98,16 @@ class RclpyRos:
 
 
 def service_type(name: str) -> Any:
-    """A service's class by ``package/srv/Name``. Raises LoadError if this ROS 2 does not have it."""
+    """Return the class of a service type ``package/srv/Name``. Raises LoadError if it is not installed."""
     package, _, rest = name.partition("/")
     try:
         return getattr(importlib.import_module(f"{package}.srv"), rest.rpartition("/")[2])
     except (ImportError, AttributeError):
-        raise LoadError(f"this ROS 2 installation has no {name}: install {package}, or a newer one") from None
+        raise LoadError(f"service type {name} not found: install {package}, or a newer version of it") from None
 
 
 class FleetmapAgent(LifecycleNode):
-    """Configured: it has read its parameters. Active: the agent runs, and its maps are loaded and published."""
+    """Lifecycle node. Configured: parameters are read. Active: the agent runs, maps are loaded and published."""
 
     def __init__(self, **more: Any) -> None:
         super().__init__("fleetmap_agent", **more)
@@ -127,7 +127,7 @@ class FleetmapAgent(LifecycleNode):
     # --- transitions ---
 
     def on_configure(self, _state: State) -> TransitionCallbackReturn:
-        """Read the parameters; offer topics and services."""
+        """Read the parameters; create topics and services."""
         try:
             settings = self._read_settings()
         except SettingsError as error:
@@ -147,7 +147,7 @@ class FleetmapAgent(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
-        """Publish the map that is there, and start the agent."""
+        """Publish the installed map and start the agent."""
         assert self._settings is not None
         assert self._loader is not None
         site = initial_site(self._settings)
@@ -164,26 +164,26 @@ class FleetmapAgent(LifecycleNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
-        """Stop the agent; what is published stays."""
+        """Stop the agent; published maps stay available."""
         self._stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, _state: State) -> TransitionCallbackReturn:
-        """Withdraw topics and services."""
+        """Destroy topics and services."""
         self._withdraw()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _state: State) -> TransitionCallbackReturn:
-        """Stop the agent and withdraw all."""
+        """Stop the agent; destroy topics and services."""
         self.stop()
         return TransitionCallbackReturn.SUCCESS
 
     def stop(self) -> None:
-        """End what runs: also where no transition comes before the process ends."""
+        """Stop everything, also if the process ends without a transition."""
         self._stop()
         self._withdraw()
 
-    # --- inside ---
+    # --- internals ---
 
     def _read_settings(self) -> Settings:
         names = [parameter.name for parameter in dataclasses.fields(Settings)]
@@ -211,7 +211,7 @@ class FleetmapAgent(LifecycleNode):
         self._loader = None
 
     def _on_switch_level(self, _request: Any, response: Any) -> Any:
-        """Load the level that the parameter ``level`` names now."""
+        """Load the level of the parameter ``level``."""
         if self._settings is None or self._agent is None:
             response.success, response.message = False, "the node is not active"
         else:
@@ -241,7 +241,7 @@ class FleetmapAgent(LifecycleNode):
 
 
 def grid_message(grid: Grid, frame_id: str, stamp: Any) -> Any:
-    """A nav_msgs/msg/OccupancyGrid."""
+    """Return a nav_msgs/msg/OccupancyGrid."""
     message = OccupancyGrid()
     message.header.frame_id = frame_id
     message.header.stamp = stamp

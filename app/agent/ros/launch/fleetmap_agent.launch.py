@@ -1,4 +1,4 @@
-"""Start the node ``fleetmap_agent``; with ``autostart`` it is configured and activated."""
+"""Launch the node ``fleetmap_agent``; with ``autostart`` configure and activate it."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
