@@ -281,5 +281,5 @@ def test_what_nobody_knows_and_does_not_parse_is_told_with_its_line(name: str, d
         read({name: data}, UploadHints(), EnvironmentContext(), LIMITS)
     (problem,) = caught.value.problems
     assert (problem.file, problem.line) == (name, line)
-    assert (problem.problem == "no known map format") == (line is None)
+    assert (problem.problem == "no recognised map format") == (line is None)
     assert (f"line {line}" in caught.value.detail) == (line is not None)

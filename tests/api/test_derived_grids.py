@@ -151,7 +151,7 @@ def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
     for report in (fetch_report(api, "lane"), direct.offline(files, "occupancy_grid").report.as_dict()):
         line = next(line for line in report["layers"] if line["layer"] == "occupancy")
         assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
-        (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]
+        (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].endswith("another derivation was used")]
         assert "objects_to_occupancy failed" in warning
         assert "walls.stl is not there" in warning
 

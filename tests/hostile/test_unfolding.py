@@ -122,13 +122,13 @@ def test_compressed_points_are_held_against_the_ratio() -> None:
     count = 20_000_000
     lie = bytearray(spiral)
     struct.pack_into("<Q", lie, 247, count)
-    with pytest.raises(TooLarge, match="bytes unfold to more than 16777216 bytes"):
+    with pytest.raises(TooLarge, match="bytes decompress to more than the limit of 16777216 bytes"):
         _read("las", "a.laz", bytes(lie))
     packed = (
         b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH %d\nHEIGHT 1\nPOINTS %d\nDATA binary_compressed\n"
     )
     packed = packed % (count, count) + struct.pack("<II", 100, 12 * count) + bytes(100)
-    with pytest.raises(TooLarge, match="100 bytes unfold to more than 16777216 bytes"):
+    with pytest.raises(TooLarge, match="100 bytes decompress to more than the limit of 16777216 bytes"):
         _read("pcd", "a.pcd", b"VERSION .7\n" + packed)
 
 
