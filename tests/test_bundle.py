@@ -196,7 +196,7 @@ def test_variables_are_read_and_never_run() -> None:
 
 def test_unknown_files_stay_sources_with_a_warning() -> None:
     bundle = read_upload({"datum.yaml": DATUM, "model.stl": b"solid", "LICENSE": b"x", "a/.placeholder": b""})
-    assert [w.file for w in bundle.warnings if "no format" in w.problem] == ["model.stl"]
+    assert [w.file for w in bundle.warnings if "no format can read" in w.problem] == ["model.stl"]
     assert not bundle.files["model.stl"].used
 
 
@@ -204,7 +204,7 @@ def test_unknown_files_stay_sources_with_a_warning() -> None:
     ("files", "hints", "error", "words"),
     [
         ({}, {}, Invalid, "no file"),
-        ({"a.bin": b"\x00\x01"}, {}, UnreadableFile, "none of the files is a map"),
+        ({"a.bin": b"\x00\x01"}, {}, UnreadableFile, "no file has a recognised map format"),
         ({"a.kml": b""}, {}, UnreadableFile, "empty"),
         ({"a.kml": kml(PATH)}, {"layer": "occupancy"}, Invalid, "layer must be one of"),
         ({"a.kml": kml(PATH)}, {"options": {"colour": "red"}}, Invalid, "colour"),

@@ -336,7 +336,7 @@ def file_recipe(
     of_file = level_of_folder(folder, site.levels) if folder else site.default
     if of_file is None or (level is not None and level != of_file):
         levels = ", ".join(sorted(site.levels))
-        raise NotFound(f"{fmt.name} has no file {file!r}: its folder is not a level; levels: {levels}")
+        raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; levels: {levels}")
     hints = dict(fmt.selection.from_filename(base))
     if name is None and parts.name in hints:
         name = _part_with_stem(site, of_file, hints[parts.name])

@@ -149,8 +149,8 @@ def distance_warnings(upload_bundle: Bundle, datum: Datum | None) -> list[Proble
         if distances and min(distances) > MAX_USUAL_METRES:
             location = f"{key.layer} {key.level}/{key.name}"
             reason = (
-                f"about {min(distances) / 1000:.0f} km away from the datum; check the environment and the order of "
-                "the coordinates"
+                f"about {min(distances) / 1000:.0f} km from the datum; check the environment and the order of the "
+                "coordinates"
             )
             files, _ = upload_bundle.origin.get(key, ((), ""))
             out.append(Problem(reason, files[0] if files else None, where=location))

@@ -43,7 +43,7 @@ PACKAGE = "environment"
 
 VARIABLES_FILES = ("properties.sh", "environment.sh")
 
-_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(shell.OF_FILES))}) is left out: only a shell")
+_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(shell.OF_FILES))}) is skipped: only a shell")
 
 DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
 

@@ -236,7 +236,7 @@ def test_what_this_release_does_not_know_is_told_and_no_robot_stands_without_a_m
     assert tolerance(api, env) == 0.4
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     problems = [w["problem"] for w in report["warnings"]]
-    assert any("'of-tomorrow' is not known" in p for p in problems)
+    assert any("'of-tomorrow' is unknown" in p for p in problems)
     assert any("colour: no such parameter of tmap2" in p for p in problems)
     line = api.get(f"environments/{env}/templates/tmap2").json()
     assert len(line["ignored"]) == 2
