@@ -82,7 +82,7 @@ def test_what_was_written_by_hand_wins_over_what_was_generated() -> None:
     assert bundle.datum.latitude == 53.26
     assert not bundle.files["datum_autogen.yaml"].used
     assert bundle.files["datum.yaml"].used
-    assert "datum.yaml is used" in warned(bundle, "datum_autogen.yaml")
+    assert "datum.yaml takes precedence" in warned(bundle, "datum_autogen.yaml")
 
 
 def test_a_real_network_wins_over_a_drawn_one_and_regions_stay() -> None:
@@ -167,7 +167,7 @@ def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float)
     point = b'{"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [10, %g]}}' % latitude
     bundle = read({"a.geojson": point}, UploadHints(), EnvironmentContext(), Limits())
     assert bundle.datum == Datum(math.copysign(85.0, latitude), 10.0)
-    assert any("no datum lies nearer to a pole" in w.problem for w in bundle.warnings)
+    assert any("Use local metres near the poles" in w.problem for w in bundle.warnings)
     with pytest.raises(BadUpload, match="must be between -85 and 85"):
         read(
             {"datum.yaml": b"datum_latitude: %g\ndatum_longitude: 10\n" % latitude},

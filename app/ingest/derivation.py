@@ -123,7 +123,7 @@ def _steps(derivation: derive.Derivation, available: frozenset[Layer], without: 
 
 
 def _no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> MissingLayer:
-    tried = f"; what is stored does not do: {'; '.join(one.reason for one in failed)}" if failed else ""
+    tried = f"; stored layers cannot replace it: {'; '.join(one.reason for one in failed)}" if failed else ""
     return MissingLayer(f"{error.detail}{tried}")
 
 
