@@ -54,7 +54,7 @@ def finished(api: Api, job: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("files", "kind"), environments())
-def test_the_table_keeps_its_word(
+def test_coverage_matches_downloads(
     api: Api, files: dict[str, bytes], kind: str | None, request: pytest.FixtureRequest
 ) -> None:
     env = re.sub(r"[^a-z0-9]+", "-", request.node.callspec.id.lower()).strip("-")[:60]

@@ -64,7 +64,7 @@ def test_readme_is_short() -> None:
     assert (ROOT / "README.md").stat().st_size <= 10_000
 
 
-def test_links_of_texts_at_the_top_lead_somewhere() -> None:
+def test_links_of_top_level_texts_resolve() -> None:
     for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text()):
             assert (ROOT / target).is_file(), f"{name}: {target}"
@@ -210,13 +210,13 @@ def texts() -> Iterator[tuple[Path, str]]:
             yield relative, path.read_text(errors="replace")
 
 
-def test_no_text_names_a_path_of_a_machine() -> None:
+def test_texts_contain_no_path_of_a_machine() -> None:
     for path, text in texts():
         for word in ("/" + "work/", "/" + "root/"):
             assert word not in text, f"{path} names a path of a machine"
 
 
-def test_no_text_names_a_document_that_is_not_in_the_project() -> None:
+def test_texts_name_only_documents_of_the_project() -> None:
     own = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
     own |= {f"{name}.md" for name in all_formats()}
     own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON, of LIF, and of a test's upload

@@ -131,23 +131,23 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return found
 
 
-def test_a_format_is_one_module(facts: dict[str, Any]) -> None:
+def test_format_is_one_module(facts: dict[str, Any]) -> None:
     assert "paper" in facts["formats"]
     assert "/maps/{env}/paper" in facts["paths"]
     assert "paper" in facts["coverage"]
 
 
-def test_a_route_noun_is_one_module(facts: dict[str, Any]) -> None:
+def test_route_noun_is_one_module(facts: dict[str, Any]) -> None:
     assert "/api/v1/papers" in facts["paths"]
 
 
-def test_a_setting_is_a_field_and_its_consumer(facts: dict[str, Any]) -> None:
+def test_setting_is_a_field_and_its_consumer(facts: dict[str, Any]) -> None:
     assert "FLEETMAP_PAPER_SIZE" in facts["settings"]
     assert facts["environment"]["FLEETMAP_PAPER_SIZE"] == "4"
     assert facts["area"] == 1 / 16
 
 
-def test_an_event_is_one_dataclass(facts: dict[str, Any]) -> None:
+def test_event_is_one_dataclass(facts: dict[str, Any]) -> None:
     assert facts["event"] == "paper.folded"
     assert "## paper.folded" in facts["events"]
     assert '"folds": 2' in facts["events"]

@@ -77,28 +77,28 @@ def pool() -> Iterator[Pool]:
     new_pool.close()
 
 
-def test_a_result_comes_back(pool: Pool) -> None:
+def test_pool_returns_a_result(pool: Pool) -> None:
     assert pool.run(work_double, 21) == 42
 
 
-def test_our_errors_keep_their_class_and_places(pool: Pool) -> None:
+def test_worker_errors_keep_their_class_and_locations(pool: Pool) -> None:
     with pytest.raises(NotFound) as caught:
         pool.run(work_refuse)
     assert caught.value.problems == (Problem("gone", "a.yaml", 3),)
 
 
-def test_a_bug_is_told_with_its_trace(pool: Pool) -> None:
+def test_bug_in_a_worker_is_reported_with_its_traceback(pool: Pool) -> None:
     with pytest.raises(RuntimeError, match="KeyError in a worker"):
         pool.run(work_bug)
 
 
-def test_a_crash_costs_one_job_and_a_fresh_worker_goes_on(pool: Pool) -> None:
+def test_crash_fails_one_job_and_worker_is_replaced(pool: Pool) -> None:
     with pytest.raises(WorkerDied, match="damaged or too large"):
         pool.run(work_crash)
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ended_worker_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its number may belong to another process by then."""
     pool.run(work_double, 1)
     killed: list[int | None] = []
@@ -115,7 +115,7 @@ def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.Monke
     assert killed == []
 
 
-def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
+def test_timeout_kills_the_job_and_worker_is_replaced(pool: Pool) -> None:
     pool.run(work_double, 1)
     start = time.monotonic()
     with pytest.raises(WorkerDied, match=r"longer than 0\.3 seconds"):
@@ -124,7 +124,7 @@ def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
+def test_cancel_stops_running_and_waiting_jobs(pool: Pool) -> None:
     pool.run(work_double, 1)
     stops = CancelHandle(), CancelHandle()
     errors: list[BaseException] = []
@@ -152,19 +152,19 @@ def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
     assert pool.run(work_double, 1) == 2
 
 
-def test_memory_is_limited_and_the_worker_survives(pool: Pool) -> None:
+def test_memory_limit_fails_the_job_and_worker_survives(pool: Pool) -> None:
     with pytest.raises(TooLarge):
         pool.run(work_eat)
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_result_too_large_to_send_is_no_bug(pool: Pool) -> None:
+def test_result_too_large_to_send_raises_too_large(pool: Pool) -> None:
     with pytest.raises(TooLarge):
         pool.run(work_unsendable)
     assert pool.run(work_double, 1) == 2
 
 
-def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_process_start_raises_unavailable(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
@@ -175,7 +175,7 @@ def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest
     assert pool.run(work_double, 1) == 2
 
 
-def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
+def test_waiting_job_raises_unavailable_when_pool_closes(pool: Pool) -> None:
     pool.run(work_double, 1)
     errors: list[type[BaseException]] = []
 
@@ -196,7 +196,7 @@ def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
     assert errors == [WorkerDied, Unavailable]
 
 
-def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:
+def test_full_pool_raises_unavailable(pool: Pool) -> None:
     pool.run(work_double, 1)
     threads = [threading.Thread(target=pool.run, args=(work_sleep, 1.0)) for _ in range(2)]
     for t in threads:
@@ -209,7 +209,7 @@ def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
+def test_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, signal, sys\n"
@@ -252,7 +252,7 @@ needs_landlock = pytest.mark.skipif(
 
 
 @needs_landlock
-def test_a_confined_worker_writes_only_where_it_may(confined: Pool, tmp_path: Path) -> None:
+def test_confined_worker_writes_only_to_allowed_folders(confined: Pool, tmp_path: Path) -> None:
     assert confined.run(work_write, str(tmp_path / "scratch" / "a"), "x") == "x"
     assert confined.run(work_write, str(tmp_path / "database" / "a-shm"), "new") == "new"
     for forbidden in ("database/other", "elsewhere"):
@@ -262,7 +262,7 @@ def test_a_confined_worker_writes_only_where_it_may(confined: Pool, tmp_path: Pa
 
 
 @needs_landlock
-def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) -> None:
+def test_confined_worker_has_no_network_and_starts_no_program(confined: Pool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with pytest.raises(RuntimeError, match="PermissionError"):
@@ -274,7 +274,7 @@ def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) 
         confined.run(work_execute)
 
 
-def test_what_workers_are_forked_from_is_started_beside() -> None:
+def test_fork_server_starts_in_background() -> None:
     """It has imported what it was told to, whoever starts the first worker."""
     script = (
         "import sys\n"

@@ -110,7 +110,7 @@ def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(("name", "kind"), samples())
-def test_every_sample_comes_back_with_the_same_information(
+def test_samples_keep_their_information(
     api: Api, shared: Path, same: Same, name: str, kind: str, request: pytest.FixtureRequest
 ) -> None:
     env = f"s{abs(hash(name)) % 10**12}"
@@ -142,7 +142,7 @@ TEMPLATES = [
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
-def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Same, name: str) -> None:
+def test_template_folder_is_one_version(api: Api, shared: Path, same: Same, name: str) -> None:
     root = shared / "data" / "environment_template" / name
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = name.replace("_", "-")
@@ -168,7 +168,7 @@ def names_in(package: bytes) -> list[str]:
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
-def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
+def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
     """Zipped in, zipped out: the same information, and the same content as the folder's files by themselves."""
     root = shared / "data" / "environment_template" / name
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
@@ -211,7 +211,7 @@ def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[st
 
 
 @pytest.mark.parametrize("way", [["kml"], ["geojson"], ["kml", "geojson"], ["geojson", "kml"], ["kmz"]])
-def test_a_network_keeps_every_node_edge_and_attribute_on_the_way(
+def test_network_keeps_every_node_edge_and_attribute_through_formats(
     api: Api, shared: Path, same: Same, way: list[str]
 ) -> None:
     """tmap2 → kml, geojson … → tmap2."""

@@ -29,14 +29,14 @@ pytestmark = pytest.mark.timeout(240 + 3 * KILLS * SECONDS_A_KILL)
 
 
 @pytest.mark.postgres
-def test_postgresql_and_the_servers_own_router(tmp_path: Path, postgres_cluster: Cluster) -> None:
+def test_postgresql_with_own_router_survives_kills(tmp_path: Path, postgres_cluster: Cluster) -> None:
     each = {"server": KILLS - KILLS // 2, "router": KILLS - KILLS // 2, "database": KILLS}
     with fleet_of(tmp_path, postgres_cluster, own_router=True, seed=SEED) as fleet:
         havoc(fleet, each)
         check(fleet)
 
 
-def test_sqlite_and_a_separate_router(tmp_path: Path) -> None:
+def test_sqlite_with_separate_router_survives_kills(tmp_path: Path) -> None:
     each = {"server": KILLS // 2, "router": KILLS // 2}
     with fleet_of(tmp_path, None, own_router=False, seed=SEED + 100) as fleet:
         havoc(fleet, each)

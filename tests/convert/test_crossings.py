@@ -70,7 +70,7 @@ def test_straight_edges_through_a_wall_are_reported_and_bent_ones_go_around(yaw:
         )
 
 
-def test_buildings_count_where_there_is_no_grid() -> None:
+def test_buildings_are_obstacles_without_a_grid() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("house", shapely.box(4, 0, 6, 7), {"kind": "building"}),
         ("roof", shapely.box(0, 4, 4, 6), {"kind": "building", "base": 3.0}),
@@ -156,7 +156,7 @@ def test_bends_inside_a_building_do_not_hide_that_an_edge_leads_through_it(name:
     assert all(crossing(worker.from_layers(fmt, layers, {}, derived=False).report.as_dict()) == [] for layers in clear)
 
 
-def test_buildings_count_where_a_grid_knows_nothing() -> None:
+def test_buildings_are_obstacles_in_unknown_cells() -> None:
     fmt = formats.get_format("tmap2")
     free = OccupancyGrid(np.full((20, 40), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     unknown = OccupancyGrid(np.full((20, 40), UNKNOWN, np.uint8), 0.5, (-5.0, -5.0, 0.0))
@@ -167,7 +167,7 @@ def test_buildings_count_where_a_grid_knows_nothing() -> None:
         assert len(warnings) == count
 
 
-def test_an_environment_package_warns_of_edges_through_obstacles() -> None:
+def test_environment_package_warns_of_edges_through_obstacles() -> None:
     fmt = formats.get_format("environment")
     warnings = crossing(worker.from_layers(fmt, detour((5, 1)), {}, derived=False).report.as_dict())
     assert len(warnings) == 1

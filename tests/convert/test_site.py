@@ -36,7 +36,7 @@ def product(name: str, **more: Any) -> ConvertedMap:
     return ConvertedMap({name: (name.encode(), "image/tiff")}, None, replace(EMPTY, **more))
 
 
-def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
+def test_files_with_equal_names_are_reported(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     members = tuple(Member(recipe(str(n)), "L2/", ("L2", name)) for n, name in enumerate(("a_b", "a/b")))
     cached_maps = [cache.get_or_make(f"{n:064}", lambda: product("a_b.tif")) for n in range(2)]

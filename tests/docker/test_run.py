@@ -132,7 +132,7 @@ def containers(tmp_path: Path, postgres_url: str) -> tuple[Container, Container]
 
 
 @pytest.mark.postgres
-def test_the_image_serves_maps_from_postgis(
+def test_image_serves_maps_from_postgis(
     containers: tuple[Container, Container], offline: Fleetmap, tmp_path: Path
 ) -> None:
     migrate, server = containers
@@ -182,14 +182,14 @@ def test_the_image_serves_maps_from_postgis(
     assert not list((tmp_path / "data").glob("*.sqlite3")), "everything is in PostgreSQL"
 
 
-def test_the_image_needs_no_shell() -> None:
+def test_image_needs_no_shell() -> None:
     configuration = image()
     for name in ("entrypoint", "cmd", "healthcheck"):
         assert isinstance(configuration[name], list), f"{name} must be in exec form"
         assert configuration[name][0] not in ("sh", "bash", "/bin/sh")
 
 
-def test_what_the_image_writes_lies_in_its_volume() -> None:
+def test_image_writes_only_to_its_volume() -> None:
     from app.config import Settings
 
     configuration = image()

@@ -61,7 +61,7 @@ def still_open(crowd: list[FakeConnection]) -> int:
 # --- which connections give way ---
 
 
-def test_oldest_connection_of_an_address_gives_way_beyond_its_limit() -> None:
+def test_oldest_connection_of_an_address_is_closed_beyond_its_limit() -> None:
     connections = Connections(ConnectionLimits(total=100, per_address=5))
     first = crowd(connections, 5, "10.0.0.1")
     other = crowd(connections, 5, "10.0.0.2")
@@ -73,7 +73,7 @@ def test_oldest_connection_of_an_address_gives_way_beyond_its_limit() -> None:
     assert still_open(local) == 20, "loopback addresses have no limit of their own"
 
 
-def test_proven_connections_do_not_count_for_their_address() -> None:
+def test_authenticated_connections_do_not_count_for_their_address() -> None:
     connections = Connections(ConnectionLimits(total=100, per_address=5))
     robots = []
     for _ in range(20):  # behind one NAT
@@ -84,7 +84,7 @@ def test_proven_connections_do_not_count_for_their_address() -> None:
     assert len(connections) == 25
 
 
-def test_strangers_leave_a_quarter_of_the_places_and_displace_no_one_with_a_token() -> None:
+def test_anonymous_connections_leave_a_quarter_and_close_none_with_a_token() -> None:
     clock = Clock()
     connections = Connections(ConnectionLimits(total=100, per_address=1000), clock)
     (robot,) = crowd(connections, 1, "10.0.0.1")
@@ -104,7 +104,7 @@ def test_strangers_leave_a_quarter_of_the_places_and_displace_no_one_with_a_toke
     assert len(connections) == 100, "its address is not trusted any longer"
 
 
-def test_connections_with_a_token_give_way_only_while_idle() -> None:
+def test_connections_with_a_token_are_closed_only_while_idle() -> None:
     connections = Connections(ConnectionLimits(total=16, per_address=100))
     proven = []
     for _ in range(16):
@@ -124,7 +124,7 @@ def test_connections_with_a_token_give_way_only_while_idle() -> None:
     assert len(connections) == 0
 
 
-def test_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
+def test_limit_of_open_files_is_raised_to_its_maximum() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     hard = before[1] if before[1] != resource.RLIM_INFINITY else 2**20
     try:
@@ -205,7 +205,7 @@ def send_head(url: str, target: str, token: str, head: str) -> socket.socket:
     return line
 
 
-def test_refused_body_is_not_awaited(api: Api) -> None:
+def test_rejected_body_is_not_awaited(api: Api) -> None:
     """The answer comes, says that the connection closes, and it does: also while the body goes on trickling."""
     lines = [send_head(api.url, target, token, head) for target, token, head, _ in REFUSED]
     for line, (target, _, head, status) in zip(lines, REFUSED, strict=True):
@@ -217,7 +217,7 @@ def test_refused_body_is_not_awaited(api: Api) -> None:
         assert seconds < CLOSED_SECONDS + PATIENCE_SECONDS / 2, target
 
 
-def test_refused_large_body_gets_its_answer(api: Api) -> None:
+def test_rejected_large_body_gets_a_response(api: Api) -> None:
     """A client that sends all before it reads is not reset."""
     with connect(api.url) as line:
         body = bytes(20_000_000)
@@ -246,7 +246,7 @@ ASK = b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n"
 
 
 @pytest.mark.parametrize("number", [1, 3])
-def test_what_is_no_request_breaks_no_answer_before_it(api: Api, number: int) -> None:
+def test_malformed_request_keeps_earlier_responses(api: Api, number: int) -> None:
     with connect(api.url) as line:
         line.sendall((ASK + b"\r\n") * number + b"nonsense\r\n\r\n" + bytes(100_000))
         answers, _ = read_to_end(line)
@@ -259,7 +259,7 @@ def test_what_is_no_request_breaks_no_answer_before_it(api: Api, number: int) ->
     assert answers == b""
 
 
-def test_half_a_request_behind_an_answer_ends_the_connection(api: Api) -> None:
+def test_incomplete_request_after_a_response_ends_the_connection(api: Api) -> None:
     with connect(api.url) as line:
         line.sendall(ASK + b"\r\n" + ASK + b"Transfer-Encoding: chunked\r\n\r\nnonsense\r\n")
         assert b"HTTP/1.1 400 " not in read_to_end(line)[0]
@@ -268,7 +268,7 @@ def test_half_a_request_behind_an_answer_ends_the_connection(api: Api) -> None:
         assert read_to_end(line)[0].startswith(b"HTTP/1.1 400 ")
 
 
-def test_slow_bodies_and_heads_end(api: Api) -> None:
+def test_slow_bodies_and_headers_time_out(api: Api) -> None:
     bearer = f"Authorization: Bearer {ADMIN}\r\n"
     with connect(api.url) as body, connect(api.url) as head, connect(api.url) as blank:
         body.sendall(f"POST /api/v1/environments HTTP/1.1\r\nHost: x\r\n{bearer}{JSON_HEAD}\r\n".encode())
@@ -281,7 +281,7 @@ def test_slow_bodies_and_heads_end(api: Api) -> None:
         assert read_to_end(blank, b"\r\n")[0].startswith(b"HTTP/1.1 200 "), "empty lines are no request"
 
 
-def test_client_that_does_not_read_is_given_up(api: Api) -> None:
+def test_connection_of_client_that_does_not_read_is_closed(api: Api) -> None:
     with connect(api.url) as line:
         line.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n\r\n" * 200)
         with pytest.raises((ConnectionResetError, BrokenPipeError)):

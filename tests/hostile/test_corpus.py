@@ -59,7 +59,7 @@ def outcome(case: Case) -> str:
 
 
 @pytest.mark.parametrize("kind", ACCORDING_TO_KIND, ids=lambda kind: kind.__name__)
-def test_hostile_files(kind: object) -> None:
+def test_hostile_files_have_their_verdict(kind: object) -> None:
     wrong = []
     for case in kind():  # type: ignore[operator]
         result = outcome(case)
@@ -68,14 +68,14 @@ def test_hostile_files(kind: object) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_case_has_a_name_of_its_own() -> None:
+def test_hostile_cases_have_unique_names() -> None:
     names = [case.name for case in cases()]
     assert len(names) > 700
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize(("name", "files"), [pytest.param(n, f, id=f"{n}/{min(f)}") for n, f in sample_maps()])
-def test_damaged_samples(name: str, files: dict[str, bytes]) -> None:
+def test_damaged_samples_are_read_or_rejected(name: str, files: dict[str, bytes]) -> None:
     results = set()
     for victim in sorted(files):
         for k, data in enumerate(damaged(files[victim], seed=len(files[victim]), count=COPIES)):

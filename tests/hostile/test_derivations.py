@@ -65,7 +65,7 @@ GIVES = {
 
 
 @pytest.mark.parametrize("case", GRIDS)
-def test_grids_without_content_through_the_server(api: Api, fresh: Callable[[], str], case: str) -> None:
+def test_grids_without_content_return_problems(api: Api, fresh: Callable[[], str], case: str) -> None:
     assert OF_GRIDS, "no derivation takes a grid"
     env = fresh()
     api.post("environments", {"name": env})
@@ -141,7 +141,7 @@ def world(mesh: bytes | None) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("case", MESHES)
-def test_bad_meshes_are_cut_and_filled_or_told(api: Api, fresh: Callable[[], str], case: str) -> None:
+def test_bad_meshes_are_sliced_or_reported(api: Api, fresh: Callable[[], str], case: str) -> None:
     env = fresh()
     api.post("environments", {"name": env})
     answer = api.upload(env, world(MESHES[case]), expect=None)
@@ -164,7 +164,7 @@ def test_bad_meshes_are_cut_and_filled_or_told(api: Api, fresh: Callable[[], str
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
-def test_a_picture_without_a_place_is_refused_with_a_way_out(api: Api, fresh: Callable[[], str]) -> None:
+def test_picture_without_position_is_rejected_with_advice(api: Api, fresh: Callable[[], str]) -> None:
     env = fresh()
     api.post("environments", {"name": env})
     ok, png = cv2.imencode(".png", np.full((20, 30, 3), 90, np.uint8))
@@ -230,7 +230,7 @@ ODD: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("seed", range(45))
-def test_any_picture_gives_something_or_a_clear_problem(seed: int) -> None:
+def test_any_picture_gives_objects_or_a_clear_problem(seed: int) -> None:
     layers = Layers({PartKey("imagery", "ground", "satellite"): pictures(seed)})
     for module in (imagery_to_objects, imagery_to_occupancy):
         function = getattr(module, module.__name__.rpartition(".")[2])

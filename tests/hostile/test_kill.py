@@ -141,7 +141,7 @@ def kill_while_uploads_arrive(tmp_path: Path, dice: random.Random, kills: int) -
 
 
 @pytest.mark.parametrize("seed", [1])
-def test_kill_9_while_uploads_arrive(tmp_path: Path, seed: int) -> None:
+def test_acknowledged_uploads_survive_kill_9(tmp_path: Path, seed: int) -> None:
     _, starts = kill_while_uploads_arrive(tmp_path, random.Random(seed), KILLS)
     # The first start also makes the database, so on a machine busy with other things it says what a start takes here.
     assert max(starts[1:]) < max(HEALTHY_SECONDS, 2 * starts[0])

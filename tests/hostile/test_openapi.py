@@ -35,7 +35,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield api
 
 
-def test_every_answer_is_declared_and_no_call_makes_the_server_fail(api: Api) -> None:
+def test_every_response_is_declared_and_no_call_fails_the_server(api: Api) -> None:
     schema = schemathesis.openapi.from_dict(api.get("/openapi.json").json())
     failures: list[str] = []
     count = 0

@@ -45,14 +45,14 @@ def nonsense() -> Iterator[tuple[str, str, Any, str]]:
     yield "GET", "environments?q=%00", None, ""
 
 
-def test_nonsense_is_refused_and_stores_nothing(api: Api) -> None:
+def test_invalid_requests_are_rejected_and_store_nothing(api: Api) -> None:
     for method, path, body, word in nonsense():
         assert word in api.problem(method, path, 422, json=body)["detail"]
     assert api.get("environments/farm").json()["version"] == 1
 
 
 @pytest.mark.parametrize("origin", [[], {}, 5, None, True])
-def test_words_of_another_type_that_an_edit_brings(api: Api, origin: Any) -> None:
+def test_edit_with_properties_of_other_types(api: Api, origin: Any) -> None:
     api.post("environments", {"name": "odd", "datum": {"latitude": 50.0, "longitude": 7.0}})
     try:
         node = {
@@ -71,7 +71,7 @@ def test_words_of_another_type_that_an_edit_brings(api: Api, origin: Any) -> Non
         api("POST", "environments/odd/purge")
 
 
-def test_hostile_networks_over_http(api: Api) -> None:
+def test_hostile_networks_are_rejected_or_stored(api: Api) -> None:
     """The readers of plain YAML networks, in the server's workers: refused with a place or stored, never an error of
     ours; what is stored can be had back in its own format."""
     stored = 0

@@ -85,7 +85,7 @@ def worker() -> Iterator[Pool]:
     pool.close()
 
 
-def test_bombs_are_refused_with_little_memory(worker: Pool, tmp_path: Path) -> None:
+def test_decompression_bombs_are_rejected_with_little_memory(worker: Pool, tmp_path: Path) -> None:
     for name, data in uploads():
         path = tmp_path / name
         path.write_bytes(data)
@@ -100,7 +100,7 @@ def test_small_archives_may_compress_well() -> None:
     assert len(upload_reader.unpack({"a.zip": zipped({"doc.kml": DOCUMENT, "a.txt": body})}, Limits())) == 2
 
 
-def test_a_blank_image_may_compress_better_than_a_text() -> None:
+def test_empty_image_may_compress_better_than_text() -> None:
     blank = bytes(2 * UNPACKED_FREE_BYTES)
     limits = Limits(pixels=len(blank))
     assert upload_reader.unpack({"a.zip": zipped({"blank.pgm": blank})}, limits)["blank.pgm"] == blank
@@ -109,7 +109,7 @@ def test_a_blank_image_may_compress_better_than_a_text() -> None:
             upload_reader.unpack({"a.zip": zipped(files)}, limits)
 
 
-def test_a_text_in_an_archive_has_the_limit_of_a_text() -> None:
+def test_text_in_an_archive_has_the_limit_of_text() -> None:
     with pytest.raises(
         TooLarge, match=r"doc\.kml: declares \d+ bytes; the limit for a text of \d+ compressed bytes is 50"
     ) as caught:
@@ -117,7 +117,7 @@ def test_a_text_in_an_archive_has_the_limit_of_a_text() -> None:
     assert [(p.file, p.where) for p in caught.value.problems] == [("a.zip", "doc.kml")]
 
 
-def test_compressed_points_are_held_against_the_ratio() -> None:
+def test_compressed_points_are_limited_by_the_ratio() -> None:
     spiral = (SAMPLES / "las" / "spiral.laz").read_bytes()
     count = 20_000_000
     lie = bytearray(spiral)

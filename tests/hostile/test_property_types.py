@@ -1,6 +1,6 @@
 """Words that mean something to us, with values of any type: edits and GeoJSON can bring them, no writer may stumble.
 
-``FLEETMAP_WORDS=500 pytest tests/hostile/test_words.py`` (a part of ``make fuzz``) looks longer than CI does.
+``FLEETMAP_WORDS=500 pytest tests/hostile/test_property_types.py`` (a part of ``make fuzz``) looks longer than CI does.
 """
 
 # ruff: noqa: E501 - lists of values
@@ -142,7 +142,7 @@ def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
 
 
 @pytest.mark.parametrize("layers", [pytest.param(layers, id=name) for name, layers in bases()])
-def test_no_value_of_a_word_breaks_a_writer(layers: Layers) -> None:
+def test_property_values_of_any_type_break_no_writer(layers: Layers) -> None:
     vector = [key for key, part in layers.parts.items() if isinstance(part, Features)]
     if not vector:
         return
