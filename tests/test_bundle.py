@@ -1,4 +1,4 @@
-"""Which file is which map, what a folder says, which of two files is believed."""
+"""Reading of uploads: format detection, folder conventions, precedence of files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The documentation builds without a warning, and what exists is in it. What is not documented fails here."""
+"""The documentation builds without warnings and contains every setting, format, route, event, command and metric."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SKIPPED = frozenset({".git", ".venv", "build", "data", "dist", "node_modules"})
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built pages. A warning of MkDocs (a broken link or anchor, a page that no menu lists) is a failure."""
+    """Build the pages. A warning of MkDocs (a broken link or anchor, a page missing in the menu) is a failure."""
     from mkdocs.commands.build import build as build_pages
     from mkdocs.config import load_config
     from mkdocs.exceptions import Abort
@@ -51,7 +51,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pages(site: Path) -> Mapping[str, str]:
-    """Path below the site -> the words of the page's content."""
+    """Map the path below the site to the text of the page."""
     out = {}
     for path in site.rglob("*.html"):
         body = path.read_text().partition("<article")[2].partition("</article>")[0]
@@ -71,7 +71,7 @@ def test_links_of_top_level_texts_resolve() -> None:
 
 
 def words(page: str) -> set[str]:
-    """The words of a page without punctuation at their ends."""
+    """Split a page into words without punctuation at their ends."""
     return {word.strip(".,;:()[]¶") for word in page.split()}
 
 
@@ -181,7 +181,7 @@ def test_every_problem_is_documented(pages: Mapping[str, str]) -> None:
 
 def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
     class Recorder:
-        """A session that notes the keys that are declared on it."""
+        """Session that records the keys declared on it."""
 
         def __init__(self) -> None:
             self.keys: list[str] = []
@@ -201,7 +201,7 @@ def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
 
 
 def texts() -> Iterator[tuple[Path, str]]:
-    """The project's own texts: (path below the root, content)."""
+    """Yield the project's own texts: (path below the root, content)."""
     for path in sorted(ROOT.rglob("*")):
         relative = path.relative_to(ROOT)
         if SKIPPED & set(relative.parts) or not path.is_file() or "samples" in relative.parts:
@@ -219,7 +219,7 @@ def test_texts_contain_no_path_of_a_machine() -> None:
 def test_texts_name_only_documents_of_the_project() -> None:
     own = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
     own |= {f"{name}.md" for name in all_formats()}
-    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON, of LIF, and of a test's upload
+    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON and LIF, and in a test's upload
     for path, text in texts():
         named = set(re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text))
         assert named <= own, f"{path} names {', '.join(sorted(named - own))}"

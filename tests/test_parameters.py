@@ -1,4 +1,4 @@
-"""Parameters: every value that is taken has its declared type and bounds; every other is refused by name."""
+"""Parameters: accepted values have the declared type and bounds; all others are rejected by name."""
 
 from __future__ import annotations
 

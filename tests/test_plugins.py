@@ -1,4 +1,4 @@
-"""Formats of other distributions: the documented example works, and a broken one stops nothing."""
+"""Plug-ins: the documented example works, and a broken plug-in does not stop the server."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ PAGE = ROOT / "docs" / "contributing" / "plug-ins.md"
 
 
 def example() -> dict[str, str]:
-    """The files on the page: name -> text."""
+    """Read the files on the page: name -> text."""
     return dict(re.findall(r'```\w+ title="([^"]+)"\n(.*?)```', PAGE.read_text(), re.DOTALL))
 
 
 def install(folder: Path, project: str, modules: dict[str, str]) -> None:
-    """What an installer leaves of a distribution in a folder of packages."""
+    """Write the files of an installed distribution to a folder of packages."""
     metadata = tomllib.loads(project)["project"]
     info = folder / f"{metadata['name'].replace('-', '_')}-{metadata['version']}.dist-info"
     info.mkdir()

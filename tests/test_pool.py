@@ -1,4 +1,4 @@
-"""Worker processes: results, errors, crashes, overruns, and the end with the parent."""
+"""Worker processes: results, errors, crashes, timeouts, and their end with the parent."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def work_eat() -> int:
 
 
 class _Unsendable:
-    """A result that takes more memory to send than there is."""
+    """Result that needs more memory to send than available."""
 
     def __reduce__(self) -> tuple[type[bytes], tuple[bytes]]:
         return bytes, (bytes(64 * 2**30),)
@@ -99,7 +99,7 @@ def test_crash_fails_one_job_and_worker_is_replaced(pool: Pool) -> None:
 
 
 def test_ended_worker_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its number may belong to another process by then."""
+    """Its PID may belong to another process by then."""
     pool.run(work_double, 1)
     killed: list[int | None] = []
     (worker,) = pool._workers.values()
@@ -138,7 +138,7 @@ def test_cancel_stops_running_and_waiting_jobs(pool: Pool) -> None:
     threads = [threading.Thread(target=run, args=(stop,)) for stop in stops]
     for thread in threads:
         thread.start()
-        time.sleep(0.3)  # one is at work, the other in line
+        time.sleep(0.3)  # one runs, the other waits
     for stop, thread in reversed(list(zip(stops, threads, strict=True))):
         stop()
         thread.join(20)
@@ -148,7 +148,7 @@ def test_cancel_stops_running_and_waiting_jobs(pool: Pool) -> None:
         pool.run(work_double, 1, stop=stops[0])
     late = CancelHandle()
     assert pool.run(work_double, 21, stop=late) == 42
-    late()  # its worker belongs to others by now
+    late()  # its worker runs other jobs by now
     assert pool.run(work_double, 1) == 2
 
 
@@ -231,7 +231,7 @@ def test_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
         except ProcessLookupError:
             return
         if Path(f"/proc/{worker}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
-            return  # ended; whoever adopted it has not yet looked
+            return  # ended; its new parent has not reaped it yet
         time.sleep(0.1)
     pytest.fail("the worker outlived its parent")
 
@@ -275,7 +275,7 @@ def test_confined_worker_has_no_network_and_starts_no_program(confined: Pool) ->
 
 
 def test_fork_server_starts_in_background() -> None:
-    """It has imported what it was told to, whoever starts the first worker."""
+    """Its modules are imported before the first worker starts."""
     script = (
         "import sys\n"
         "from app import pool\n"

@@ -1,4 +1,4 @@
-"""The main job on real maps, through HTTP, on both databases: upload, and get the same information back."""
+"""Upload and download of real maps over HTTP, on both databases, keep their information."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
     path = data / name
-    if kind == "gazebo":  # a world with all that lies below its folder, or beside the folder of the worlds
+    if kind == "gazebo":  # a world with all files below its folder, or beside the folder of the worlds
         root = path.parent.parent if path.parent.name == "worlds" else path.parent
         paths = [p for p in root.rglob("*") if p == path or (p.is_file() and p.parent != path.parent)]
         return {p.relative_to(root).as_posix(): p.read_bytes() for p in paths}
@@ -97,7 +97,7 @@ def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
 
 
 def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
-    """All files of a map, by the short address a robot uses."""
+    """Download all files of a map, by the short URL for robots."""
     import io
     import zipfile
 
@@ -120,14 +120,14 @@ def test_samples_keep_their_information(
         problem = api.upload(env, files, expect=None, format=kind)
         assert 400 <= problem.status_code < 500, REFUSED[name]
         assert problem.json()["errors"]
-        assert api.get(f"environments/{env}").json()["version"] == 0, "nothing is half stored"
+        assert api.get(f"environments/{env}").json()["version"] == 0, "a rejected upload stores nothing"
         return
     api.upload(env, files, format=kind)
     sources = api.get(f"environments/{env}/versions/latest/sources").json()
     assert {s["name"] for s in sources} == set(files)
     for source in sources[:3]:
         response = api.get(f"environments/{env}/versions/latest/sources/{source['name']}")
-        assert response.content == files[source["name"]], "the original is kept byte for byte"
+        assert response.content == files[source["name"]], "the original is stored byte for byte"
     back = served(api, env, kind)
     if name not in UNCOMPARED:
         assert same(kind, files, back) == []
@@ -169,7 +169,7 @@ def names_in(package: bytes) -> list[str]:
 
 @pytest.mark.parametrize("name", TEMPLATES)
 def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
-    """Zipped in, zipped out: the same information, and the same content as the folder's files by themselves."""
+    """A zipped upload and download keep the information, and equal an upload of the folder's files."""
     root = shared / "data" / "environment_template" / name
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = f"zip-{name.replace('_', '-')}"
@@ -181,7 +181,7 @@ def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, n
     assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-disposition"] == 'attachment; filename="environment.zip"'
     other = api.get(f"/maps/{loose}/environment/environment.zip").content
-    assert names_in(other) == names_in(answer.content), "maps differ by the environment's name alone"
+    assert names_in(other) == names_in(answer.content), "maps differ only by the environment's name"
     assert same("environment", files, {"environment.zip": answer.content}) == []
     report = api.get(f"environments/{env}/versions/latest/reports/environment").json()
     layers = {e["layer"] for e in api.get(f"environments/{env}/versions/latest/layers").json() if e["count"]}
@@ -189,7 +189,7 @@ def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, n
 
 
 def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[str, Any]) -> None:
-    """OSM's nodes in the local frame of a tmap2, against PROJ's own transverse Mercator."""
+    """Compare OSM nodes in the local frame of a tmap2 with PROJ's own transverse Mercator."""
     name = "osm/urban-usa-mn-minnesota-zoo/osm.xml"
     api.post("environments", {"name": "zoo"})
     version = api.upload("zoo", {"osm.xml": (shared / "data" / name).read_bytes()}).json()
@@ -214,7 +214,7 @@ def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[st
 def test_network_keeps_every_node_edge_and_attribute_through_formats(
     api: Api, shared: Path, same: Same, way: list[str]
 ) -> None:
-    """tmap2 → kml, geojson … → tmap2."""
+    """Convert tmap2 → kml, geojson … → tmap2."""
     path = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/topological"
     original = {"network.tmap2.yaml": (path / "network.tmap2.yaml").read_bytes()}
     env = "way-" + "-".join(way)

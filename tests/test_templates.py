@@ -1,4 +1,4 @@
-"""The named sets hold what writers accept; what holds for a format follows from set and environment."""
+"""Template sets have values that writers accept; a format's values follow from set and environment."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def test_template_sets_have_only_valid_values(name: str) -> None:
     for format_name, values in one.values.items():
         assert values, format_name
         checked = templates.check_values(formats.get_format(format_name), values)
-        assert checked == dict(sorted(values.items())), f"{format_name}: values stand as they are kept"
+        assert checked == dict(sorted(values.items())), f"{format_name}: values must have their stored form"
         defaults = {p["name"]: p["default"] for p in parameters.describe(formats.get_format(format_name).write_options)}
         same = [key for key, value in checked.items() if value == defaults[key]]
-        assert not same, f"{format_name}: {same} say the format's own defaults"
+        assert not same, f"{format_name}: {same} repeat the format's own defaults"
 
 
 def test_names_are_unambiguous() -> None:
-    """``set`` stands beside formats' names and parameters' names in a version's changes."""
+    """``set`` is beside names of formats and parameters in a version's changes."""
     assert "set" not in formats.all_formats()
     for fmt in formats.all_formats().values():
         assert "set" not in {p["name"] for p in parameters.describe(fmt.write_options)}
@@ -99,7 +99,7 @@ LANE = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</na
 
 
 def texts(fmt: formats.Format) -> dict[str, str]:
-    """The parameters of a writer that take any text and choose no stored part."""
+    """List a writer's parameters that accept any text and select no stored part."""
     choosing = {"grid", "level", "name", "picture", "world"}
     described = parameters.describe(fmt.write_options)
     return {p["name"]: EVIL for p in described if p["schema"] == {"type": "string"} and p["name"] not in choosing}
@@ -122,4 +122,4 @@ def test_text_values_are_escaped_in_files(name: str) -> None:
     assert {line["from"] for line in converted.report.as_dict()["template"] if line.get("option") in filled} == {
         "request"
     }
-    assert content.count(repr(EVIL)[1:-1]) >= 1, "it came through as a text, whole"
+    assert content.count(repr(EVIL)[1:-1]) >= 1, "the complete text is in the file"

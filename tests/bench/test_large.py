@@ -1,4 +1,4 @@
-"""The benchmark's large maps are maps: each converts, as a small one, and is the same from the same seed."""
+"""The benchmark's synthetic maps convert, in a small size, and are reproducible from their seed."""
 
 from __future__ import annotations
 

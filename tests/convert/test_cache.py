@@ -1,4 +1,4 @@
-"""Made maps on disk: whole or absent, made once for many askers, bounded."""
+"""Cached maps on disk: complete or absent, converted once for concurrent callers, limited in size."""
 
 from __future__ import annotations
 
@@ -90,14 +90,14 @@ def test_leftovers_of_killed_process_are_removed_at_start(tmp_path: Path) -> Non
     (tmp_path / "making-1").mkdir(parents=True)
     (tmp_path / "making-1" / "0").write_bytes(b"half")
     Cache(tmp_path, 10**6)
-    assert (tmp_path / "making-1").exists(), "a sibling process may be at work on it"
+    assert (tmp_path / "making-1").exists(), "a sibling process may be using it"
     os.utime(tmp_path / "making-1", (0, 0))
     Cache(tmp_path, 10**6)
     assert not (tmp_path / "making-1").exists()
 
 
 def flip(path: Path, *, quietly: bool = False) -> None:
-    """Change a byte in the middle. quietly: as bit rot does, which no time tells."""
+    """Change a byte in the middle. quietly: keep the modification time, as bit rot does."""
     before, data = path.stat(), bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -106,7 +106,7 @@ def flip(path: Path, *, quietly: bool = False) -> None:
 
 
 def zero(path: Path) -> None:
-    """What a power cut leaves of a file whose length alone was written."""
+    """Overwrite a file with zeros, as after a power cut that stored only its length."""
     path.write_bytes(bytes(path.stat().st_size))
 
 
@@ -136,10 +136,10 @@ def test_entry_changed_while_server_runs_is_not_served(tmp_path: Path) -> None:
     with pytest.raises(LostMap):
         cached_map.files[0].read()
     assert cache.damaged == 1
-    assert cache.get(key("a")) is None, "what was found damaged is gone"
+    assert cache.get(key("a")) is None, "a damaged entry is removed"
     cached_map = cache.get_or_make(key("a"), product)
     flip(cached_map.files[0].path)
-    assert cache.get(key("a")) is None, "a file that was written to is hashed again"
+    assert cache.get(key("a")) is None, "a changed file is hashed again"
     assert cache.damaged == 2
 
 
@@ -178,7 +178,7 @@ def test_map_that_cannot_be_synced_is_removed(tmp_path: Path, monkeypatch: pytes
     cache = Cache(tmp_path, 10**6)
 
     def sync(path: Path) -> None:
-        if path.is_relative_to(tmp_path):  # tests before this one may still be syncing
+        if path.is_relative_to(tmp_path):  # earlier tests may still be syncing
             synced.append(path)
         if len(synced) > 4:
             raise OSError(errno.EIO, "Input/output error")
@@ -214,7 +214,7 @@ def test_maps_are_served_when_disk_is_full(
             b"PK",
             None,
         )
-    assert cache.misses == 2, "it was made once"
+    assert cache.misses == 2, "converted once"
     assert cache.get(key("before")) == stored
     with cache.hold_files() as hold:
         assert [f.read() for f in (*hold(cached_map).files, *hold(stored).files)] == [b"hello", b"before"]
@@ -238,7 +238,7 @@ def test_check_hashes_every_entry_and_removes_the_damaged_ones(tmp_path: Path) -
 
 
 def refusing(monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
-    """Let reading files of this name fail."""
+    """Make reading of files with this name fail."""
     real = Path.open
 
     def refuse(path: Path, mode: str = "r", **more: Any) -> Any:

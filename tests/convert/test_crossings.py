@@ -1,4 +1,4 @@
-"""A map of a network warns of edges that lead through obstacles, and closures find edges that get nodes at bends."""
+"""Warnings about edges that cross obstacles, and closures of edges that get nodes at bends."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tests.api.conftest import Api
 
 TOPOLOGY = PartKey("topology", GROUND, NETWORK)
 AROUND = [(0.5, 2.5), (0.5, 8.5), (9.5, 8.5), (9.5, 2.5)]
-"""From a to b around a wall on x = 5 that leaves y > 7 free."""
+"""Path from a to b around a wall on x = 5 that leaves y > 7 free."""
 
 
 def site(bend: bool, yaw: float = 0.0, **parts: Part) -> Layers:
-    """Two nodes on both sides of a wall, joined both ways, and one edge along the wall."""
+    """Build two nodes on both sides of a wall, joined in both directions, and one edge along the wall."""
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     at = [tuple(row) for row in (np.array(AROUND) @ turn).tolist()]
     line = at if bend else [at[0], at[-1]]
@@ -128,7 +128,7 @@ HOUSE = ("house", shapely.box(4, -2, 6, 4), {"kind": "building"})
 
 
 def detour(*between: tuple[float, float], inside: bool = False, **parts: Part) -> Layers:
-    """One edge from (0, 0) over these places to (10, 0), or to a node inside of ``HOUSE``."""
+    """Build one edge from (0, 0) via these points to (10, 0), or to a node inside ``HOUSE``."""
     end = (5.0, 0.0) if inside else (10.0, 0.0)
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0, 0), {"kind": "node"}),

@@ -1,4 +1,4 @@
-"""Maps from layers: what their reports say."""
+"""Reports of maps converted from layers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> worker.
 
 
 def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:
-    """The edges of a map, as our own reader finds them; a node is a or b by its place, west or east."""
+    """Read the edges of a map with our own reader; a node is a or b by its position, west or east."""
     (group,), _ = formats.group(files, name)
     out = set()
     for part in formats.read(group, ReadContext()).vector("topology").values():

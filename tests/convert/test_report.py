@@ -1,4 +1,4 @@
-"""A report is the same value after it was JSON on disk."""
+"""A report is unchanged by a round trip through JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps that are put together from the maps of several parts."""
+"""Maps assembled from the maps of several parts."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Pat
 
 
 def tower(*kinds: str) -> Layers:
-    """A grid on two levels, and on L2 a zone of each of these kinds."""
+    """Build a grid on two levels, and on L2 a zone of each of these kinds."""
     cells = np.zeros((4, 6), np.uint8)
     grid = OccupancyGrid(cells, 0.5, (0.0, 0.0, 0.0), "trinary", 0.65, 0.196, False, {})
     parts: dict[PartKey, Any] = {PartKey("occupancy", level, "map"): grid for level in ("ground", "L2")}

@@ -1,4 +1,4 @@
-"""Trials of derivations are remembered over a restart, and a damaged memory is none."""
+"""Trial results survive a restart; damaged ones are ignored."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_trials_stay_in_memory_when_disk_cannot_be_written(tmp_path: Path) -> No
 
 
 class Runs:
-    """Runs jobs at once and counts them."""
+    """Runner that runs jobs immediately and counts them."""
 
     def __init__(self) -> None:
         self.count = 0

@@ -1,4 +1,4 @@
-"""The container files against their schema, linter and each other; the lock file and CI against what they promise."""
+"""Checks of the container files (schema, linter, consistency), the lock file and CI."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bounded part of `make fuzz`: the same mutations on every machine, chosen by Hypothesis where it finds more."""
+"""Bounded part of `make fuzz`: the same mutations on every machine; Hypothesis also chooses some."""
 
 from __future__ import annotations
 

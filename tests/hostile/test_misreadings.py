@@ -1,4 +1,4 @@
-"""Values out of range are refused with their place; what is not understood is reported by name. Nothing is misread."""
+"""Values out of range are rejected with their location; unknown content is reported by name. Nothing is misread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HERE = EnvironmentContext(Datum(50.0, 7.0))
 
 @dataclass(frozen=True)
 class Row:
-    """A sample with one change. sample: folder and main file; others beside it go along. old: a pattern, replaced once.
+    """Sample with one change. sample: folder and main file; its companions are included. old: pattern, replaced once.
 
     refused, warned: a text of the problem (one of the two).
     """
@@ -154,7 +154,7 @@ def test_changed_sample_is_rejected_or_reported(row: Row) -> None:
 
 
 def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
-    """Binary samples with a change, and why they are refused."""
+    """List binary samples with a change, and the reason of their rejection."""
 
     def infinite(data: bytes) -> bytes:
         body = data.index(b"data\n") + 5

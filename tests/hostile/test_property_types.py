@@ -1,6 +1,6 @@
-"""Words that mean something to us, with values of any type: edits and GeoJSON can bring them, no writer may stumble.
+"""Canonical properties with values of any type, from edits or GeoJSON, make no writer fail.
 
-``FLEETMAP_WORDS=500 pytest tests/hostile/test_property_types.py`` (a part of ``make fuzz``) looks longer than CI does.
+``FLEETMAP_WORDS=500 pytest tests/hostile/test_property_types.py`` (a part of ``make fuzz``) runs longer than CI does.
 """
 
 # ruff: noqa: E501 - lists of values
@@ -31,7 +31,7 @@ from tests.hostile.corpus import sample_maps
 
 HERE = Datum(50.0, 7.0, heading=30.0)
 SMALLER = 0.1
-"""The samples' streets, some hundred metres long, are drawn smaller: words are tried here, not how many cells a grid has."""
+"""Scale of the samples' streets, some hundred metres long: these tests need no large grids."""
 VALUES: tuple[Any, ...] = (
     None, True, 0, -5, 2**63 - 1, 1.5, -1e300, 1e300, "", "x", "50", "nan", "\u202e\u200b", "a\nb", "\0", "]]>", "<&>", "-->", [], {},
     [None], [[]], [1, 2, 3], ["a"], [{}], [[1.0, 2.0]], {"a": 1}, {"": {}}, {"name": []}, {"type": []}, {"a:b c": "<"}, [["a", "b", "c"]],
@@ -59,7 +59,7 @@ FOR_EACH = 6
 
 
 def other(value: Any, dice: random.Random) -> Any:
-    """The value with one place in it changed, taken away or added."""
+    """Change, remove or add one member of a value."""
     if isinstance(value, Mapping):
         out = dict(value)
         key = dice.choice([*out, dice.choice(WORDS)]) if out else dice.choice(WORDS)
@@ -79,7 +79,7 @@ def other(value: Any, dice: random.Random) -> Any:
 
 
 def changed(part: Features, dice: random.Random) -> Features:
-    """One feature, or the document, with something else in it."""
+    """Change one feature or the document."""
     geometry, properties, local = part.geometry.copy(), list(part.properties), part.local.copy()
     document = part.document
     kind = dice.random()
@@ -112,7 +112,7 @@ def bases() -> Iterator[tuple[str, Layers]]:
 
 
 def smaller(part: Features) -> Features:
-    """The part with everything near HERE that stands in degrees drawn smaller about it."""
+    """Scale all geometries in degrees near HERE about that point."""
     centre = np.array([HERE.longitude, HERE.latitude])
 
     def nearer(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -126,7 +126,7 @@ def smaller(part: Features) -> Features:
 
 
 def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
-    """Of writing every format, deriving what it takes: exceptions that nobody could tell a user."""
+    """Write every format, with derivations. Returns exceptions that are no errors for users."""
     out: list[tuple[str, BaseException]] = []
     stock = AvailableLayers(frozenset(layers.parts), layers.datum is not None)
     for name, fmt in formats.all_formats().items():
@@ -134,7 +134,7 @@ def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
             written = write(fmt, layers, {}, plan_chain(fmt, stock, fmt.write_options()))
         except FleetMapError as error:
             assert error.detail
-        except Exception as error:  # noqa: BLE001  all of them are what is looked for
+        except Exception as error:  # noqa: BLE001  this test looks for any exception
             out.append((name, error))
         else:
             assert all(isinstance(data, bytes) for data in written.files.values())

@@ -1,4 +1,4 @@
-"""Requests that are JSON and still nonsense: told as a problem, nothing stored."""
+"""Invalid requests in valid JSON are rejected with a problem, and nothing is stored."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 
 
 def nonsense() -> Iterator[tuple[str, str, Any, str]]:
-    """Method, path, JSON, and a word of the refusal."""
+    """Yield method, path, JSON, and a word of the error."""
     for time in ("9999-12-31T23:59:59-23:59", "0001-01-01T00:00:00+23:59"):
         yield "PUT", "environments/farm/channels/staging", {"version": 1, "activate_at": time}, ""
         yield "POST", "tokens", {"name": "a", "role": "viewer", "expires": time}, ""
@@ -72,8 +72,10 @@ def test_edit_with_properties_of_other_types(api: Api, origin: Any) -> None:
 
 
 def test_hostile_networks_are_rejected_or_stored(api: Api) -> None:
-    """The readers of plain YAML networks, in the server's workers: refused with a place or stored, never an error of
-    ours; what is stored can be had back in its own format."""
+    """Plain YAML networks are rejected with a location or stored, never a server error.
+
+    Stored ones can be downloaded in their own format.
+    """
     stored = 0
     for k, case in enumerate(network_cases()):
         env = f"hostile-{k}"

@@ -1,4 +1,4 @@
-"""Compressed uploads that unfold to far more than they are: refused early, with little memory and work."""
+"""Decompression bombs are rejected early, with little memory and time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNFOLDED_BYTES = 32 * 2**20
 
 
 def measured_upload(path: str) -> tuple[str, int, float]:
-    """In a worker: error class of reading this file as an upload, the growth of peak memory, the CPU time."""
+    """Read a file as an upload (in a worker); return the error class, the growth of peak memory, the CPU time."""
     before, start = _peak_bytes(), time.process_time()
     data = Path(path).read_bytes()
     try:
@@ -49,7 +49,7 @@ def _peak_bytes() -> int:
 
 
 def bomb(name: str, size: int, more: dict[str, bytes] | None = None) -> bytes:
-    """An archive with one member of this many zero bytes, written without holding them."""
+    """Build an archive with one member of this many zero bytes, without having them in memory."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for other, body in (more or {}).items():
