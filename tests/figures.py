@@ -30,7 +30,7 @@ from app import native
 from tests.api import samples
 from tests.api.conftest import ADMIN, API, parts, running, settings_for
 from tests.api.test_damage import NETWORK, cached, fill, flip, mounted_disk
-from tests.chaos.test_chaos import check, havoc, lost_versions
+from tests.chaos.test_chaos import check, kill_repeatedly, lost_versions
 from tests.chaos.world import fleet_of
 from tests.cli.conftest import ServerProcess, seconds_until_healthy
 from tests.conftest import TOP
@@ -38,8 +38,8 @@ from tests.hostile import corpus
 from tests.hostile.corpus import Case
 from tests.hostile.test_connections import REFUSED, read_to_end, send_head, trickle
 from tests.hostile.test_kill import kill_while_uploads_arrive
-from tests.hostile.test_misreadings import HERE, ROWS, changed, odd_files
-from tests.hostile.test_requests import nonsense
+from tests.hostile.test_misreadings import HERE, ROWS, bad_binaries, changed
+from tests.hostile.test_requests import invalid_requests
 from tests.hostile.test_unfolding import uploads
 from tests.postgres import running_cluster
 
@@ -63,7 +63,7 @@ def table(*rows: Iterable[object]) -> str:
 def out_of_range() -> Iterator[Case]:
     for k, row in enumerate(ROWS):
         yield Case(f"{row.sample} {k}", changed(row), "refused" if row.refused else "read")
-    for sample, change, _ in odd_files():
+    for sample, change, _ in bad_binaries():
         yield Case(sample, {sample: change((corpus.SAMPLES / sample).read_bytes())}, "refused")
 
 
@@ -183,7 +183,7 @@ def hostile(folder: Path, only: str) -> tuple[str, bool]:
             count = counts.setdefault(REQUESTS, Count())
             client.post(f"{API}/environments", json={"name": "farm"}).raise_for_status()
             client.post(f"{API}/environments/farm/versions", files=parts(corpus.room())).raise_for_status()
-            for method, path, request, _ in nonsense():
+            for method, path, request, _ in invalid_requests():
                 start = usage.cpu_seconds()
                 answer = client.request(method, f"{API}/{path}", json=request)
                 count.seconds = max(count.seconds, usage.cpu_seconds() - start)
@@ -429,7 +429,7 @@ def wrong_clock(folder: Path, times: int) -> Outcome:
 
 def kill(target: str, folder: Path, times: int) -> Outcome:
     with running_cluster() as cluster, fleet_of(folder, cluster, own_router=True, seed=5) as fleet:
-        healthy = havoc(fleet, {target: times})
+        healthy = kill_repeatedly(fleet, {target: times})
         check(fleet)
         versions = fleet.world.get("environments/farm/versions?limit=1000")
         absent = lost_versions(fleet, {v["version"]: v["message"] for v in versions})

@@ -96,7 +96,7 @@ def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
     return {p.relative_to(path.parent).as_posix(): p.read_bytes() for p in paths}
 
 
-def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
+def download(api: Api, env: str, kind: str) -> dict[str, bytes]:
     """Download all files of a map, by the short URL for robots."""
     import io
     import zipfile
@@ -128,7 +128,7 @@ def test_samples_keep_their_information(
     for source in sources[:3]:
         response = api.get(f"environments/{env}/versions/latest/sources/{source['name']}")
         assert response.content == files[source["name"]], "the original is stored byte for byte"
-    back = served(api, env, kind)
+    back = download(api, env, kind)
     if name not in UNCOMPARED:
         assert same(kind, files, back) == []
 
@@ -157,10 +157,10 @@ def test_template_folder_is_one_version(api: Api, shared: Path, same: Same, name
         assert same("occupancy_grid", original, answer) == []
     if any(n.endswith("network.tmap2.yaml") for n in files):
         network = next(n for n in used if "topological" in n and n.endswith(".tmap2.yaml"))
-        assert same("tmap2", {"a.tmap2.yaml": files[network]}, served(api, env, "tmap2")) == []
+        assert same("tmap2", {"a.tmap2.yaml": files[network]}, download(api, env, "tmap2")) == []
     if any("datum" in n for n in used):
         site = next(n for n in used if "datum" in n)
-        assert same("datum", {"datum.yaml": files[site]}, served(api, env, "datum")) == []
+        assert same("datum", {"datum.yaml": files[site]}, download(api, env, "datum")) == []
 
 
 def names_in(package: bytes) -> list[str]:
@@ -222,8 +222,8 @@ def test_network_keeps_every_node_edge_and_attribute_through_formats(
     api.post("environments", {"name": env, "datum": datum})
     api.upload(env, original)
     for k, kind in enumerate(way):
-        files = served(api, env, kind)
+        files = download(api, env, kind)
         env = f"{env}-{k}"
         api.post("environments", {"name": env, "datum": datum})
         api.upload(env, files, format=kind)
-    assert same("tmap2", original, served(api, env, "tmap2")) == []
+    assert same("tmap2", original, download(api, env, "tmap2")) == []

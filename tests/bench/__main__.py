@@ -1,4 +1,4 @@
-"""Measure conversions against floors, first GET against the bare conversion, GETs against a peer, large maps, events."""
+"""Measure conversions against floors, first GET against conversion, GETs against a peer, large maps, events."""
 
 from __future__ import annotations
 

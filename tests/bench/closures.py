@@ -21,7 +21,7 @@ from app.agent.agent import Agent
 from app.agent.options import AgentOptions
 from app.events import messages
 from tests.bench import http
-from tests.bench.events import ENVIRONMENT, TOKEN, served
+from tests.bench.events import ENVIRONMENT, TOKEN, serve_network
 
 ROBOTS = 100
 PROCESSES = 10
@@ -38,7 +38,7 @@ def rows() -> list[dict[str, Any]]:
     with (
         tempfile.TemporaryDirectory() as folder,
         tempfile.TemporaryDirectory(dir=memory) as disks,
-        served(Path(folder), port, zenoh_port) as client,
+        serve_network(Path(folder), port, zenoh_port) as client,
     ):
         base = f"/api/v1/environments/{ENVIRONMENT}"
         client.put(f"{base}/channels/{CHANNEL}", json={"version": 1}).raise_for_status()

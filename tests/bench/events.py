@@ -65,7 +65,7 @@ def network(moved: float = 0.0, count: int = 100) -> bytes:
 
 
 @contextlib.contextmanager
-def served(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
+def serve_network(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
     """Run a server with an environment of one network, and yield a client."""
     native = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
     native.fill(native)  # compile before the measurement
@@ -124,7 +124,7 @@ def latency() -> list[dict[str, Any]]:
     commit is the last change of the store's commit counter (``app.store.commit_counter``) before the first delivery.
     """
     port, zenoh_port = http.free_port(), http.free_port()
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
+    with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:
         sessions = [open_session(zenoh_port) for _ in range(SESSIONS)]
         arrived: list[tuple[float, bytes]] = []
         bare: list[tuple[float, bytes]] = []
@@ -319,7 +319,7 @@ def convergence() -> list[dict[str, Any]]:
     disk = Path(tempfile.mkdtemp(dir=shared))
     more = {"FLEETMAP_ZENOH_MODE": "client", "FLEETMAP_ZENOH_CONNECT": endpoint, "FLEETMAP_ZENOH_ADVERTISE": endpoint}
     try:
-        with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port, **more) as client:
+        with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port, **more) as client:
             robots = _Robots(f"http://127.0.0.1:{port}", zenoh_port, disk)
             _until(lambda: len(robots.times("active", 1)) == ROBOTS and len(robots.times("connected")) == ROBOTS, 300)
             # All receive a change at once: one conversion.
@@ -386,7 +386,7 @@ def conversions(client: httpx.Client) -> int:
 def costs() -> list[dict[str, Any]]:
     """Measure the bytes for small changes of a real site."""
     port, zenoh_port = http.free_port(), http.free_port()
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
+    with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:
 
         def upload(env: str, files: dict[str, bytes]) -> None:
             client.post("/api/v1/environments", json={"name": env})

@@ -32,18 +32,18 @@ pytestmark = pytest.mark.timeout(240 + 3 * KILLS * SECONDS_A_KILL)
 def test_postgresql_with_own_router_survives_kills(tmp_path: Path, postgres_cluster: Cluster) -> None:
     each = {"server": KILLS - KILLS // 2, "router": KILLS - KILLS // 2, "database": KILLS}
     with fleet_of(tmp_path, postgres_cluster, own_router=True, seed=SEED) as fleet:
-        havoc(fleet, each)
+        kill_repeatedly(fleet, each)
         check(fleet)
 
 
 def test_sqlite_with_separate_router_survives_kills(tmp_path: Path) -> None:
     each = {"server": KILLS // 2, "router": KILLS // 2}
     with fleet_of(tmp_path, None, own_router=False, seed=SEED + 100) as fleet:
-        havoc(fleet, each)
+        kill_repeatedly(fleet, each)
         check(fleet)
 
 
-def havoc(fleet: Fleet, each: dict[str, int]) -> list[float]:
+def kill_repeatedly(fleet: Fleet, each: dict[str, int]) -> list[float]:
     """Kill each process ``each`` times in random order, in each phase in turn. Returns seconds until /healthz."""
     world, dice = fleet.world, random.Random(SEED)
     order = [target for target, count in each.items() for _ in range(count)]

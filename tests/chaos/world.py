@@ -306,7 +306,7 @@ class Watcher:
         try:
             while not self.stopping.wait(0.05):
                 for robot in self._robots:
-                    sequence = look(robot.into)
+                    sequence = check_current_map(robot.into)
                     if sequence is not None:
                         self.looks += 1
                         name = robot.into.name
@@ -322,7 +322,7 @@ class Watcher:
             raise self.problem
 
 
-def look(into: Path) -> int | None:
+def check_current_map(into: Path) -> int | None:
     """Return the sequence of the current map after verifying its files; None if there is no map yet."""
     for _ in range(20):
         try:
@@ -339,7 +339,7 @@ def look(into: Path) -> int | None:
         except FileNotFoundError:
             # After three more switches the old version was removed. The current one must be complete.
             assert (into / "current").resolve() != version, f"{into.name}: the current map lacks a file"
-    raise AssertionError(f"{into.name} switches faster than anybody can look")
+    raise AssertionError(f"{into.name} switches faster than its map can be read")
 
 
 class Fleet:

@@ -153,7 +153,7 @@ def test_changed_sample_is_rejected_or_reported(row: Row) -> None:
     assert row.where in (findings[0].where or "")
 
 
-def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
+def bad_binaries() -> list[tuple[str, Callable[[bytes], bytes], str]]:
     """List binary samples with a change, and the reason of their rejection."""
 
     def infinite(data: bytes) -> bytes:
@@ -177,7 +177,7 @@ def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
     ]
 
 
-@pytest.mark.parametrize(("sample", "change", "reason"), odd_files(), ids=lambda v: v if isinstance(v, str) else "")
+@pytest.mark.parametrize(("sample", "change", "reason"), bad_binaries(), ids=lambda v: v if isinstance(v, str) else "")
 def test_changed_binary_sample_is_rejected(sample: str, change: Callable[[bytes], bytes], reason: str) -> None:
     data = (SAMPLES / sample).read_bytes()
     read({sample: data})

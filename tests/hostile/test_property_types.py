@@ -58,7 +58,7 @@ ROUNDS = int(os.environ.get("FLEETMAP_WORDS", "8"))
 FOR_EACH = 6
 
 
-def other(value: Any, dice: random.Random) -> Any:
+def mutated_value(value: Any, dice: random.Random) -> Any:
     """Change, remove or add one member of a value."""
     if isinstance(value, Mapping):
         out = dict(value)
@@ -66,29 +66,29 @@ def other(value: Any, dice: random.Random) -> Any:
         if key in out and dice.random() < 0.15:
             del out[key]
         elif key in out and dice.random() < 0.6:
-            out[key] = other(out[key], dice)
+            out[key] = mutated_value(out[key], dice)
         else:
             out[key] = dice.choice(VALUES)
         return out
     if isinstance(value, list) and value and dice.random() < 0.7:
         rows = list(value)
         at = dice.randrange(len(rows))
-        rows[at] = other(rows[at], dice)
+        rows[at] = mutated_value(rows[at], dice)
         return rows if dice.random() < 0.8 else rows[:at]
     return dice.choice(VALUES)
 
 
-def changed(part: Features, dice: random.Random) -> Features:
+def mutated_part(part: Features, dice: random.Random) -> Features:
     """Change one feature or the document."""
     geometry, properties, local = part.geometry.copy(), list(part.properties), part.local.copy()
     document = part.document
     kind = dice.random()
     if kind < 0.2 or not len(part):
-        document = other(document, dice)
+        document = mutated_value(document, dice)
     else:
         k = dice.randrange(len(part))
         if kind < 0.8:
-            properties[k] = other(properties[k], dice)
+            properties[k] = mutated_value(properties[k], dice)
         else:
             geometry[k] = dice.choice(SHAPES)
             local[k] = dice.random() < 0.5
@@ -107,11 +107,11 @@ def bases() -> Iterator[tuple[str, Layers]]:
                 Limits(),
             )
             layers = upload_bundle.layers(HERE)
-            parts = {key: smaller(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
+            parts = {key: scaled_part(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
             yield f"{name}/{min(files)}{f' as {layer}' if layer else ''}", Layers(parts, layers.datum, layers.levels)
 
 
-def smaller(part: Features) -> Features:
+def scaled_part(part: Features) -> Features:
     """Scale all geometries in degrees near HERE about that point."""
     centre = np.array([HERE.longitude, HERE.latitude])
 
@@ -125,7 +125,7 @@ def smaller(part: Features) -> Features:
     return Features(part.ids, geometry, part.properties, part.local, part.document)
 
 
-def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
+def writer_bugs(layers: Layers) -> list[tuple[str, BaseException]]:
     """Write every format, with derivations. Returns exceptions that are no errors for users."""
     out: list[tuple[str, BaseException]] = []
     stock = AvailableLayers(frozenset(layers.parts), layers.datum is not None)
@@ -152,8 +152,8 @@ def test_property_values_of_any_type_break_no_writer(layers: Layers) -> None:
         parts = dict(layers.parts)
         for _ in range(dice.randint(1, FOR_EACH)):
             key = dice.choice(vector)
-            parts[key] = changed(parts[key], dice)  # type: ignore[arg-type]
-        for name, error in bugs(Layers(parts, layers.datum, layers.levels)):
+            parts[key] = mutated_part(parts[key], dice)  # type: ignore[arg-type]
+        for name, error in writer_bugs(Layers(parts, layers.datum, layers.levels)):
             place = traceback.extract_tb(error.__traceback__)[-1]
             failures.setdefault(f"{name}: {type(error).__name__} {place.filename}:{place.lineno}", f"{error}"[:200])
     assert not failures, "\n".join(f"{place}  {text}" for place, text in sorted(failures.items()))

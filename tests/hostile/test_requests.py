@@ -23,7 +23,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield api
 
 
-def nonsense() -> Iterator[tuple[str, str, Any, str]]:
+def invalid_requests() -> Iterator[tuple[str, str, Any, str]]:
     """Yield method, path, JSON, and a word of the error."""
     for time in ("9999-12-31T23:59:59-23:59", "0001-01-01T00:00:00+23:59"):
         yield "PUT", "environments/farm/channels/staging", {"version": 1, "activate_at": time}, ""
@@ -46,7 +46,7 @@ def nonsense() -> Iterator[tuple[str, str, Any, str]]:
 
 
 def test_invalid_requests_are_rejected_and_store_nothing(api: Api) -> None:
-    for method, path, body, word in nonsense():
+    for method, path, body, word in invalid_requests():
         assert word in api.problem(method, path, 422, json=body)["detail"]
     assert api.get("environments/farm").json()["version"] == 1
 
