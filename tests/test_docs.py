@@ -35,15 +35,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from mkdocs.exceptions import Abort
 
     folder = tmp_path_factory.mktemp("site")
-    said: list[str] = []
+    messages: list[str] = []
     handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
     log = logging.getLogger("mkdocs")
     log.addHandler(handler)
     try:
         build_pages(load_config(str(ROOT / ".mkdocs.yml"), site_dir=str(folder), strict=True))
     except Abort:
-        pytest.fail("\n".join(said))
+        pytest.fail("\n".join(messages))
     finally:
         log.removeHandler(handler)
     return folder
@@ -102,28 +102,28 @@ def test_every_setting_is_documented(pages: Mapping[str, str]) -> None:
 
 @pytest.mark.parametrize("name", sorted(all_formats()))
 def test_every_format_has_a_page(pages: Mapping[str, str], name: str) -> None:
-    known = all_formats()[name]
+    fmt = all_formats()[name]
     page = pages[f"reference/formats/{name}.html"]
-    assert known.title in page
+    assert fmt.title in page
     assert name in words(pages["reference/formats.html"])
-    for file in known.files:
+    for file in fmt.files:
         assert file in page
-    options = (known.write_options if known.write else None, known.read_options if known.read else None)
+    options = (fmt.write_options if fmt.write else None, fmt.read_options if fmt.read else None)
     for field in (f for cls in options if cls for f in dataclasses.fields(cls)):
         assert field.name in words(page)
-        assert field.metadata["doc"], f"{name}: {field.name} does not say what it means"
-    assert ("Rules of its consumers" in page) == (known.check is not None)
+        assert field.metadata["doc"], f"{name}: {field.name} has no description"
+    assert ("Rules of its consumers" in page) == (fmt.check is not None)
 
 
 @pytest.mark.parametrize("kind", ["derivations", "generators"])
 def test_every_derivation_and_generator_is_documented(pages: Mapping[str, str], kind: str) -> None:
-    known: Mapping[str, Any] = derive.all_derivations() if kind == "derivations" else generate.all_generators()
+    declared: Mapping[str, Any] = derive.all_derivations() if kind == "derivations" else generate.all_generators()
     page = pages[f"reference/{kind}.html"]
-    for name, one in known.items():
+    for name, one in declared.items():
         assert name in words(page)
         for field in dataclasses.fields(one.parameters):
             assert field.name in words(page), f"{name}: {field.name}"
-            assert field.metadata["doc"], f"{name}: {field.name} does not say what it means"
+            assert field.metadata["doc"], f"{name}: {field.name} has no description"
 
 
 def test_every_route_is_documented(pages: Mapping[str, str], schema: dict[str, Any]) -> None:

@@ -105,10 +105,10 @@ def texts(fmt: formats.Format) -> dict[str, str]:
     return {p["name"]: EVIL for p in described if p["schema"] == {"type": "string"} and p["name"] not in choosing}
 
 
-SAYING = [known.name for known in formats.all_formats().values() if texts(known)]
+WITH_TEXTS = [fmt.name for fmt in formats.all_formats().values() if texts(fmt)]
 
 
-@pytest.mark.parametrize("name", SAYING)
+@pytest.mark.parametrize("name", WITH_TEXTS)
 def test_text_values_are_escaped_in_files(name: str) -> None:
     fmt = formats.get_format(name)
     options = templates.check_values(fmt, texts(fmt))

@@ -144,7 +144,7 @@ def test_what_follows_the_pixels_is_another_picture() -> None:
         (b"", "unknown type"),
         (b"GIF89a", "unknown type"),
         (b"P9 1 1 255\n", "unknown type"),
-        (b"P1 1 1\n0", "PBM or PPM"),
+        (b"P1 1 1\n0", "PBM and PPM"),
         (b"P5 ", "width"),
         (b"P5 2", "height"),
         (b"P5 2 2", "highest value"),

@@ -122,7 +122,7 @@ def test_lines_may_end_as_windows_ends_them() -> None:
         ("a: {b: 1, b: 2}\n", 1, "duplicate key"),
         ("a: 1\n1: x\n'1': y\n", 3, "duplicate key"),
         ("a: &a {b: 1}\nc:\n  <<: *a\n", 3, "merge"),
-        ("a: 1\n---\nb: 1\n", 2, "second document"),
+        ("a: 1\n---\nb: 1\n", 2, "only one document"),
         ("a: !!python/object/apply:os.system [ls]\n", 1, "tag"),
         ("a: !!python/name:os.system\n", 1, "tag"),
         ("a: !foo b\n", 1, "tag"),
