@@ -48,7 +48,7 @@ chaos: install-dev
 # Mutations of every sample through the read boundary, for some minutes: ARGS="--minutes 30 --seed 7 --format kml".
 # First more of what `make test` tries some hundred times: texts in YAML, and odd values of words.
 fuzz: install-dev
-	@FLEETMAP_EXAMPLES=2000 FLEETMAP_WORDS=50 $(BIN)/python -m pytest -q -n auto tests/formats/test_yaml.py tests/hostile/test_words.py
+	@FLEETMAP_EXAMPLES=2000 FLEETMAP_WORDS=50 $(BIN)/python -m pytest -q -n auto tests/formats/test_yaml.py tests/hostile/test_property_types.py
 	@$(BIN)/python -m tests.hostile.fuzz $(ARGS)
 
 # The two tables of docs/security.md: hostile input and faults.

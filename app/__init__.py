@@ -1,3 +1,3 @@
-"""Fleet Map Server: every environment's maps, versioned in canonical layers, for every robot in its own format."""
+"""Fleet Map Server: stores versioned maps of environments and serves each robot the format that it needs."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""What formats and derivations can do, as clients and the command line see it: no web, no store."""
+"""Descriptions of formats and derivations for clients and the command line; needs no web server and no store."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.model.layers import CONTENT_LAYERS, Layer
 def describe_format(fmt: Format) -> dict[str, Any]:
     """Describe a format as JSON.
 
-    ``information`` is what a file of it gives, itself or by derivation.
+    ``information``: the layers that a file of it provides, directly or by derivation.
     """
     return {
         "id": fmt.name,
@@ -58,7 +58,7 @@ def _options(fmt: Format) -> list[dict[str, Any]]:
 
 
 def _information(fmt: Format, layer: Layer) -> str:
-    carried = fmt.layers - ({"occupancy"} if fmt.traits.outlines else frozenset())  # where a grid lies is no grid
+    carried = fmt.layers - ({"occupancy"} if fmt.traits.outlines else frozenset())  # the outline of a grid is no grid
     if layer in carried:
         return "raw"
     return "derived" if derive.plan(carried, frozenset({layer})) is not None else "-"

@@ -1,6 +1,6 @@
-"""The one error tree. It knows no HTTP; ``app.api.http.problems`` maps a class to a status.
+"""Error classes. They are independent of HTTP; ``app.api.http.problems`` maps each class to a status.
 
-Every error says in ``detail`` what went wrong and what the user can do about it; ``problems`` name the places.
+``detail`` of an error states what is wrong and what to do about it; ``problems`` name the locations.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""What writing fails with where the disk is full, or a quota or the process's limit is reached."""
+"""Error numbers of a failed write: disk full, quota reached, or file size limit of the process."""
 
 BROKEN_STORAGE_ERRNOS = frozenset({errno.EIO, errno.EBADMSG, errno.EUCLEAN})
-"""What reading damaged storage fails with. All others (too many open files, no permission) say nothing about bytes."""
+"""Error numbers of reading damaged storage. Others (too many open files, no permission) do not indicate damage."""
 
 
 def system_reason(error: OSError) -> str:
-    """Why the system refuses, without the path, for clients and the log."""
+    """Return the reason of a system error without the path, for clients and the log."""
     return os.strerror(error.errno) if error.errno else type(error).__name__
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong or doubtful, and where: file name, line (from 1), key or element path.
+    """Problem and its location: file name, line (from 1), key or element path.
 
-    level: of a finding about a served or checked map: ``error`` where its consumer would refuse or misread it,
-    ``warning`` where it may not like it.
+    level: for findings of a map check: ``error`` if the consumer would reject or misread the map, ``warning`` if it
+    might.
     """
 
     problem: str
@@ -38,14 +38,14 @@ class Problem:
     level: Literal["error", "warning"] | None = None
 
     def as_dict(self) -> dict[str, str | int]:
-        """The problem as JSON, without its empty members."""
+        """Convert the problem to JSON, without empty members."""
         members = {"file": self.file, "line": self.line, "where": self.where, "problem": self.problem}
         members |= {"level": self.level}
         return {name: value for name, value in members.items() if value is not None}
 
 
 class FleetMapError(Exception):
-    """Base of all errors that a user can be told about."""
+    """Base class of all errors that are reported to users."""
 
     def __init__(self, detail: str, problems: Sequence[Problem] = ()) -> None:
         super().__init__(detail)
@@ -61,37 +61,37 @@ class NotFound(FleetMapError):
 
 
 class Gone(NotFound):
-    """It was here and has been deleted."""
+    """A resource that has been deleted."""
 
 
 class Invalid(FleetMapError):
-    """A parameter, name or request body that cannot be used."""
+    """Invalid parameter, name or request body."""
 
 
 class BadUpload(FleetMapError):
-    """An upload that cannot be taken in."""
+    """Upload that cannot be stored."""
 
 
 class UnreadableFile(BadUpload):
-    """A file that is not what its format says."""
+    """File that violates its format."""
 
 
 class TooLarge(BadUpload):
-    """An upload, what it would unfold to, or an answer over Zenoh, beyond a limit (limits are settings)."""
+    """Upload, its uncompressed content, or Zenoh reply above a limit (limits are settings)."""
 
 
 class UnsafeArchive(BadUpload):
-    """An archive with links, escaping names, overlaps or encrypted members."""
+    """Archive with links, names outside of it, overlaps or encrypted members."""
 
 
 class CannotConvert(FleetMapError):
-    """The stored layers do not give the wanted map; ``detail`` says what to supply."""
+    """The stored layers cannot be converted to the requested map; ``detail`` states what to supply."""
 
 
 class CannotDerive(CannotConvert):
-    """A derivation found nothing in the stored content that it can use; ``step`` is its name.
+    """A derivation found no usable content; ``step`` is its name.
 
-    choose: it found several things, and none was named.
+    choose: it found several candidates, and the request selects none.
     """
 
     def __init__(self, detail: str, problems: Sequence[Problem] = (), step: str = "", *, choose: bool = False) -> None:
@@ -103,7 +103,7 @@ class CannotDerive(CannotConvert):
 
 
 class CannotGenerate(FleetMapError):
-    """A generator cannot make a site of these parameters; ``detail`` says which to change."""
+    """A generator cannot create a site with these parameters; ``detail`` states which to change."""
 
 
 class MissingLayer(CannotConvert):
@@ -111,15 +111,15 @@ class MissingLayer(CannotConvert):
 
 
 class MissingDatum(CannotConvert):
-    """The format speaks of places on earth and the environment has no datum."""
+    """The format needs WGS 84 coordinates and the environment has no datum."""
 
 
 class Ambiguous(CannotConvert):
-    """Several parts fit and none was named."""
+    """Several parts match and the request selects none."""
 
 
 class Conflict(FleetMapError):
-    """The request does not fit the present state (a taken name, a reused idempotency key)."""
+    """The request conflicts with the current state (name already exists, idempotency key reused)."""
 
 
 class StaleParent(Conflict):
@@ -127,36 +127,36 @@ class StaleParent(Conflict):
 
 
 class Denied(FleetMapError):
-    """A token without the role or the scope that the call needs."""
+    """Token without the role or the scope that the call requires."""
 
 
 class Unauthenticated(Denied):
-    """No token, or an unknown or expired one."""
+    """Missing, unknown or expired token."""
 
 
 class InvalidLink(Denied):
-    """A signed link that was altered or never made here, or whose environment is deleted."""
+    """Signed link that was altered, was not created by this server, or whose environment is deleted."""
 
 
 class ExpiredLink(Denied):
-    """A signed link whose time is over."""
+    """Expired signed link."""
 
 
 class Unavailable(FleetMapError):
-    """Not now: too much work, a store that does not answer. Trying again later may help."""
+    """Temporarily unavailable: overload, or no response from the store. Retry later."""
 
 
 class NoRoom(Unavailable):
-    """The server's disk is full: nothing can be stored, what is stored can be read."""
+    """The server's disk is full: writes fail, reads work."""
 
 
 class DatabaseDamaged(Unavailable):
-    """The database itself is malformed, missing or was replaced: an operator must act."""
+    """The database is malformed, missing or was replaced: an operator must act."""
 
 
 class Damaged(FleetMapError):
-    """Stored bytes that no longer match their hash. An alarm, never served."""
+    """Stored bytes that do not match their hash; never served."""
 
 
 class Untrusted(FleetMapError):
-    """What a robot was told and must not believe: a foreign signature, an old or expired manifest, wrong bytes."""
+    """Data that a robot must reject: a foreign signature, an old or expired manifest, wrong bytes."""

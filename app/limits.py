@@ -1,4 +1,4 @@
-"""What an upload may cost."""
+"""Resource limits of an upload."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from app.errors import Problem, TooLarge
 
 UNPACKED_FREE_BYTES = 16 * 2**20
-"""Bytes that compressed content may unfold to whatever its ratio is."""
+"""Uncompressed size in bytes that is allowed for any compression ratio."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an upload may hold. Every number is a setting; the defaults let real maps pass."""
+    """Limits of an upload. Every number is a setting; the defaults are above the size of real maps."""
 
     upload_bytes: int = 512 * 2**20
     unpacked_bytes: int = 1024 * 2**20
@@ -30,17 +30,17 @@ class Limits:
     warnings: int = 1000
 
     def max_unpacked(self, packed: int, free: int = UNPACKED_FREE_BYTES) -> int:
-        """Compute the maximum number of bytes that compressed content may unfold to.
+        """Compute the maximum uncompressed size of compressed content, in bytes.
 
         Args:
             packed: bytes of the compressed content.
-            free: bytes that any content may unfold to, whatever its ratio; small real files compress well.
+            free: bytes allowed for any compression ratio; small real files compress well.
         """
         return min(self.unpacked_bytes, max(free, self.unpacked_ratio * packed))
 
     def check_unpacked(self, size: int, packed: int) -> None:
-        """Raise TooLarge if this much compressed content must not unfold to this many bytes."""
+        """Raise TooLarge if ``size`` uncompressed bytes are too many for ``packed`` compressed bytes."""
         bound = self.max_unpacked(packed)
         if size > bound:
-            reason = f"{packed} bytes unfold to more than {bound} bytes, which is the limit"
+            reason = f"{packed} bytes decompress to more than the limit of {bound} bytes"
             raise TooLarge(f"{reason}: upload it uncompressed, or in parts", [Problem(reason)])

@@ -1,13 +1,12 @@
-"""Signed links: an address of a map that needs no token until it expires.
+"""Signed links: URLs of maps that work without a token until they expire.
 
-A link is the map's address with two more query parameters: ``expires`` (seconds since 1970) and ``signature``
-(``<environment id>.<HMAC-SHA-256 in base64url>``). The code covers the environment's id, the path, all other parameters
-in the order of their names, and the expiry. The id makes a link end with its environment, also where another
-environment gets the same name. The secrets are a file that only the server reads; all processes of a data folder share
-it.
+A link is the map's URL with two more query parameters: ``expires`` (seconds since 1970) and ``signature``
+(``<environment id>.<HMAC-SHA-256 in base64url>``). The HMAC covers the environment's id, the path, all other parameters
+sorted by name, and the expiry. Because of the id a link ends with its environment, even if another environment gets the
+same name. The secrets are in a file that only the server reads; all processes of a data directory share it.
 
-A link that was seen to be over stays so, also where the clock is set back: each secret has the latest expiry
-that was seen to have passed, and its links that expire no later are refused.
+A link that was once rejected as expired stays expired, even if the clock is set back: each secret stores the latest
+such expiry, and its links that do not expire later are rejected.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ _PURPOSE = "fleetmap-link-1"
 
 @dataclass(frozen=True, slots=True)
 class SignedAddress:
-    """An address with a signature, which is not checked yet.
+    """URL with a signature that is not checked yet.
 
     path: percent-decoded. query: the map's own parameters, percent-encoded, without ``expires`` and ``signature``.
     expires: seconds since 1970.
@@ -57,12 +56,12 @@ class SignedAddress:
 
     @property
     def environment_id(self) -> str:
-        """Id of the environment that the link was made for, as the link states it."""
+        """Id of the link's environment, as the link states it."""
         return self.signature.partition(".")[0]
 
 
 def parse(path: str, query: bytes) -> SignedAddress | None:
-    """Read a signed address; None for an address without ``signature``.
+    """Parse a signed URL; None for a URL without ``signature``.
 
     Raises:
         InvalidLink: ``expires`` is missing or no number, a parameter is duplicate, or the query cannot be read.
@@ -74,23 +73,23 @@ def parse(path: str, query: bytes) -> SignedAddress | None:
     except ValueError:
         raise InvalidLink(
             "the link's query cannot be read: it must be percent-encoded UTF-8 with at most "
-            f"{MAX_PARAMETERS} parameters; use the link exactly as it was given"
+            f"{MAX_PARAMETERS} parameters; use the link exactly as received"
         ) from None
     values = dict(pairs)
     if SIGNATURE not in values:
         return None
     if len(values) != len(pairs):
-        raise InvalidLink("the link has a duplicate parameter: use it exactly as it was given")
+        raise InvalidLink("the link has a duplicate parameter: use it exactly as received")
     signature, text = values.pop(SIGNATURE), values.pop(EXPIRES, "")
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise InvalidLink(
-            "the link has no valid 'expires' (seconds since 1970): use it exactly as it was given, or request a new one"
+            "the link has no valid 'expires' (seconds since 1970): use it exactly as received, or request a new one"
         )
     return SignedAddress(path, _canonical(values), int(text), signature)
 
 
 def sign(secret: bytes, environment_id: str, path: str, parameters: Mapping[str, str], expires: int) -> str:
-    """Create the query of a signed link: the parameters in the order of their names, the expiry, the signature."""
+    """Create the query of a signed link: the parameters sorted by name, the expiry, the signature."""
     query = _canonical(parameters)
     code = _code(secret, environment_id, path, query, expires)
     ending = urlencode({EXPIRES: expires, SIGNATURE: f"{environment_id}.{code}"})
@@ -98,9 +97,9 @@ def sign(secret: bytes, environment_id: str, path: str, parameters: Mapping[str,
 
 
 def check(keys: list[bytes], address: SignedAddress) -> int:
-    """Check a link's signature against each valid secret, in constant time; the index of its secret.
+    """Check a link's signature against each valid secret, in constant time. Returns the index of its secret.
 
-    Raises InvalidLink: it was altered, or was not made by this server.
+    Raises InvalidLink if it was altered or not created by this server.
     """
     environment_id, _, code = address.signature.partition(".")
     given = code.encode("utf-8", "surrogatepass")
@@ -111,8 +110,8 @@ def check(keys: list[bytes], address: SignedAddress) -> int:
             match_index = index
     if match_index < 0:
         raise InvalidLink(
-            "the link's signature does not match its address: it was altered, its secret is no longer valid, or "
-            "another server made it; use it exactly as it was given, or request a new one"
+            "the link's signature does not match its URL: it was altered, its secret is no longer valid, or "
+            "another server created it; use it exactly as received, or request a new one"
         )
     return match_index
 
@@ -129,8 +128,10 @@ def _code(secret: bytes, environment_id: str, path: str, query: bytes, expires: 
 
 @dataclass(frozen=True, slots=True)
 class _Secret:
-    """until: seconds since 1970 up to which links made with it are valid; None for the newest. over: latest expiry
-    of its links that was seen to have passed.
+    """Secret of links.
+
+    until: end of the validity of its links, in seconds since 1970; None for the newest. over: latest expiry of its
+    links that were rejected as expired.
     """
 
     value: bytes
@@ -139,7 +140,7 @@ class _Secret:
 
 
 class LinkSecrets:
-    """The secrets of a folder, in ``links.json``; created when first needed. Safe for threads and processes."""
+    """Secrets of a data directory, in ``links.json``; created on first use. Safe for threads and processes."""
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / "links.json"
@@ -147,17 +148,17 @@ class LinkSecrets:
         self._cached: tuple[int, list[_Secret]] | None = None
 
     def newest(self) -> bytes:
-        """The secret that signs."""
+        """Return the secret that signs new links."""
         return self._load()[0].value
 
     def signing(self, now: float, expires: float) -> bytes:
-        """The secret for a link that expires then; a new one if it would be refused.
+        """Return the secret for a link that expires at ``expires``; a new one if the link would be rejected.
 
-        That happens after the clock was set back. All older links end.
+        A new one is needed after the clock was set back. It invalidates all older links.
         """
         newest = self._load()[0]
         if now < expires <= newest.over:
-            log.warning("links: replaced the secret, for the clock was set back; all older links end")
+            log.warning("links: clock was set back; secret replaced, all older links are invalid")
             with self._exclusive():
                 if self._read()[0].value == newest.value:
                     self._write([_new_secret()])
@@ -167,8 +168,8 @@ class LinkSecrets:
         """Check a link.
 
         Raises:
-            InvalidLink: it was altered, its secret is no longer valid, or another server made it.
-            ExpiredLink: it is genuine, but its time is over, or was once.
+            InvalidLink: it was altered, its secret is no longer valid, or another server created it.
+            ExpiredLink: it is genuine, but has expired, or was once rejected as expired.
         """
         secrets = self._valid(now)
         secret = secrets[check([s.value for s in secrets], address)]
@@ -179,7 +180,7 @@ class LinkSecrets:
         raise ExpiredLink("the link has expired: request a new one")
 
     def valid(self, now: float) -> list[bytes]:
-        """All secrets whose links are still accepted, the newest first."""
+        """List the secrets whose links are still accepted, newest first."""
         return [s.value for s in self._valid(now)]
 
     def rotate(self, now: float, seconds: float) -> None:
@@ -190,19 +191,19 @@ class LinkSecrets:
             self._write([_new_secret(), *valid_secrets][:MAX_SECRETS])
 
     def _valid(self, now: float) -> list[_Secret]:
-        """The valid secrets; those whose time is over are deleted, so that no change of the clock revives them."""
+        """Return the valid secrets and delete expired ones, so that no change of the clock makes them valid again."""
         stored_secrets = self._load()
         if any(s.until is not None and s.until <= now for s in stored_secrets):
             self._change(lambda s: s if s.until is None or now < s.until else None)
         return [s for s in stored_secrets if s.until is None or now < s.until]
 
     def _change(self, change: Callable[[_Secret], _Secret | None]) -> None:
-        """Change each secret in the file, or delete it. If that fails it is done when the need is seen again."""
+        """Update or delete each secret in the file. A failed write is only logged: the next check repeats it."""
         try:
             with self._exclusive():
                 self._write([changed for s in self._read() if (changed := change(s)) is not None])
         except OSError as error:
-            log.warning("links: the end of a link or secret could not be stored (%s)", error.strerror)
+            log.warning("links: storing an expiry failed, will retry (reason=%s)", error.strerror)
 
     def _load(self) -> list[_Secret]:
         with self._lock:
@@ -212,7 +213,7 @@ class LinkSecrets:
                     with self._exclusive():
                         if self._stamp() == 0:
                             self._write([_new_secret()])
-                stamp = self._stamp()  # before the content is read: a change in between is read again
+                stamp = self._stamp()  # before reading: a concurrent change is then read again
                 self._cached = (stamp, self._read())
             return self._cached[1]
 
@@ -230,7 +231,7 @@ class LinkSecrets:
         return [_Secret(base64.b64decode(line["secret"]), line["until"], line.get("over", 0.0)) for line in lines]
 
     def _write(self, lines: list[_Secret]) -> None:
-        """Replace the file as a whole, readable by its owner only."""
+        """Replace the file atomically, readable by its owner only."""
         body = [{"secret": base64.b64encode(s.value).decode(), "until": s.until, "over": s.over} for s in lines]
         temporary = self._file.with_suffix(f".{os.getpid()}")
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)

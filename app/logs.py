@@ -1,6 +1,6 @@
-"""What the server logs, as lines for people or JSON for machines: time, level, request, what.
+"""Server log as text lines or JSON: time, level, request, message.
 
-No line has a token, a body, or a path of this machine: callers see to it.
+Callers must not log tokens, bodies, or paths of this machine.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any, Literal
 LogFormat = Literal["text", "json"]
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
-"""The request that is being answered, as its answer's ``X-Request-Id`` names it."""
+"""Id of the current request, as in the ``X-Request-Id`` response header."""
 
 
 def config(level: str, form: LogFormat) -> dict[str, Any]:
-    """Settings for ``logging.config``: to standard error; libraries only when something is wrong.
+    """Build the settings for ``logging.config``: standard error; libraries only from WARNING.
 
-    The root logger is left as it is: a program that embeds the server may use it.
+    The root logger is not changed: a program that embeds the server may use it.
     """
     formatter = {"text": TextFormatter, "json": JsonFormatter}[form]
     levels = {"app": level.upper(), "uvicorn": level.upper(), "asyncio": "WARNING", "sqlalchemy": "WARNING"}
@@ -35,7 +35,7 @@ def config(level: str, form: LogFormat) -> dict[str, Any]:
 
 
 def log_request(log: logging.Logger, level: int, fields: Mapping[str, Any]) -> None:
-    """One answered request; JSON gets the fields one by one."""
+    """Log a completed request; JSON has its fields as members."""
     caller = f"{fields['token']} ({fields['role']})" if fields.get("role") else "no token"
     reason = f": {fields['reason']}" if fields.get("reason") else ""
     text = (
@@ -48,7 +48,7 @@ class TextFormatter(logging.Formatter):
     """``2030-01-31T06:00:00.000Z INFO    4f2c… app.api.http.middleware: text``."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line, whatever the message has in it; a trace below it."""
+        """Format a record as one line, with control characters escaped, and a traceback below it."""
         head = f"{_time(record)} {record.levelname:<7} {REQUEST_ID.get() or '-'} {record.name}: "
         text = record.getMessage()
         if not text.isprintable():
@@ -57,10 +57,10 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object in a line."""
+    """One JSON object per line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Time, level, logger, message, request, and the fields of a request."""
+        """Format time, level, logger, message, request, and the fields of a request."""
         entry: dict[str, Any] = {
             "time": _time(record),
             "level": record.levelname.lower(),

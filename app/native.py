@@ -1,9 +1,9 @@
-"""Functions compiled to native code by numba, kept compiled between processes.
+"""Compile functions to native code with numba, and cache the code between processes.
 
-Compiling takes seconds, loading what was compiled milliseconds. Worker processes may not write (``app.sandbox``), so
-the folder is filled by a process that only compiles (``fill``) and reads nothing; where nothing can be read or written,
-a function is compiled in memory: a folder never makes a derivation fail. numba is imported with the first kernel, so
-that starting the server does not pay for it.
+Compiling takes seconds, loading compiled code milliseconds. Worker processes may not write (``app.sandbox``), so a
+process that only compiles and reads no input fills the folder (``fill``). If the folder cannot be read or written,
+functions are compiled in memory: the folder never makes a derivation fail. numba is imported with the first kernel, so
+that it does not delay the start of the server.
 """
 
 from __future__ import annotations
@@ -26,48 +26,48 @@ from typing import Any, ClassVar, TypeVar, cast
 F = TypeVar("F", bound=Callable[..., Any])
 
 FOLDER = "NUMBA_CACHE_DIR"
-"""numba's own variable for the folder; without it the user's cache folder is taken."""
+"""Variable of numba for the folder. Unset: the user's cache folder."""
 
 _base: ContextVar[Path | None] = ContextVar("base", default=None)
 """Folder to compile into, before what ``FOLDER`` names."""
 
 _KERNELS = "_kernels_"
-"""Modules of this name hold kernels and nothing else; they are imported when first needed."""
+"""Name prefix of modules that contain only kernels; they are imported on first use."""
 
 _PACKAGES = ("derive", "generate")
-"""Folders beside and including this one's that have such modules."""
+"""Packages below ``app`` with such modules."""
 
 _PREFIX = "fleetmap-native-"
 _PARENT_DEATH_SIGNAL = 1
-"""prctl's, linux/prctl.h."""
+"""Option PR_SET_PDEATHSIG of prctl (linux/prctl.h)."""
 
 
 def folder() -> Path:
-    """Where compiled code of this release, machine and user is kept; it need not exist."""
+    """Return the folder for compiled code of this release, machine and user; it need not exist."""
     setting = _base.get() or os.environ.get(FOLDER)
     base = Path(setting) if setting else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fleetmap"
     return base / _key()
 
 
 def native(function: F) -> F:
-    """The function as native code that holds no lock; compiled when first called, or loaded from the folder."""
+    """Compile a function to native code that releases the GIL, on the first call or from the folder."""
     import numba
 
     compiled: Any = numba.njit(nogil=True)(function)
-    with contextlib.suppress(Exception):  # another numba may look otherwise inside: then without a folder
+    with contextlib.suppress(Exception):  # numba's internals may change: then without a folder
         compiled._cache = _cache(function)
     return cast(F, compiled)
 
 
 def is_filled(directory: Path) -> bool:
-    """Whether ``fill`` has nothing to do."""
+    """Return whether ``fill`` has nothing to do."""
     return (directory / _key()).is_dir()
 
 
 def fill(directory: Path) -> None:
-    """Compile all kernels into ``directory`` (what ``NUMBA_CACHE_DIR`` names), unless this was done before.
+    """Compile all kernels into ``directory`` (the value of ``NUMBA_CACHE_DIR``), unless this was done before.
 
-    It never reads what stands there, and the new folder appears in one step: nothing half-written is ever loaded.
+    It never reads existing files, and creates the new folder atomically: no incomplete file is ever loaded.
     """
     if is_filled(directory):
         return
@@ -88,10 +88,10 @@ def fill(directory: Path) -> None:
 
 
 def fill_quietly(directory: Path) -> None:
-    """``fill`` for a process of its own: politely, and without a word where it cannot be done."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
+    """Run ``fill`` in a separate process, with low priority and without errors."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the server ends this process
     with contextlib.suppress(Exception):
-        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)  # it ends with the server, however that ends
+        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)  # end with the server, even if it is killed
         os.nice(19)
         fill(directory)
 
@@ -102,13 +102,13 @@ def _modules() -> list[str]:
 
 
 def _files() -> list[Path]:
-    """The modules that hold kernels."""
+    """List the kernel modules."""
     app = Path(__file__).parent
     return sorted(file for package in _PACKAGES for file in (app / package).glob(f"{_KERNELS}*.py"))
 
 
 def _key() -> str:
-    """A name for what compiled code depends on besides the processor, which numba itself looks at."""
+    """Hash the dependencies of compiled code, except the processor, which numba checks itself."""
     digest = hashlib.blake2b(digest_size=8)
     for file in _files():
         digest.update(file.read_bytes())
@@ -118,7 +118,7 @@ def _key() -> str:
 
 
 def _cache(function: Callable[..., Any]) -> Any:
-    """numba's cache of one function in our folder, whether or not it can be written."""
+    """Create numba's cache of one function in our folder, even if that is not writable."""
     from numba.core import caching
 
     place = folder()
@@ -144,12 +144,12 @@ def _cache(function: Callable[..., Any]) -> Any:
         _impl_class = Stored
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
-            with contextlib.suppress(Exception):  # damaged: compiled again
+            with contextlib.suppress(Exception):  # damaged: compile again
                 return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
             return None
 
         def save_overload(self, sig: Any, data: Any) -> None:
-            with contextlib.suppress(Exception):  # not ours to write, or damaged
+            with contextlib.suppress(Exception):  # not writable, or damaged
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     return Cache(function)  # type: ignore[no-untyped-call]

@@ -1,6 +1,6 @@
-"""Typed parameters of formats and derivations: one frozen dataclass says name, type, default, bounds and meaning.
+"""Typed parameters of formats and derivations: a frozen dataclass declares name, type, default, bounds and meaning.
 
-OpenAPI, the command line and the coverage table are made from the same declaration::
+OpenAPI, the command line and the coverage table are generated from the same declaration::
 
     @dataclass(frozen=True, slots=True)
     class Options:
@@ -28,16 +28,16 @@ _hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
 def parameter(
     default: Any, doc: str, *, minimum: float | None = None, maximum: float | None = None, unit: str = ""
 ) -> Any:
-    """A dataclass field with its meaning and bounds (both inclusive)."""
+    """Declare a dataclass field with its description and bounds (both inclusive)."""
     return dataclasses.field(
         default=default, metadata={"doc": doc, "minimum": minimum, "maximum": maximum, "unit": unit}
     )
 
 
 def parse(cls: type[T], values: Mapping[str, Any], label: str = "parameter") -> T:
-    """The dataclass from texts (a query, a form, a command line) or JSON values.
+    """Parse strings (of a query, form or command line) or JSON values into the dataclass.
 
-    Invalid names every parameter that is unknown, of the wrong type or out of bounds, and says what is accepted.
+    Raises Invalid with every parameter that is unknown, of the wrong type or out of bounds, and the accepted values.
     """
     hints = _hints(cls)
     fields_by_name = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
@@ -60,7 +60,7 @@ def parse(cls: type[T], values: Mapping[str, Any], label: str = "parameter") -> 
 
 
 def describe(cls: type[Any]) -> list[dict[str, Any]]:
-    """Each parameter as ``{name, schema, default, description}`` with a JSON schema, in declared order."""
+    """Describe each parameter as ``{name, schema, default, description}`` with a JSON schema, in declared order."""
     hints = _hints(cls)
     out = []
     for f in dataclasses.fields(cls):
@@ -76,7 +76,7 @@ def describe(cls: type[Any]) -> list[dict[str, Any]]:
 
 
 def canonical(options: Any) -> dict[str, Any]:
-    """The parameters that differ from their defaults, sorted: part of a recipe's key."""
+    """Return the parameters that differ from their defaults, sorted: part of a recipe's key."""
     if options is None:
         return {}
     fields = sorted(dataclasses.fields(options), key=lambda f: f.name)
@@ -95,12 +95,12 @@ def _convert(hint: Any, value: Any) -> Any:
         return value
     if origin is tuple:
         if not isinstance(value, (str, list, tuple)):
-            raise ValueError(f"must be values separated by commas, got {value!r}")
+            raise ValueError(f"must be comma-separated values, got {value!r}")
         parts = value.split(",") if isinstance(value, str) else list(value)
         if len(args) == 2 and args[1] is Ellipsis:
             return tuple(_convert(args[0], p) for p in parts)
         if len(parts) != len(args):
-            raise ValueError(f"must be {len(args)} values separated by commas, got {value!r}")
+            raise ValueError(f"must be {len(args)} comma-separated values, got {value!r}")
         return tuple(_convert(a, p) for a, p in zip(args, parts, strict=True))
     if hint is bool:
         if isinstance(value, bool):
@@ -119,7 +119,7 @@ def _convert(hint: Any, value: Any) -> Any:
         except (TypeError, ValueError):
             raise ValueError(f"must be a whole number, got {value!r}") from None
         if not -(2**63) <= integer < 2**63:
-            raise ValueError("must be a whole number of at most 64 bit")
+            raise ValueError("must be a whole number of at most 64 bits")
         return integer
     if hint is float:
         try:
@@ -137,7 +137,7 @@ def _convert(hint: Any, value: Any) -> Any:
 
 
 def _digits(value: Any) -> Any:
-    """Texts in ASCII only: Python also takes other scripts' digits and underscores for numbers."""
+    """Reject strings that are not plain ASCII numbers: Python also accepts other scripts' digits and underscores."""
     if isinstance(value, str) and (not value.isascii() or "_" in value):
         raise ValueError("not a number")
     return value
@@ -160,6 +160,6 @@ def _schema(hint: Any) -> dict[str, Any]:
     if origin is Literal:
         return {"type": "string", "enum": list(args)}
     if origin is tuple:
-        return {"type": "string", "description": "values separated by commas"}
+        return {"type": "string", "description": "comma-separated values"}
     names = {bool: "boolean", int: "integer", float: "number", str: "string"}
     return {"type": names[hint]}

@@ -1,7 +1,7 @@
 """Plug-ins: modules of other distributions that register formats or derivations, found by entry points.
 
-A plug-in's module is written like one of ours, and states the version of the interface that it was written for:
-``FLEETMAP_INTERFACE = 1``. What is public to it is listed in docs/contributing/plug-ins.md.
+A plug-in's module looks like a built-in one and declares the interface version that it was written for:
+``FLEETMAP_INTERFACE = 1``. docs/contributing/plug-ins.md lists the public interface.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 T = TypeVar("T")
 
 INTERFACE = 1
-"""Raised when plug-ins must be changed to go on working."""
+"""Interface version, incremented by changes that break plug-ins."""
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ def title(function: object) -> str:
 def load(group: str, registry: dict[str, Any]) -> None:
     """Import the plug-ins of an entry point group, in the order of their distributions' names.
 
-    One that fails is logged and leaves nothing in the registry: the server runs without it.
+    A plug-in that fails is logged and leaves nothing in the registry: the server runs without it.
     """
     for entry in sorted(entry_points(group=group), key=lambda entry: (_distribution(entry), entry.name)):
         before = dict(registry)

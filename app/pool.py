@@ -1,8 +1,8 @@
-"""A pool of worker processes for parsing and conversion: limits on memory and time, and a crash costs one job.
+"""Pool of worker processes for parsing and conversion, with limits on memory and time; a crash fails only one job.
 
-Hostile files are read here, never in the server's own process. Workers are forked from a process
-that has imported what they need and does nothing else: a worker that dies or overruns is replaced within milliseconds,
-and all share that memory. The server itself is never forked, since it holds native threads. Workers end with it.
+Untrusted files are parsed here, never in the server's own process. Workers are forked from a process that has only
+imported their modules: a worker that dies or exceeds its time is replaced within milliseconds, and all share that
+memory. The server itself is never forked, since it has native threads. Workers end with it.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ log = logging.getLogger(__name__)
 _processes = multiprocessing.get_context("forkserver")
 
 PRELOADED_MODULES = ("app.ingest.prepare", "app.convert.warm")
-"""What the server's worker processes import before their first job."""
+"""Modules that the server's worker processes import before their first job."""
 
 CANCEL_POLL_SECONDS = 0.2
-"""How often a job in line looks whether it is still wanted."""
+"""Seconds between two checks of a queued job for its cancellation."""
 
 
 def preload_in_background(warm: tuple[str, ...] = PRELOADED_MODULES) -> None:
-    """Start what workers are forked from; its imports run beside whatever the caller does meanwhile."""
+    """Start the process that workers are forked from, without waiting for its imports."""
     _processes.set_forkserver_preload(list(warm))
     forkserver.ensure_running()
 
 
 class WorkerDied(FleetMapError):
-    """The job ended its process (a crash, or out of memory) or overran its time."""
+    """The job ended its process (a crash, or out of memory) or exceeded its time."""
 
 
 class Cancelled(Unavailable):
-    """Nobody wants the job's result any more; it was stopped."""
+    """The job was cancelled because its result is no longer needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class _Worker:
 
 
 class CancelHandle:
-    """Stops one job from another thread, wherever it is: its process is killed, or it never gets one."""
+    """Cancels one job from another thread: kills its process, or prevents its start."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -66,30 +66,30 @@ class CancelHandle:
         self.is_cancelled = False
 
     def __call__(self) -> None:
-        """Stop the job; it raises Cancelled unless it has just come to its end."""
+        """Cancel the job; it raises Cancelled unless it has just finished."""
         with self._lock:
             self.is_cancelled = True
             if self._process is not None:
                 _kill(self._process)
 
     def check(self) -> None:
-        """Cancelled where it was called."""
+        """Raise Cancelled if the job was cancelled."""
         if self.is_cancelled:
-            raise Cancelled("it was cancelled: ask for it again")
+            raise Cancelled("the conversion was cancelled: request it again")
 
     def attach(self, process: BaseProcess | None) -> None:
-        """From now on the job is at work in this process (None: no longer); Cancelled where it was called before."""
+        """Set the process that runs the job (None: none any more). Raises Cancelled if the job was cancelled."""
         with self._lock:
             self._process = process
             self.check()
 
 
 class Pool:
-    """At most ``workers`` jobs at once, ``waiting`` more in line; a further one is told to come again later.
+    """Pool of at most ``workers`` concurrent and ``waiting`` queued jobs; rejects further jobs with Unavailable.
 
-    memory_bytes: address space of a worker. seconds: longest time of a job. warm: modules that a worker imports before
-    its first job. allowed: what a worker may do besides computing and reading; None: everything.
-    environment: variables that a worker has besides this process's own.
+    memory_bytes: address space of a worker. seconds: time limit of a job. warm: modules that a worker imports before
+    its first job. allowed: permissions of a worker besides computing and reading; None: everything. environment:
+    variables that a worker has besides those of this process.
     """
 
     def __init__(
@@ -111,27 +111,27 @@ class Pool:
         self._lock = threading.Lock()
         self._closed = False
         for _ in range(workers):
-            self._idle.put(None)  # started when first needed
+            self._idle.put(None)  # started on first use
         self._count = workers
         if warm:
             _processes.set_forkserver_preload(list(warm))
 
     @property
     def is_busy(self) -> bool:
-        """Whether a further job would wait."""
+        """Whether a further job would have to wait."""
         return self._idle.empty()
 
     def start(self) -> None:
-        """Start all workers now, so that the first job does not pay for their imports; blocks until they are there.
+        """Start all workers now, so that the first job does not wait for their imports; blocks until they run.
 
-        Where one cannot be started, that is tried again when it is needed.
+        A worker that cannot be started is tried again when it is needed.
         """
         for taken in [self._idle.get() for _ in range(self._count)]:
             worker = taken
             try:
                 worker = taken or self._start_worker()
             except FleetMapError as error:
-                log.warning("a worker could not be started: %s", error.detail)
+                log.warning("pool: starting a worker failed, will retry (reason=%s)", error.detail)
             finally:
                 self._idle.put(worker)
 
@@ -140,8 +140,8 @@ class Pool:
     ) -> Any:
         """Call a module-level function in a worker and return its result; blocks, so call it from a thread.
 
-        Raises what the function raises; WorkerDied where the process ended or overran; Unavailable where too much
-        waits already; Cancelled after ``stop`` was called.
+        Raises the errors of the function, WorkerDied if the process ended or exceeded its time, Unavailable if too many
+        jobs are waiting, Cancelled after ``stop`` was called.
         """
         if not self._slots.acquire(blocking=False):
             raise Unavailable("too many conversions are waiting: try again in a few seconds")
@@ -157,7 +157,7 @@ class Pool:
                     ok, value = _call_worker(worker, function, args, self._seconds if seconds is None else seconds)
                 finally:
                     if stop is not None:
-                        stop.attach(None)  # Cancelled comes before what its death looks like
+                        stop.attach(None)  # raise Cancelled rather than WorkerDied
                 healthy = True
             finally:
                 healthy = healthy and not self._closed
@@ -171,7 +171,7 @@ class Pool:
         return value
 
     def _turn(self, stop: CancelHandle | None) -> _Worker | None:
-        """Wait in line for a worker; None: one is to be started."""
+        """Wait for a worker; None: the caller must start one."""
         if stop is None:
             return self._idle.get()
         while True:
@@ -182,8 +182,8 @@ class Pool:
     def close(self) -> None:
         """End all workers.
 
-        A pipe is closed by the thread that holds its worker, here only those of idle ones: closed under another
-        thread's hands, its number could by then belong to another file.
+        Closes only the pipes of idle workers; the thread that uses a busy worker closes its pipe. If another thread
+        closed it, its file descriptor could already belong to another file.
         """
         with self._lock:
             self._closed = True
@@ -193,7 +193,7 @@ class Pool:
         for _ in range(self._count):
             with contextlib.suppress(queue.Empty):
                 self._stop_worker(self._idle.get_nowait())
-                self._idle.put_nowait(None)  # who waits for a worker wakes up and is told
+                self._idle.put_nowait(None)  # wake threads that wait for a worker
         for worker in workers:
             worker.process.join(5.0)
 
@@ -201,14 +201,14 @@ class Pool:
         try:
             ours, theirs = _processes.Pipe()
         except OSError as error:
-            raise Unavailable("the system lets no further file be opened: try again in a few seconds") from error
+            raise Unavailable("the system limit of open files is reached: try again in a few seconds") from error
         arguments = (theirs, {**os.environ, **self._environment}, self._memory_bytes, self._warm, self._allowed)
         process = _processes.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
         try:
             process.start()
-        except (OSError, EOFError) as error:  # EOFError: what it was to be forked from has ended; it is started anew
+        except (OSError, EOFError) as error:  # EOFError: the fork server ended; it is restarted
             ours.close()
-            raise Unavailable("the system lets no further process start: try again in a few seconds") from error
+            raise Unavailable("the system cannot start another process: try again in a few seconds") from error
         finally:
             theirs.close()
         worker = _Worker(process, ours)
@@ -231,7 +231,7 @@ class Pool:
 
 
 def _kill(process: BaseProcess) -> None:
-    """End a worker. It is no child of this process: once it has ended, its number may be another process'."""
+    """Kill a worker. It is no child of this process: after it ended, its PID may belong to another process."""
     if process.is_alive():
         process.kill()
 
@@ -239,16 +239,16 @@ def _kill(process: BaseProcess) -> None:
 def _call_worker(
     worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], seconds: float
 ) -> tuple[bool, Any]:
-    """Whether the function returned, and what it returned or raised."""
+    """Run the function in a worker. Returns whether it returned, and its result or exception."""
     try:
         worker.pipe.send((function.__module__, function.__qualname__, args))
         if not worker.pipe.poll(seconds):
-            raise WorkerDied(f"it took longer than {seconds:g} seconds and was stopped")
+            raise WorkerDied(f"the time limit of {seconds:g} seconds was exceeded")
         ok, value = worker.pipe.recv()
     except (EOFError, OSError) as error:
         worker.process.join(1.0)
         code = worker.process.exitcode
-        raise WorkerDied(f"the process that worked on it ended (exit code {code}): damaged or too large") from error
+        raise WorkerDied(f"the worker process died (exit code {code}): the input is damaged or too large") from error
     return ok, value
 
 
@@ -259,11 +259,11 @@ def _work(
     warm: tuple[str, ...],
     allowed: SandboxPolicy | None,
 ) -> None:
-    """A worker's life: take a job, answer, until the parent closes the pipe or dies."""
-    os.environ.clear()  # what it was forked from may have been started under other settings
+    """Run jobs in a worker until the parent closes the pipe or dies."""
+    os.environ.clear()  # the fork server may have been started with other settings
     os.environ.update(environment)
     if allowed is not None:
-        confine(allowed)  # before any thread is started: those that exist already would stay free
+        confine(allowed)  # before any thread starts: existing threads would not be confined
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
@@ -284,7 +284,7 @@ def _work(
             answer = (False, _no_memory())
         except FleetMapError as error:
             answer = (False, error)
-        except Exception as error:  # noqa: BLE001  a bug of ours: told to the parent with its trace, for the log
+        except Exception as error:  # noqa: BLE001  a bug: send the parent its traceback, for the log
             trace = "".join(traceback.format_exception(error))
             answer = (False, RuntimeError(f"{type(error).__name__} in a worker\n{trace}"))
         try:
@@ -292,16 +292,16 @@ def _work(
         except (OSError, BrokenPipeError):
             return
         except MemoryError:
-            answer = (False, None)  # lets go of the result before anything else is made
+            answer = (False, None)  # release the result before anything else is allocated
             with contextlib.suppress(OSError):
                 pipe.send((False, _no_memory()))
-        except Exception as error:  # noqa: BLE001  an answer that cannot be pickled is a bug of ours too
+        except Exception as error:  # noqa: BLE001  a result that cannot be pickled is a bug, too
             with contextlib.suppress(OSError):
-                pipe.send((False, RuntimeError(f"a worker's answer could not be sent: {error}")))
+                pipe.send((False, RuntimeError(f"sending a worker's result failed: {error}")))
 
 
 def _no_memory() -> TooLarge:
-    return TooLarge("it needs more memory than an upload may use")
+    return TooLarge("processing needs more memory than an upload may use")
 
 
 def _die_with_parent() -> None:

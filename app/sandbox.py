@@ -1,7 +1,7 @@
-"""Confine a process that reads hostile files: no programs, no network, no writes but where they are allowed.
+"""Confine a process that parses untrusted files: no programs, no network, writes only to allowed folders.
 
-By Linux' Landlock, which any user may use on itself and nothing can undo; on a kernel without it the limits on memory
-and time still hold. Layout of the structures: linux/landlock.h.
+Uses Linux Landlock, which needs no privileges and cannot be undone. On a kernel without it the limits on memory and
+time still apply. Layout of the structures: linux/landlock.h.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _NO_NEW_PRIVS = 38
 _BENEATH, _PORT = 1, 2
 
 _EXECUTE, _WRITE_FILE, _TRUNCATE = 1 << 0, 1 << 1, 1 << 14
-_CHANGES = _WRITE_FILE | sum(1 << k for k in range(4, 13))  # make and remove files and folders of every kind
+_CHANGES = _WRITE_FILE | sum(1 << k for k in range(4, 13))  # create and remove files and folders of every kind
 _BIND, _CONNECT = 1 << 0, 1 << 1
 
 
 @dataclass(frozen=True, slots=True)
 class SandboxPolicy:
-    """What a confined process may do besides computing and reading.
+    """Permissions of a confined process besides computing and reading.
 
-    scratch: folders in which it may do everything. overwrite: folders in which it may write to existing files (SQLite's
-    shared memory beside the database). ports: TCP ports that it may connect to (the database's).
+    scratch: folders with full access. overwrite: folders in which it may write to existing files (SQLite's shared
+    memory beside the database). ports: TCP ports that it may connect to (the database's).
     """
 
     scratch: tuple[Path, ...] = ()
@@ -36,13 +36,13 @@ class SandboxPolicy:
 
 
 def landlock_version() -> int:
-    """The kernel's Landlock version, 0 where there is none."""
+    """Return the kernel's Landlock version, 0 if it has none."""
     abi_version = _syscall(_CREATE, None, 0, 1)
     return max(0, abi_version)
 
 
 def confine(allowed: SandboxPolicy) -> bool:
-    """Confine the calling thread and all that it starts, for good. False where the kernel cannot."""
+    """Confine the calling thread and all that it starts, permanently. Returns False if the kernel cannot."""
     version = landlock_version()
     if version < 1:
         return False

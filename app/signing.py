@@ -1,7 +1,7 @@
-"""The server's Ed25519 keys: what signs manifests, kept in a folder that only the server reads.
+"""Ed25519 keys that sign manifests, in a folder that only the server reads.
 
-A key is a file ``<id>.pem`` (PKCS 8); its id is the start of the SHA-256 of the raw public key. The newest one signs.
-A rotated key is vouched for by the one before it, so that a robot that pinned the old one can follow.
+A key is a file ``<id>.pem`` (PKCS 8); its id is the start of the SHA-256 of the raw public key. The newest key signs.
+Each key endorses its successor, so that a robot with a pinned old key can trust the new one.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 MAX_PUBLISHED_KEYS = 32
-"""Keys of which the public part is still told: a robot that was away for as many rotations follows."""
+"""Maximum number of published public keys: a robot may miss that many rotations."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """A key as clients see it. endorsement: by the key before it, over the raw public key."""
+    """Public key for clients. endorsement: signature of the raw public key by the previous key."""
 
     id: str
     public: bytes
@@ -37,7 +37,7 @@ class PublicKey:
     endorsement: bytes | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON members; bytes in base64."""
+        """Convert the key to JSON, with bytes in base64."""
         out: dict[str, Any] = {
             "id": self.id,
             "algorithm": "Ed25519",
@@ -51,7 +51,7 @@ class PublicKey:
 
 
 class Keys:
-    """The keys of a folder; made when first needed. All processes of a data folder share them."""
+    """Keys of a folder, created on first use and shared by all processes of a data directory."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -59,16 +59,16 @@ class Keys:
         self._loaded: tuple[float, list[PublicKey], Ed25519PrivateKey] | None = None
 
     def public(self) -> list[PublicKey]:
-        """The newest first."""
+        """List the public keys, newest first."""
         return self._load()[0]
 
     def sign(self, data: bytes) -> tuple[str, bytes]:
-        """(id of the key, signature of 64 bytes)."""
+        """Sign data with the newest key. Returns the id of the key and the signature of 64 bytes."""
         keys, private = self._load()
         return keys[0].id, private.sign(data)
 
     def rotate(self) -> PublicKey:
-        """A new key from now on, vouched for by the old one."""
+        """Create a new key, endorsed by the previous one, and sign with it from now on."""
         self._load()
         with self._exclusive():
             keys, private = self._read()
@@ -138,17 +138,17 @@ class Keys:
         _write(self._folder / "keys.json", json.dumps([k.as_dict() for k in stored_keys], indent=1).encode())
         for path in self._folder.glob("*.pem"):
             if path.stem != key.id:
-                path.unlink()  # an old key never signs again
+                path.unlink()  # old keys never sign again
         return key
 
 
 def key_id(public: bytes) -> str:
-    """The id of a raw public key."""
+    """Compute the id of a raw public key."""
     return hashlib.sha256(public).hexdigest()[:16]
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Whole or not at all, for the owner alone."""
+    """Write a file atomically, readable by its owner only."""
     temporary = path.with_suffix(f".{os.getpid()}")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "wb") as handle:

@@ -1,8 +1,7 @@
-"""What formats ask for and no layer has: named sets of values, and what holds for an environment.
+"""Templates: values that formats need and no layer has, in named sets and per environment.
 
-A set gives values to the writers' own parameters, by format; a new one is one entry of ``SETS``. What is asked for
-with a request goes before what the environment says (``app.model.templates``), this before its set, and this before
-the format's defaults.
+A set assigns values to the writers' parameters, by format; to add one, add an entry to ``SETS``. Precedence: values of
+the request, of the environment (``app.model.templates``), of its set, defaults of the format.
 """
 
 from __future__ import annotations
@@ -19,21 +18,21 @@ from app.model.names import did_you_mean
 from app.model.templates import DEFAULT_SET, FormatTemplate, Templates
 
 REQUEST, ENVIRONMENT, DEFAULT = "request", "environment", "default"
-"""Where a value may come from, besides a set."""
+"""Origins of a value, besides a set."""
 
 MAX_TEXT_CHARACTERS: Final = 2000
-"""Characters of a text among the values."""
+"""Maximum length of a string value, in characters."""
 
 
 @dataclass(frozen=True, slots=True)
 class TemplateSet:
-    """A named set. values: by format, by parameter of its writer."""
+    """Named set of template values. values: by format, then by parameter of its writer."""
 
     title: str
     values: Mapping[str, Mapping[str, Any]]
 
     def as_dict(self, name: str) -> dict[str, Any]:
-        """The set as clients see it."""
+        """Convert the set to JSON for clients."""
         values = {name: dict(sorted(format_values.items())) for name, format_values in sorted(self.values.items())}
         return {"name": name, "title": self.title, "formats": values}
 
@@ -79,13 +78,16 @@ SETS: Final[Mapping[str, TemplateSet]] = {
         {"tmap2": dict(_GOALS), "tmap": {"action": _GOALS["action"]}},
     ),
 }
-"""All sets by name. What one does not say is left to the format's defaults."""
+"""All sets by name. The format's defaults supply all values that a set does not have."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResolvedTemplate:
-    """What holds for one format of an environment. values: of the set and the environment. origin: where each came
-    from: ``environment`` or ``set NAME``. ignored: what was kept once and cannot be used any more."""
+    """Resolved template values for one format of an environment.
+
+    values: of the set and the environment. origin: of each value, ``environment`` or ``set NAME``. ignored: stored
+    values that this release cannot use, with the reason.
+    """
 
     values: Mapping[str, Any] = field(default_factory=dict)
     origin: Mapping[str, str] = field(default_factory=dict)
@@ -96,24 +98,24 @@ NO_VALUES: Final = ResolvedTemplate()
 
 
 def check_set(name: str, location: str = "set") -> str:
-    """Invalid, with the known ones, where there is no such set."""
+    """Check the name of a template set. Raises Invalid with the valid names."""
     if name not in SETS:
         near = did_you_mean(name, SETS)
-        reason = f"there is no template set {name[:80]!r}{near}; known sets: {', '.join(SETS)}"
+        reason = f"unknown template set {name[:80]!r}{near}; known sets: {', '.join(SETS)}"
         raise Invalid(reason, [Problem(reason, where=location)])
     return name
 
 
 def check_format(name: str) -> Format:
-    """The format; NotFound where there is none, or it is not served."""
+    """Return the format. Raises NotFound if it does not exist or cannot be written."""
     fmt = formats.get_format(name)
     if fmt.write is None:
-        raise NotFound(f"{name} is read and not served: it has no templates")
+        raise NotFound(f"{name} is a read-only format: it has no templates")
     return fmt
 
 
 def check_values(fmt: Format, values: Mapping[str, Any], location: str = "values") -> dict[str, Any]:
-    """Values of a format's parameters, typed, as JSON has them; Invalid names each that is unknown or wrong."""
+    """Convert values of a format's parameters to JSON types. Raises Invalid with each unknown or wrong value."""
     try:
         chosen = parameters.parse(fmt.write_options, values, f"parameter of {fmt.name}")
     except Invalid as error:
@@ -121,7 +123,7 @@ def check_values(fmt: Format, values: Mapping[str, Any], location: str = "values
             error.detail, [dataclasses.replace(p, where=f"{location}.{p.where}") for p in error.problems]
         ) from None
     out = {name: _plain(getattr(chosen, name)) for name in sorted(values)}
-    reason = f"a text has at most {MAX_TEXT_CHARACTERS} printable characters"
+    reason = f"a string must have at most {MAX_TEXT_CHARACTERS} printable characters"
     texts = {name: value for name, value in out.items() if isinstance(value, str)}
     bad = [n for n, text in texts.items() if len(text) > MAX_TEXT_CHARACTERS or not text.isprintable()]
     if bad:
@@ -130,15 +132,15 @@ def check_values(fmt: Format, values: Mapping[str, Any], location: str = "values
 
 
 def resolve(templates: Templates, fmt: Format) -> ResolvedTemplate:
-    """The values that an environment's templates give to a format.
+    """Resolve the values of an environment's templates for a format.
 
-    What an older or newer release has kept and this one does not know is left out, and told in ``ignored``: a robot
-    gets its map all the same.
+    Values stored by another release that this one cannot use are skipped and listed in ``ignored``: robots get their
+    maps anyway.
     """
     if templates.set == DEFAULT_SET and not templates.formats:
         return NO_VALUES
     format_template, chosen = templates.for_format(fmt.name), templates.set_of(fmt.name)
-    ignored = [] if chosen in SETS else [f"the template set {chosen!r} is not known to this release"]
+    ignored = [] if chosen in SETS else [f"template set {chosen!r} is unknown in this release"]
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}
     of_set = SETS[chosen].values.get(fmt.name, {}) if chosen in SETS else {}
@@ -154,7 +156,7 @@ def resolve(templates: Templates, fmt: Format) -> ResolvedTemplate:
 
 
 def effective(templates: Templates, fmt: Format) -> dict[str, dict[str, Any]]:
-    """``{PARAMETER: {value, from}}`` of all parameters of a format's writer."""
+    """Return ``{PARAMETER: {value, from}}`` for all parameters of a format's writer."""
     resolved = resolve(templates, fmt)
     return {
         p["name"]: {
@@ -166,12 +168,12 @@ def effective(templates: Templates, fmt: Format) -> dict[str, dict[str, Any]]:
 
 
 def has_parameters(fmt: Format) -> bool:
-    """Whether there is anything that a template could say of a format."""
+    """Return whether a format has template parameters."""
     return bool(dataclasses.fields(fmt.write_options))
 
 
 def with_format_template(templates: Templates, name: str, format_template: FormatTemplate) -> Templates:
-    """The same with something else said of one format; nothing is said of it where ``format_template`` is empty."""
+    """Replace the template of one format; an empty ``format_template`` removes it."""
     others = {format_name: template for format_name, template in templates.formats.items() if format_name != name}
     return Templates(templates.set, {**others, name: format_template} if format_template.as_dict() else others)
 

@@ -1,4 +1,4 @@
-"""Certificates made for a test: a certification authority, and who it vouches for."""
+"""Certificates for tests: a certification authority and the certificates that it signs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cryptography.x509.oid import NameOID
 
 
 class Authority:
-    """A certification authority in a folder: ``NAME.pem`` is its own certificate."""
+    """Certification authority in a folder: ``NAME.pem`` is its own certificate."""
 
     def __init__(self, folder: Path, name: str = "ca") -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -23,7 +23,7 @@ class Authority:
         self.pem = self._write(name, self._name, self._key, None)
 
     def sign(self, name: str, days: int = 2) -> tuple[Path, Path]:
-        """A certificate for this machine and its key: the two files. days: how long it is still good."""
+        """Create a certificate for this machine and its key; return the two files. days: remaining validity."""
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]

@@ -1,4 +1,4 @@
-"""For all tests: the real data beside the checkout with its independent readers, and what their processes share."""
+"""Fixtures of all tests: the real data beside the checkout with its independent readers, and shared caches."""
 
 from __future__ import annotations
 
@@ -29,34 +29,34 @@ for name in native._modules():
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """What a process compiles serves the next one: tests start hundreds of them, each of which imports the server.
+    """Share compiled code between processes: tests start hundreds of them, each of which imports the server.
 
-    Bytecode: where the environment forbids to keep it beside the sources, pytest's own cache takes it, for the next run
-    as well; it spares each worker half a minute. Native code: servers take the folder of the user, as the processes of
-    the tests do, not one in each data folder.
+    Bytecode: if the environment forbids to write it beside the sources, it goes to pytest's cache, also for the next
+    run; this saves each worker half a minute. Native code: servers use the user's folder, like the tests' processes,
+    not one in each data folder.
     """
-    gc.set_threshold(10_000, 10, 10)  # by default looking for garbage is a third of reading a large document
-    if hasattr(config, "workerinput"):  # of pytest-xdist: it has the environment of the process that started it
+    gc.set_threshold(10_000, 10, 10)  # the default spends a third of reading a large document on garbage collection
+    if hasattr(config, "workerinput"):  # pytest-xdist: inherits the environment of the main process
         return
     if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and "PYTHONPYCACHEPREFIX" not in os.environ:
         sys.dont_write_bytecode, sys.pycache_prefix = False, str(TOP / ".pytest_cache" / "bytecode")
         os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.setdefault("NUMBA_CACHE_DIR", str(native.folder().parent))
-    if config.getoption("numprocesses", None):  # many tests: workers of servers may not write what they compile
+    if config.getoption("numprocesses", None):  # many tests: workers of servers may not write compiled code
         process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TOP)
         config.add_cleanup(process.wait)
         config.add_cleanup(process.kill)
 
 
 def pytest_collection_finish() -> None:
-    """What was imported and collected stays: the garbage collector looks at it once and never again."""
+    """Freeze imported and collected objects, so that the garbage collector ignores them."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder with real maps; where it is absent CI fails and a developer's run leaves these tests out."""
+    """Folder with real maps. If it is missing, CI fails and a developer's run skips these tests."""
     if not (SHARED / "data" / "facts.json").is_file():
         message = "../shared/data is absent: these tests need the real maps beside the checkout"
         if os.environ.get("CI"):
@@ -67,13 +67,13 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def facts(shared: Path) -> ModuleType:
-    """The independent readers that count facts of a file."""
+    """Independent readers that count facts of a file."""
     return _tool(shared, "facts")
 
 
 @pytest.fixture(scope="session")
 def same(shared: Path) -> Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]:
-    """same(format, original, served): what information two maps do not share."""
+    """Function same(format, original, served): the differences between the information of two maps."""
     function: Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]] = _tool(shared, "same").same
     return function
 

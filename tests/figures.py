@@ -30,7 +30,7 @@ from app import native
 from tests.api import samples
 from tests.api.conftest import ADMIN, API, parts, running, settings_for
 from tests.api.test_damage import NETWORK, cached, fill, flip, mounted_disk
-from tests.chaos.test_chaos import check, havoc, lost_versions
+from tests.chaos.test_chaos import check, kill_repeatedly, lost_versions
 from tests.chaos.world import fleet_of
 from tests.cli.conftest import ServerProcess, seconds_until_healthy
 from tests.conftest import TOP
@@ -38,21 +38,21 @@ from tests.hostile import corpus
 from tests.hostile.corpus import Case
 from tests.hostile.test_connections import REFUSED, read_to_end, send_head, trickle
 from tests.hostile.test_kill import kill_while_uploads_arrive
-from tests.hostile.test_misreadings import HERE, ROWS, changed, odd_files
-from tests.hostile.test_requests import nonsense
+from tests.hostile.test_misreadings import HERE, ROWS, bad_binaries, changed
+from tests.hostile.test_requests import invalid_requests
 from tests.hostile.test_unfolding import uploads
 from tests.postgres import running_cluster
 
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}
 COPIES = 3
-"""Damaged copies of each file of each sample: cut, with flipped bits, with a part left out or doubled."""
+"""Number of damaged copies of each file of each sample: cut, with flipped bits, with a part removed or doubled."""
 
 SLOW = 999
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def table(*rows: Iterable[object]) -> str:
-    """Markdown; the first row is the head."""
+    """Format rows as a Markdown table; the first row is the header."""
     head, *others = [[str(cell) for cell in row] for row in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *others))
 
@@ -63,7 +63,7 @@ def table(*rows: Iterable[object]) -> str:
 def out_of_range() -> Iterator[Case]:
     for k, row in enumerate(ROWS):
         yield Case(f"{row.sample} {k}", changed(row), "refused" if row.refused else "read")
-    for sample, change, _ in odd_files():
+    for sample, change, _ in bad_binaries():
         yield Case(sample, {sample: change((corpus.SAMPLES / sample).read_bytes())}, "refused")
 
 
@@ -98,7 +98,7 @@ KINDS = [*UPLOADS, REQUESTS]
 
 @dataclass
 class Count:
-    """The outcomes of one kind of input. peak: bytes, of the worker."""
+    """Outcomes of one kind of input. peak: memory of the worker, in bytes."""
 
     inputs: int = 0
     refused: int = 0
@@ -130,15 +130,15 @@ class Usage:
         for folder in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 values = (folder / "stat").read_text().rpartition(") ")[2].split()
-                if int(values[3]) == self._process:  # its session
+                if int(values[3]) == self._process:  # session id
                     yield folder, values
 
     def cpu_seconds(self) -> float:
-        """Also of processes that have ended."""
+        """Return the CPU time, including ended processes."""
         return sum(sum(map(int, values[11:15])) for _, values in self._folders()) / TICKS
 
     def worker_peak(self) -> int:
-        """Bytes; the highest of its processes but the server's own."""
+        """Return the highest memory of its processes except the server's own, in bytes."""
         peaks = [0]
         for folder, _ in self._folders():
             with contextlib.suppress(OSError):
@@ -154,7 +154,7 @@ class Usage:
 
 
 def hostile(folder: Path, only: str) -> tuple[str, bool]:
-    """The table, and whether any input made the server fail or had another outcome than the corpus says."""
+    """Build the table; also return whether any input made the server fail or had an unexpected outcome."""
     process = serve(folder / "data", FLEETMAP_MAX_MEMORY_BYTES="6GiB")
     counts, bad = {name: Count() for name in KINDS if only in name}, False
     try:
@@ -183,7 +183,7 @@ def hostile(folder: Path, only: str) -> tuple[str, bool]:
             count = counts.setdefault(REQUESTS, Count())
             client.post(f"{API}/environments", json={"name": "farm"}).raise_for_status()
             client.post(f"{API}/environments/farm/versions", files=parts(corpus.room())).raise_for_status()
-            for method, path, request, _ in nonsense():
+            for method, path, request, _ in invalid_requests():
                 start = usage.cpu_seconds()
                 answer = client.request(method, f"{API}/{path}", json=request)
                 count.seconds = max(count.seconds, usage.cpu_seconds() - start)
@@ -208,7 +208,7 @@ def hostile(folder: Path, only: str) -> tuple[str, bool]:
 
 @dataclass
 class Outcome:
-    """What came of a fault. healthy: seconds until /healthz, of each time."""
+    """Outcome of a fault. healthy: seconds until /healthz of each run."""
 
     times: int
     lost: int = 0
@@ -226,7 +226,7 @@ def serve(data: Path, *arguments: str, **environment: str) -> ServerProcess:
 
 
 def survey(call: Callable[..., httpx.Response], number: int) -> tuple[str, dict[str, bytes], dict[str, bytes]]:
-    """Commit a version: its path, its files, and all that is served of it, by path."""
+    """Commit a version; return its path, its files, and all its responses by path."""
     network = samples.tmap2({"gate": (0.0, 0.0), "barn": (11.0, number), "field": (10.0, 8.0)})
     files = {NETWORK: network, "notes.txt": random.Random(number).randbytes(100_000)}
     version = call("POST", "environments/farm/versions", files=parts(files)).raise_for_status().json()["version"]
@@ -241,7 +241,7 @@ DATUM = {"latitude": samples.LATITUDE, "longitude": samples.LONGITUDE}
 
 
 class Site:
-    """A server with three versions, and what it served of them before the fault. folder: for what is not its data."""
+    """Server with three versions and their responses before the fault. folder: for files other than its data."""
 
     def __init__(self, folder: Path, data: Path) -> None:
         self.data, self.dice = data, random.Random(1)
@@ -279,11 +279,11 @@ class Site:
         return self.client.request(method, path, **more)
 
     def wrong(self) -> int:
-        """Answers 200 with other bytes than before."""
+        """Count responses with status 200 and other bytes than before."""
         return wrong(self.call, self.good)
 
     def lost(self) -> int:
-        """Versions that are not there byte by byte."""
+        """Count versions that are not intact byte by byte."""
         return lost(self.call, self.good)
 
     def repair(self) -> None:
@@ -323,7 +323,7 @@ def flip_chunk(site: Site) -> None:
 
 
 def flip_page(site: Site) -> None:
-    """The byte that says what kind of page it is, of a page but the first."""
+    """Change the type byte of a page other than the first."""
     file = site.data / "fleetmap.sqlite3"
     with contextlib.closing(sqlite3.connect(file)) as database:
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -331,7 +331,7 @@ def flip_page(site: Site) -> None:
 
 
 def damage(harm: Callable[[Site], None], remedy: Callable[[Site], None], folder: Path, times: int) -> Outcome:
-    """Kill, harm, start and read all; then apply the documented remedy, start and read all again."""
+    """Kill, damage, start and read all; then apply the documented remedy, start and read all again."""
     site, out = Site(folder, folder / "data"), Outcome(times)
     try:
         for _ in range(times):
@@ -352,7 +352,7 @@ def damage(harm: Callable[[Site], None], remedy: Callable[[Site], None], folder:
 
 
 def full_disk(folder: Path, times: int) -> Outcome:
-    """Fill it to the last byte, read, write in vain, start on the full disk, read; make room, and read again."""
+    """Fill the disk, read, try to write, start on the full disk, read; free space, and read again."""
     out = Outcome(times)
     with mounted_disk(folder / "disk") as disk:
         site = Site(folder, disk / "data")
@@ -373,7 +373,7 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 
 def slow_connections(folder: Path, times: int) -> Outcome:
-    """healthy: the seconds of each GET /healthz meanwhile."""
+    """Open slow connections. healthy: seconds of each GET /healthz meanwhile."""
     site, out, flood = Site(folder, folder / "data"), Outcome(times), list[socket.socket]()
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -392,7 +392,7 @@ def slow_connections(folder: Path, times: int) -> Outcome:
 
 
 class Shifted(datetime):
-    """A datetime whose now() is wrong."""
+    """Datetime with a wrong now()."""
 
     by = timedelta(0)
 
@@ -402,7 +402,7 @@ class Shifted(datetime):
 
 
 def wrong_clock(folder: Path, times: int) -> Outcome:
-    """The clock is a year ahead, a year behind, and right again: a start, a commit and a collection each time."""
+    """Set the clock a year ahead, a year back, and right again, with a start, a commit and a collection each time."""
     out, good, real = Outcome(times), dict[str, bytes](), time.time
 
     def shifted() -> float:
@@ -429,7 +429,7 @@ def wrong_clock(folder: Path, times: int) -> Outcome:
 
 def kill(target: str, folder: Path, times: int) -> Outcome:
     with running_cluster() as cluster, fleet_of(folder, cluster, own_router=True, seed=5) as fleet:
-        healthy = havoc(fleet, {target: times})
+        healthy = kill_repeatedly(fleet, {target: times})
         check(fleet)
         versions = fleet.world.get("environments/farm/versions?limit=1000")
         absent = lost_versions(fleet, {v["version"]: v["message"] for v in versions})
@@ -456,11 +456,11 @@ FAULTS: dict[str, tuple[Callable[[Path, int], Outcome], int]] = {
     f"{SLOW} connections at a byte now and then": (slow_connections, 1),
     "clock a year ahead, a year behind": (wrong_clock, 3),
 }
-"""By name: how, and how many times by default."""
+"""Faults by name: function and default number of runs."""
 
 
 def faults(folder: Path, times: int | None, only: str) -> tuple[str, bool]:
-    """The table, and whether anything was lost or wrong."""
+    """Build the table; also return whether anything was lost or wrong."""
     rows, bad = [], False
     for number, (name, (cause, default)) in enumerate(FAULTS.items()):
         if only in name:
@@ -481,7 +481,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only rows whose name has this in it")
     values = parser.parse_args()
     os.environ.setdefault("NUMBA_CACHE_DIR", str(native.folder().parent))
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # starts are measured as users see them
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # measure starts like those of users
     with tempfile.TemporaryDirectory(prefix="fleetmap-figures-") as name:
         if values.table == "hostile":
             text, bad = hostile(Path(name), values.only)

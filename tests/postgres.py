@@ -1,4 +1,4 @@
-"""A throw-away PostgreSQL cluster with PostGIS for a test session, on a free port of the loopback address.
+"""Temporary PostgreSQL cluster with PostGIS for a test session, on a free loopback port.
 
 Import the fixtures in a conftest.py: ``from tests.postgres import postgres_cluster, postgres_url``.
 """
@@ -29,7 +29,7 @@ FOLDERS = ("/usr/local/bin", *(f"/usr/lib/postgresql/{n}/bin" for n in range(20,
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """A running server: one superuser, trusted on the loopback address. run: a command as the server's user."""
+    """Running server: one superuser, trusted on the loopback address. run: prefix of commands as the server's user."""
 
     port: int
     bin: Path
@@ -37,7 +37,7 @@ class Cluster:
     run: Callable[..., subprocess.CompletedProcess[str]]
 
     def start(self) -> subprocess.CompletedProcess[str]:
-        """Start it, and wait until it answers."""
+        """Start the server and wait until it responds."""
         home = self.data.parent
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories='{home}'"
         options += " -c max_connections=80 -c fsync=off"  # its files outlive its processes; tests cut no power
@@ -45,7 +45,7 @@ class Cluster:
         return self.run(*command, "-o", options, "start")
 
     def kill(self) -> None:
-        """kill -9 of all its processes, as a machine does that runs out of memory."""
+        """Kill all processes with kill -9, as when memory runs out."""
         postmaster = int((self.data / "postmaster.pid").read_text().split()[0])
         children = subprocess.run(["pgrep", "-P", str(postmaster)], capture_output=True, text=True, check=False)
         for process in (postmaster, *map(int, children.stdout.split())):
@@ -53,7 +53,7 @@ class Cluster:
                 os.kill(process, signal.SIGKILL)
 
     def restart(self) -> None:
-        """Start it after ``kill``; until its last process is gone it refuses."""
+        """Start the server after ``kill``; it refuses to start until its last process has ended."""
         for _ in range(50):
             started = self.start()
             if started.returncode == 0:
@@ -62,17 +62,17 @@ class Cluster:
         pytest.fail(f"PostgreSQL does not start again: {started.stdout}{started.stderr}")
 
     def url(self, database: str = "postgres") -> str:
-        """For SQLAlchemy."""
+        """Return the URL for SQLAlchemy."""
         return f"postgresql+psycopg://fleetmap@127.0.0.1:{self.port}/{database}"
 
     def connect(self, database: str = "postgres") -> psycopg.Connection[tuple[object, ...]]:
-        """A connection that commits by itself."""
+        """Open a connection with autocommit."""
         return psycopg.connect(
             host="127.0.0.1", port=self.port, user="fleetmap", dbname=database, autocommit=True, connect_timeout=10
         )
 
     def create_database(self, template: str = "fleetmap_template") -> str:
-        """A new database, empty and with PostGIS, or a copy of another one that nobody is connected to; its name."""
+        """Create an empty database with PostGIS, or copy one without connections; return its name."""
         name = f"t{uuid.uuid4().hex}"
         with self.connect() as connection:
             names = sql.Identifier(name), sql.Identifier(template)
@@ -80,13 +80,13 @@ class Cluster:
         return name
 
     def drop_database(self, name: str) -> None:
-        """Remove a database, whoever is connected."""
+        """Remove a database, even with open connections."""
         with self.connect() as connection:
             connection.execute(sql.SQL("DROP DATABASE IF EXISTS {} WITH (FORCE)").format(sql.Identifier(name)))
 
 
 def _missing(message: str) -> None:
-    """CI must leave nothing out; a developer without PostgreSQL may."""
+    """Fail in CI; skip the tests for a developer without PostgreSQL."""
     if os.environ.get("CI"):
         pytest.fail(message)
     pytest.skip(message)
@@ -102,7 +102,7 @@ def _binaries() -> Path | None:
 
 
 def _as_user() -> tuple[list[str], int | None]:
-    """A command prefix that gives up root, since PostgreSQL refuses it, and the user's id."""
+    """Return a command prefix that drops root, which PostgreSQL rejects, and the user's id."""
     if os.geteuid() != 0:
         return [], None
     for name in ("postgres", "nobody"):
@@ -125,14 +125,14 @@ def _free_port() -> int:
 
 @pytest.fixture(scope="session")
 def postgres_cluster() -> Iterator[Cluster]:
-    """The cluster; skipped where PostgreSQL or PostGIS is not installed, a failure where CI is set."""
+    """Cluster; skips if PostgreSQL or PostGIS is not installed, and fails if CI is set."""
     with running_cluster() as cluster:
         yield cluster
 
 
 @contextmanager
 def running_cluster() -> Iterator[Cluster]:
-    """The same, outside of tests."""
+    """Run a cluster outside of tests."""
     folder = _binaries()
     if folder is None:
         _missing("PostgreSQL is not installed (initdb is not to be found)")
@@ -185,7 +185,7 @@ def running_cluster() -> Iterator[Cluster]:
 
 @pytest.fixture
 def postgres_url(postgres_cluster: Cluster) -> Iterator[str]:
-    """A database of its own, removed after the test."""
+    """Separate database, removed after the test."""
     name = postgres_cluster.create_database()
     yield postgres_cluster.url(name)
     postgres_cluster.drop_database(name)

@@ -1,4 +1,4 @@
-"""Which file is which map, what a folder says, which of two files is believed."""
+"""Reading of uploads: format detection, folder conventions, precedence of files."""
 
 from __future__ import annotations
 
@@ -75,17 +75,17 @@ def warned(bundle: Bundle, file: str) -> str:
     return " ".join(w.problem for w in bundle.warnings if w.file == file)
 
 
-def test_what_was_written_by_hand_wins_over_what_was_generated() -> None:
+def test_handwritten_file_takes_precedence_over_generated_one() -> None:
     other = DATUM.replace(b"53.26", b"10.0")
     bundle = read_upload({"datum.yaml": DATUM, "datum_autogen.yaml": other})
     assert bundle.datum is not None
     assert bundle.datum.latitude == 53.26
     assert not bundle.files["datum_autogen.yaml"].used
     assert bundle.files["datum.yaml"].used
-    assert "datum.yaml is used" in warned(bundle, "datum_autogen.yaml")
+    assert "datum.yaml takes precedence" in warned(bundle, "datum_autogen.yaml")
 
 
-def test_a_real_network_wins_over_a_drawn_one_and_regions_stay() -> None:
+def test_real_network_takes_precedence_over_drawn_one_and_regions_stay() -> None:
     bundle = read_upload(
         {
             "config/location/datum.yaml": DATUM,
@@ -102,14 +102,14 @@ def test_a_real_network_wins_over_a_drawn_one_and_regions_stay() -> None:
     assert kinds(part(bundle, "objects", "kml")) == ["region"]
 
 
-def test_a_drawing_in_topological_alone_is_a_network_and_stays_a_drawing() -> None:
+def test_single_drawing_in_topological_is_a_network_and_stays_a_drawing() -> None:
     bundle = read_upload({"config/topological/drawn.kml": kml(PATH)})
     network = part(bundle, "topology", "network")
     assert kinds(network) == ["edge"] * 4 + ["node"] * 3
     assert len(part(bundle, "objects", "kml")) == 1
 
 
-def test_the_layer_says_what_a_drawing_is_meant_for() -> None:
+def test_layer_hint_assigns_a_drawing() -> None:
     assert kinds(part(read_upload({"a.kml": kml(FIELD, PATH)}), "objects", "kml")) == ["path", "region"]
     bundle = read_upload({"a.kml": kml(FIELD, PATH)}, layer="zones")
     assert kinds(part(bundle, "zones", "zones")) == ["keepout"]
@@ -118,7 +118,7 @@ def test_the_layer_says_what_a_drawing_is_meant_for() -> None:
     assert kinds(part(bundle, "location", "site")) == ["fence"]
 
 
-def test_the_environments_own_fence_is_found_among_the_fields() -> None:
+def test_fence_is_found_among_the_fields() -> None:
     bundle = read_upload({"config/location/datum.yaml": FENCED, "config/location/fields.kml": kml(FIELD, FENCE)})
     site = part(bundle, "location", "site")
     assert len(site) == 1
@@ -126,20 +126,20 @@ def test_the_environments_own_fence_is_found_among_the_fields() -> None:
     assert kinds(part(bundle, "objects", "kml")) == ["region"]
 
 
-def test_polygons_without_a_fence_among_them_are_regions() -> None:
+def test_polygons_without_a_fence_are_regions() -> None:
     bundle = read_upload({"a.kml": kml(FIELD, FIELD.replace("field", "other"))}, layer="location")
     assert kinds(part(bundle, "objects", "kml")) == ["region", "region"]
     assert "no GNSS fence" in warned(bundle, "a.kml")
 
 
-def test_grids_are_called_by_their_folder_in_a_template_and_by_their_file_elsewhere() -> None:
+def test_grid_name_is_folder_in_a_template_and_file_elsewhere() -> None:
     files = {f"config/metric/{f}/map.{e}": d for f in ("map", "nogo") for e, d in (("yaml", GRID), ("pgm", PGM))}
     assert {k.name for k in read_upload(files).parts} == {"map", "nogo"}
     assert {k.name for k in read_upload({"hall.yaml": GRID, "map.pgm": PGM}).parts} == {"hall"}
     assert {k.name for k in read_upload({"hall.yaml": GRID, "map.pgm": PGM}, grid="keepout").parts} == {"keepout"}
 
 
-def test_a_zip_of_a_folder_is_the_same_as_its_files() -> None:
+def test_zip_of_a_folder_equals_its_files() -> None:
     files = {"config/location/datum.yaml": FENCED, "config/topological/n.kml": kml(PATH)}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as z:
@@ -150,12 +150,12 @@ def test_a_zip_of_a_folder_is_the_same_as_its_files() -> None:
     assert packed.datum == read_upload(files).datum
 
 
-def test_two_drawings_with_the_same_ids_are_both_kept() -> None:
+def test_drawings_with_equal_ids_are_both_stored() -> None:
     bundle = read_upload({"a.kml": kml(PATH), "b.kml": kml(PATH, FIELD)})
     assert len(part(bundle, "objects", "kml")) == 3
 
 
-def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None:
+def test_missing_datum_becomes_south_west_corner_with_a_warning() -> None:
     bundle = read_upload({"a.kml": kml(PATH)})
     assert bundle.datum is not None
     assert (bundle.datum.latitude, bundle.datum.longitude) == (53.26, -0.52)
@@ -163,11 +163,11 @@ def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None
 
 
 @pytest.mark.parametrize("latitude", [88.0, -88.0])
-def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float) -> None:
+def test_data_beyond_datum_latitude_limit_gives_a_warning(latitude: float) -> None:
     point = b'{"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [10, %g]}}' % latitude
     bundle = read({"a.geojson": point}, UploadHints(), EnvironmentContext(), Limits())
     assert bundle.datum == Datum(math.copysign(85.0, latitude), 10.0)
-    assert any("no datum lies nearer to a pole" in w.problem for w in bundle.warnings)
+    assert any("Use local metres near the poles" in w.problem for w in bundle.warnings)
     with pytest.raises(BadUpload, match="must be between -85 and 85"):
         read(
             {"datum.yaml": b"datum_latitude: %g\ndatum_longitude: 10\n" % latitude},
@@ -177,7 +177,7 @@ def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float)
         )
 
 
-def test_the_corner_across_the_antimeridian_is_the_western_end() -> None:
+def test_corner_across_the_antimeridian_is_the_western_end() -> None:
     line = shapely.LineString([(179.9, -17.0), (180.0, -16.9)])
     other = shapely.LineString([(-180.0, -16.9), (-179.8, -16.8)])
     datum = corner({PartKey("objects"): features([("a", line, {}), ("b", other, {})], "wgs84")})
@@ -185,7 +185,7 @@ def test_the_corner_across_the_antimeridian_is_the_western_end() -> None:
     assert (datum.latitude, datum.longitude) == (-17.0, 179.9)
 
 
-def test_variables_are_read_and_never_run() -> None:
+def test_variables_are_read_without_running_them() -> None:
     bundle = read_upload(
         {"config/properties.sh": b"export FARM_NAME='x'\nexport BAD=$(rm -rf /)\n", "datum.yaml": DATUM}
     )
@@ -194,9 +194,9 @@ def test_variables_are_read_and_never_run() -> None:
     assert warned(bundle, "config/properties.sh")
 
 
-def test_unknown_files_stay_sources_with_a_warning() -> None:
+def test_unknown_files_become_sources_with_a_warning() -> None:
     bundle = read_upload({"datum.yaml": DATUM, "model.stl": b"solid", "LICENSE": b"x", "a/.placeholder": b""})
-    assert [w.file for w in bundle.warnings if "no format" in w.problem] == ["model.stl"]
+    assert [w.file for w in bundle.warnings if "no format can read" in w.problem] == ["model.stl"]
     assert not bundle.files["model.stl"].used
 
 
@@ -204,21 +204,21 @@ def test_unknown_files_stay_sources_with_a_warning() -> None:
     ("files", "hints", "error", "words"),
     [
         ({}, {}, Invalid, "no file"),
-        ({"a.bin": b"\x00\x01"}, {}, UnreadableFile, "none of the files is a map"),
+        ({"a.bin": b"\x00\x01"}, {}, UnreadableFile, "no file has a recognised map format"),
         ({"a.kml": b""}, {}, UnreadableFile, "empty"),
         ({"a.kml": kml(PATH)}, {"layer": "occupancy"}, Invalid, "layer must be one of"),
         ({"a.kml": kml(PATH)}, {"options": {"colour": "red"}}, Invalid, "colour"),
         ({"a.kml": b"<kml><Document>"}, {}, BadUpload, "a.kml"),
     ],
 )
-def test_what_cannot_be_taken_is_refused_with_a_reason(
+def test_invalid_upload_is_rejected_with_a_reason(
     files: dict[str, bytes], hints: dict[str, Any], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
         read_upload(files, **hints)
 
 
-def test_every_bad_file_of_an_upload_is_named() -> None:
+def test_upload_error_names_every_bad_file() -> None:
     with pytest.raises(BadUpload) as caught:
         read_upload({"a.kml": b"<kml><Document>", "datum.yaml": DATUM.replace(b"53.26", b"953.26")})
     assert {p.file for p in caught.value.problems} == {"a.kml", "datum.yaml"}
@@ -234,7 +234,7 @@ def test_every_bad_file_of_an_upload_is_named() -> None:
         ("other/location/datum.yaml", None),
     ],
 )
-def test_template_folder(name: str, below: tuple[str, ...] | None) -> None:
+def test_template_folder_is_path_below_config(name: str, below: tuple[str, ...] | None) -> None:
     assert template_folder(name) == below
 
 
@@ -247,7 +247,9 @@ def test_template_folder(name: str, below: tuple[str, ...] | None) -> None:
         ("riseholme_park_farm_vineyard", {"location", "objects", "topology", "occupancy"}),
     ],
 )
-def test_real_template_folders(shared: Path, facts_json: dict[str, Any], environment: str, layers: set[str]) -> None:
+def test_real_template_folders_are_read(
+    shared: Path, facts_json: dict[str, Any], environment: str, layers: set[str]
+) -> None:
     root = shared / "data" / "environment_template" / environment
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
     bundle = read_upload(files)
@@ -276,10 +278,10 @@ def test_real_template_folders(shared: Path, facts_json: dict[str, Any], environ
         ("notes.txt", b"{ not JSON, and not called so either", 1),
     ],
 )
-def test_what_nobody_knows_and_does_not_parse_is_told_with_its_line(name: str, data: bytes, line: int | None) -> None:
+def test_unknown_file_with_syntax_error_is_reported_with_its_line(name: str, data: bytes, line: int | None) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read({name: data}, UploadHints(), EnvironmentContext(), LIMITS)
     (problem,) = caught.value.problems
     assert (problem.file, problem.line) == (name, line)
-    assert (problem.problem == "no known map format") == (line is None)
+    assert (problem.problem == "no recognised map format") == (line is None)
     assert (f"line {line}" in caught.value.detail) == (line is not None)

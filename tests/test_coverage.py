@@ -1,6 +1,6 @@
-"""The coverage table keeps its word: what it calls direct or derivable is served, what is missing can be supplied.
+"""The coverage table matches downloads: direct and derivable formats are served, missing ones name what to supply.
 
-Over every format that is registered, so a new one is tested here by itself.
+Runs over all registered formats, so that new ones are included.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SLOW_SECONDS = 5.0
 
 
 def environments() -> list[Any]:
-    """Every environment_template folder, and the first sample of each kind."""
+    """List every environment_template folder, and the first sample of each kind."""
     out: list[Any] = []
     for root in sorted(p for p in SHARED.iterdir() if p.is_dir()) if SHARED.is_dir() else []:
         files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
@@ -44,8 +44,8 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield server
 
 
-def finished(api: Api, job: dict[str, Any]) -> dict[str, Any]:
-    """A job's end."""
+def wait_for_job(api: Api, job: dict[str, Any]) -> dict[str, Any]:
+    """Wait until a job has finished."""
     until = time.monotonic() + JOB_SECONDS
     while job["state"] in ("queued", "running") and time.monotonic() < until:
         time.sleep(0.5)
@@ -54,11 +54,11 @@ def finished(api: Api, job: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("files", "kind"), environments())
-def test_the_table_keeps_its_word(
+def test_coverage_matches_downloads(
     api: Api, files: dict[str, bytes], kind: str | None, request: pytest.FixtureRequest
 ) -> None:
     env = re.sub(r"[^a-z0-9]+", "-", request.node.callspec.id.lower()).strip("-")[:60]
-    api.http.timeout = httpx.Timeout(JOB_SECONDS)  # the table tries derivations, on a machine with other work
+    api.http.timeout = httpx.Timeout(JOB_SECONDS)  # the table runs derivations, maybe on a busy machine
     api.post("environments", {"name": env})
     api.upload(env, files, **({"format": kind} if kind else {}))
     rows = api.get(f"environments/{env}/versions/latest/maps").json()
@@ -66,11 +66,11 @@ def test_the_table_keeps_its_word(
     slow: set[str] = set()
     states = {row["format"]: row["state"] for row in rows}
     if kind is not None and kind in states:
-        assert states[kind] == "direct", "a map is to be had as it came"
+        assert states[kind] == "direct", "an uploaded map is available in its format"
     for row in rows:
         label = f"{env} as {row['format']}"
         if row["state"] == "missing":
-            assert row["missing"], f"{label}: what is to be supplied?"
+            assert row["missing"], f"{label}: nothing to supply is named"
             assert any(SUPPLY.search(text) for text in row["missing"]), f"{label}: {row['missing']}"
             refused = api.get(f"environments/{env}/versions/latest/maps/{row['format']}", None)
             assert 400 <= refused.status_code < 500, f"{label}: {refused.status_code}"
@@ -79,7 +79,7 @@ def test_the_table_keeps_its_word(
         assert bool(row["chain"]) == (row["state"] == "derivable"), label
         steps = str([step["step"] for step in row["chain"]])
         if steps in slow:
-            continue  # the same derivation again for another writer, which faster samples try
+            continue  # same derivation for another writer, which faster samples cover
         start = time.monotonic()
         answer = api.get(f"environments/{env}/versions/latest/maps/{row['format']}", None)
         if row["chain"] and time.monotonic() - start > SLOW_SECONDS:
@@ -88,12 +88,12 @@ def test_the_table_keeps_its_word(
             assert answer.status_code == 409, f"{label}: {answer.status_code}"
             continue
         if answer.status_code == 409 and row["chain"] and "name one" in answer.json()["detail"]:
-            continue  # a derivation gave several, which the table cannot know without doing it
+            continue  # a derivation gave several, unknown without running it
         if answer.status_code == 422 and "too far from the datum" in answer.text:
-            continue  # one item of a sample lies where no local frame reaches, which no table can know without it
+            continue  # one feature of a sample is outside any local frame, unknown without reading it
         assert answer.status_code in (200, 202), f"{label}: {answer.status_code} {answer.text[:500]}"
         if answer.status_code == 202:
-            job = finished(api, answer.json())
+            job = wait_for_job(api, answer.json())
             assert job["state"] == "done", f"{label}: {job}"
         else:
             assert answer.content, label

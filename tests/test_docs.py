@@ -1,4 +1,4 @@
-"""The documentation builds without a warning, and what exists is in it. What is not documented fails here."""
+"""The documentation builds without warnings and contains every setting, format, route, event, command and metric."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ SKIPPED = frozenset({".git", ".venv", "build", "data", "dist", "node_modules"})
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The built pages. A warning of MkDocs (a broken link or anchor, a page that no menu lists) is a failure."""
+    """Build the pages. A warning of MkDocs (a broken link or anchor, a page missing in the menu) is a failure."""
     from mkdocs.commands.build import build as build_pages
     from mkdocs.config import load_config
     from mkdocs.exceptions import Abort
 
     folder = tmp_path_factory.mktemp("site")
-    said: list[str] = []
+    messages: list[str] = []
     handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
     log = logging.getLogger("mkdocs")
     log.addHandler(handler)
     try:
         build_pages(load_config(str(ROOT / ".mkdocs.yml"), site_dir=str(folder), strict=True))
     except Abort:
-        pytest.fail("\n".join(said))
+        pytest.fail("\n".join(messages))
     finally:
         log.removeHandler(handler)
     return folder
@@ -51,7 +51,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pages(site: Path) -> Mapping[str, str]:
-    """Path below the site -> the words of the page's content."""
+    """Map the path below the site to the text of the page."""
     out = {}
     for path in site.rglob("*.html"):
         body = path.read_text().partition("<article")[2].partition("</article>")[0]
@@ -64,14 +64,14 @@ def test_readme_is_short() -> None:
     assert (ROOT / "README.md").stat().st_size <= 10_000
 
 
-def test_links_of_texts_at_the_top_lead_somewhere() -> None:
+def test_links_of_top_level_texts_resolve() -> None:
     for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text()):
             assert (ROOT / target).is_file(), f"{name}: {target}"
 
 
 def words(page: str) -> set[str]:
-    """The words of a page without punctuation at their ends."""
+    """Split a page into words without punctuation at their ends."""
     return {word.strip(".,;:()[]¶") for word in page.split()}
 
 
@@ -102,28 +102,28 @@ def test_every_setting_is_documented(pages: Mapping[str, str]) -> None:
 
 @pytest.mark.parametrize("name", sorted(all_formats()))
 def test_every_format_has_a_page(pages: Mapping[str, str], name: str) -> None:
-    known = all_formats()[name]
+    fmt = all_formats()[name]
     page = pages[f"reference/formats/{name}.html"]
-    assert known.title in page
+    assert fmt.title in page
     assert name in words(pages["reference/formats.html"])
-    for file in known.files:
+    for file in fmt.files:
         assert file in page
-    options = (known.write_options if known.write else None, known.read_options if known.read else None)
+    options = (fmt.write_options if fmt.write else None, fmt.read_options if fmt.read else None)
     for field in (f for cls in options if cls for f in dataclasses.fields(cls)):
         assert field.name in words(page)
-        assert field.metadata["doc"], f"{name}: {field.name} does not say what it means"
-    assert ("Rules of its consumers" in page) == (known.check is not None)
+        assert field.metadata["doc"], f"{name}: {field.name} has no description"
+    assert ("Rules of its consumers" in page) == (fmt.check is not None)
 
 
 @pytest.mark.parametrize("kind", ["derivations", "generators"])
 def test_every_derivation_and_generator_is_documented(pages: Mapping[str, str], kind: str) -> None:
-    known: Mapping[str, Any] = derive.all_derivations() if kind == "derivations" else generate.all_generators()
+    declared: Mapping[str, Any] = derive.all_derivations() if kind == "derivations" else generate.all_generators()
     page = pages[f"reference/{kind}.html"]
-    for name, one in known.items():
+    for name, one in declared.items():
         assert name in words(page)
         for field in dataclasses.fields(one.parameters):
             assert field.name in words(page), f"{name}: {field.name}"
-            assert field.metadata["doc"], f"{name}: {field.name} does not say what it means"
+            assert field.metadata["doc"], f"{name}: {field.name} has no description"
 
 
 def test_every_route_is_documented(pages: Mapping[str, str], schema: dict[str, Any]) -> None:
@@ -181,7 +181,7 @@ def test_every_problem_is_documented(pages: Mapping[str, str]) -> None:
 
 def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
     class Recorder:
-        """A session that notes the keys that are declared on it."""
+        """Session that records the keys declared on it."""
 
         def __init__(self) -> None:
             self.keys: list[str] = []
@@ -201,7 +201,7 @@ def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
 
 
 def texts() -> Iterator[tuple[Path, str]]:
-    """The project's own texts: (path below the root, content)."""
+    """Yield the project's own texts: (path below the root, content)."""
     for path in sorted(ROOT.rglob("*")):
         relative = path.relative_to(ROOT)
         if SKIPPED & set(relative.parts) or not path.is_file() or "samples" in relative.parts:
@@ -210,16 +210,16 @@ def texts() -> Iterator[tuple[Path, str]]:
             yield relative, path.read_text(errors="replace")
 
 
-def test_no_text_names_a_path_of_a_machine() -> None:
+def test_texts_contain_no_path_of_a_machine() -> None:
     for path, text in texts():
         for word in ("/" + "work/", "/" + "root/"):
             assert word not in text, f"{path} names a path of a machine"
 
 
-def test_no_text_names_a_document_that_is_not_in_the_project() -> None:
+def test_texts_name_only_documents_of_the_project() -> None:
     own = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
     own |= {f"{name}.md" for name in all_formats()}
-    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON, of LIF, and of a test's upload
+    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON and LIF, and in a test's upload
     for path, text in texts():
         named = set(re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text))
         assert named <= own, f"{path} names {', '.join(sorted(named - own))}"

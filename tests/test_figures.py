@@ -12,7 +12,7 @@ TEXT = (Path(__file__).resolve().parents[1] / "docs" / "security.md").read_text(
 
 
 def rows(head: str) -> list[list[str]]:
-    """The cells of the table whose first cell is this, without its head."""
+    """Return the rows of the table whose first header cell is ``head``."""
     lines = TEXT.partition(f"\n| {head} |")[2].partition("\n\n")[0].splitlines()[2:]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 

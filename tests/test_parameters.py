@@ -1,4 +1,4 @@
-"""Parameters: every value that is taken has its declared type and bounds; every other is refused by name."""
+"""Parameters: accepted values have the declared type and bounds; all others are rejected by name."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def parse(**values: Any) -> Options:
         ("limit", -(2**63), -(2**63)),
     ],
 )
-def test_taken(name: str, value: Any, expected: Any) -> None:
+def test_valid_values_are_parsed(name: str, value: Any, expected: Any) -> None:
     parsed_value = getattr(parse(**{name: value}), name)
     assert parsed_value == expected
     assert type(parsed_value) is type(expected)
@@ -96,7 +96,7 @@ def test_taken(name: str, value: Any, expected: Any) -> None:
         ("", "1"),
     ],
 )
-def test_refused(name: str, value: Any) -> None:
+def test_invalid_values_are_rejected(name: str, value: Any) -> None:
     with pytest.raises(Invalid) as error:
         parse(**{name: value})
     (problem,) = error.value.problems
@@ -104,7 +104,7 @@ def test_refused(name: str, value: Any) -> None:
     assert problem.problem
 
 
-def test_every_mistake_is_told_at_once_with_what_is_accepted() -> None:
+def test_error_lists_every_problem_with_accepted_values() -> None:
     with pytest.raises(Invalid) as error:
         parse(resolution="x", height="1", count="99")
     assert [p.where for p in error.value.problems] == ["resolution", "height", "count"]
@@ -114,18 +114,18 @@ def test_every_mistake_is_told_at_once_with_what_is_accepted() -> None:
         parameters.parse(type("None_", (), {"__dataclass_fields__": {}}), {"a": "1"}, "option")
 
 
-def test_nothing_given_is_all_defaults() -> None:
+def test_missing_values_get_defaults() -> None:
     assert parse() == Options()
     assert parameters.canonical(parse()) == {}
     assert parameters.canonical(None) == {}
 
 
-def test_canonical_is_what_differs_in_a_fixed_order() -> None:
+def test_canonical_lists_non_default_values_in_fixed_order() -> None:
     options = parse(tags="b,a", count="3", fast="yes", band="0,1")
     assert list(parameters.canonical(options).items()) == [("band", (0.0, 1.0)), ("fast", True), ("tags", ("b", "a"))]
 
 
-def test_described_as_json_schema() -> None:
+def test_parameters_are_described_as_json_schema() -> None:
     descriptions = {entry["name"]: entry for entry in parameters.describe(Options)}
     assert list(descriptions) == ["resolution", "count", "kind", "fast", "name", "band", "tags", "limit"]
     assert descriptions["resolution"] == {
@@ -141,7 +141,7 @@ def test_described_as_json_schema() -> None:
 
 
 @given(st.dictionaries(st.sampled_from(["resolution", "count", "band", "limit", "fast"]), st.text()))
-def test_any_text_is_taken_or_refused(values: dict[str, str]) -> None:
+def test_any_text_is_parsed_or_rejected(values: dict[str, str]) -> None:
     try:
         options = parameters.parse(Options, values)
     except Invalid:

@@ -1,7 +1,7 @@
-"""How many places a made-up format, setting, route noun and event take: one each, two for a setting.
+"""Number of places to change for a new format, setting, route noun and event: one each, two for a setting.
 
-Each is added to a copy of the package, by nothing but its own module, field or dataclass, and is then found by
-everything that lists its kind.
+Each is added to a copy of the package, only by its own module, field or dataclass, and then appears in every list of
+its kind.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def insert(path: Path, text: str, before: str) -> None:
 
 @pytest.fixture(scope="module")
 def facts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a copy of the package with all four made-up things says of itself."""
+    """Collect the lists of a copy of the package with all four additions."""
     copy = tmp_path_factory.mktemp("copy")
     shutil.copytree(ROOT / "app", copy / "app", ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
     shutil.copytree(ROOT / "docs" / "hooks", copy / "docs" / "hooks")
@@ -130,22 +130,22 @@ def facts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return found
 
 
-def test_a_format_is_one_module(facts: dict[str, Any]) -> None:
+def test_format_is_one_module(facts: dict[str, Any]) -> None:
     assert "paper" in facts["formats"]
     assert "/maps/{env}/paper" in facts["paths"]
     assert "paper" in facts["coverage"]
 
 
-def test_a_route_noun_is_one_module(facts: dict[str, Any]) -> None:
+def test_route_noun_is_one_module(facts: dict[str, Any]) -> None:
     assert "/api/v1/papers" in facts["paths"]
 
 
-def test_a_setting_is_a_field_and_its_consumer(facts: dict[str, Any]) -> None:
+def test_setting_is_a_field_and_its_consumer(facts: dict[str, Any]) -> None:
     assert "FLEETMAP_PAPER_SIZE" in facts["settings"]
     assert facts["area"] == 1 / 16
 
 
-def test_an_event_is_one_dataclass(facts: dict[str, Any]) -> None:
+def test_event_is_one_dataclass(facts: dict[str, Any]) -> None:
     assert facts["event"] == "paper.folded"
     assert "## paper.folded" in facts["events"]
     assert '"folds": 2' in facts["events"]

@@ -1,4 +1,4 @@
-"""Formats of other distributions: the documented example works, and a broken one stops nothing."""
+"""Plug-ins: the documented example works, and a broken plug-in does not stop the server."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ PAGE = ROOT / "docs" / "contributing" / "plug-ins.md"
 
 
 def example() -> dict[str, str]:
-    """The files on the page: name -> text."""
+    """Read the files on the page: name -> text."""
     return dict(re.findall(r'```\w+ title="([^"]+)"\n(.*?)```', PAGE.read_text(), re.DOTALL))
 
 
 def install(folder: Path, project: str, modules: dict[str, str]) -> None:
-    """What an installer leaves of a distribution in a folder of packages."""
+    """Write the files of an installed distribution to a folder of packages."""
     metadata = tomllib.loads(project)["project"]
     info = folder / f"{metadata['name'].replace('-', '_')}-{metadata['version']}.dist-info"
     info.mkdir()
@@ -38,7 +38,7 @@ def run(packages: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, cwd=packages, capture_output=True, text=True, check=False)
 
 
-def test_the_documented_plug_in_lists_reads_and_writes(tmp_path: Path) -> None:
+def test_documented_plug_in_lists_reads_and_writes(tmp_path: Path) -> None:
     files = example()
     install(tmp_path, files.pop("pyproject.toml"), files)
     listed = run(tmp_path, "formats", "--json")
@@ -54,7 +54,7 @@ def test_the_documented_plug_in_lists_reads_and_writes(tmp_path: Path) -> None:
     assert (tmp_path / "back.poles").read_text() == "# poles\na 1.000 2.500\nb 3.000 4.000\n"
 
 
-def test_plug_ins_that_cannot_be_used_are_named_and_left_out(tmp_path: Path) -> None:
+def test_broken_plug_ins_are_reported_and_skipped(tmp_path: Path) -> None:
     module = example()["fleetmap_poles.py"]
     broken = {
         "absent": module.replace("import numpy", "import no_such_module"),

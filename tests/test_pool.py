@@ -1,4 +1,4 @@
-"""Worker processes: results, errors, crashes, overruns, and the end with the parent."""
+"""Worker processes: results, errors, crashes, timeouts, and their end with the parent."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def work_eat() -> int:
 
 
 class _Unsendable:
-    """A result that takes more memory to send than there is."""
+    """Result that needs more memory to send than available."""
 
     def __reduce__(self) -> tuple[type[bytes], tuple[bytes]]:
         return bytes, (bytes(64 * 2**30),)
@@ -77,29 +77,29 @@ def pool() -> Iterator[Pool]:
     new_pool.close()
 
 
-def test_a_result_comes_back(pool: Pool) -> None:
+def test_pool_returns_a_result(pool: Pool) -> None:
     assert pool.run(work_double, 21) == 42
 
 
-def test_our_errors_keep_their_class_and_places(pool: Pool) -> None:
+def test_worker_errors_keep_their_class_and_locations(pool: Pool) -> None:
     with pytest.raises(NotFound) as caught:
         pool.run(work_refuse)
     assert caught.value.problems == (Problem("gone", "a.yaml", 3),)
 
 
-def test_a_bug_is_told_with_its_trace(pool: Pool) -> None:
+def test_bug_in_a_worker_is_reported_with_its_traceback(pool: Pool) -> None:
     with pytest.raises(RuntimeError, match="KeyError in a worker"):
         pool.run(work_bug)
 
 
-def test_a_crash_costs_one_job_and_a_fresh_worker_goes_on(pool: Pool) -> None:
+def test_crash_fails_one_job_and_worker_is_replaced(pool: Pool) -> None:
     with pytest.raises(WorkerDied, match="damaged or too large"):
         pool.run(work_crash)
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its number may belong to another process by then."""
+def test_ended_worker_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its PID may belong to another process by then."""
     pool.run(work_double, 1)
     killed: list[int | None] = []
     (worker,) = pool._workers.values()
@@ -115,7 +115,7 @@ def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.Monke
     assert killed == []
 
 
-def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
+def test_timeout_kills_the_job_and_worker_is_replaced(pool: Pool) -> None:
     pool.run(work_double, 1)
     start = time.monotonic()
     with pytest.raises(WorkerDied, match=r"longer than 0\.3 seconds"):
@@ -124,7 +124,7 @@ def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
+def test_cancel_stops_running_and_waiting_jobs(pool: Pool) -> None:
     pool.run(work_double, 1)
     stops = CancelHandle(), CancelHandle()
     errors: list[BaseException] = []
@@ -138,7 +138,7 @@ def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
     threads = [threading.Thread(target=run, args=(stop,)) for stop in stops]
     for thread in threads:
         thread.start()
-        time.sleep(0.3)  # one is at work, the other in line
+        time.sleep(0.3)  # one runs, the other waits
     for stop, thread in reversed(list(zip(stops, threads, strict=True))):
         stop()
         thread.join(20)
@@ -148,23 +148,23 @@ def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
         pool.run(work_double, 1, stop=stops[0])
     late = CancelHandle()
     assert pool.run(work_double, 21, stop=late) == 42
-    late()  # its worker belongs to others by now
+    late()  # its worker runs other jobs by now
     assert pool.run(work_double, 1) == 2
 
 
-def test_memory_is_limited_and_the_worker_survives(pool: Pool) -> None:
+def test_memory_limit_fails_the_job_and_worker_survives(pool: Pool) -> None:
     with pytest.raises(TooLarge):
         pool.run(work_eat)
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_result_too_large_to_send_is_no_bug(pool: Pool) -> None:
+def test_result_too_large_to_send_raises_too_large(pool: Pool) -> None:
     with pytest.raises(TooLarge):
         pool.run(work_unsendable)
     assert pool.run(work_double, 1) == 2
 
 
-def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_process_start_raises_unavailable(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
@@ -175,7 +175,7 @@ def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest
     assert pool.run(work_double, 1) == 2
 
 
-def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
+def test_waiting_job_raises_unavailable_when_pool_closes(pool: Pool) -> None:
     pool.run(work_double, 1)
     errors: list[type[BaseException]] = []
 
@@ -196,7 +196,7 @@ def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
     assert errors == [WorkerDied, Unavailable]
 
 
-def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:
+def test_full_pool_raises_unavailable(pool: Pool) -> None:
     pool.run(work_double, 1)
     threads = [threading.Thread(target=pool.run, args=(work_sleep, 1.0)) for _ in range(2)]
     for t in threads:
@@ -209,7 +209,7 @@ def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:
     assert pool.run(work_double, 1) == 2
 
 
-def test_a_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
+def test_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import os, signal, sys\n"
@@ -231,7 +231,7 @@ def test_a_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
         except ProcessLookupError:
             return
         if Path(f"/proc/{worker}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
-            return  # ended; whoever adopted it has not yet looked
+            return  # ended; its new parent has not reaped it yet
         time.sleep(0.1)
     pytest.fail("the worker outlived its parent")
 
@@ -252,7 +252,7 @@ needs_landlock = pytest.mark.skipif(
 
 
 @needs_landlock
-def test_a_confined_worker_writes_only_where_it_may(confined: Pool, tmp_path: Path) -> None:
+def test_confined_worker_writes_only_to_allowed_folders(confined: Pool, tmp_path: Path) -> None:
     assert confined.run(work_write, str(tmp_path / "scratch" / "a"), "x") == "x"
     assert confined.run(work_write, str(tmp_path / "database" / "a-shm"), "new") == "new"
     for forbidden in ("database/other", "elsewhere"):
@@ -262,7 +262,7 @@ def test_a_confined_worker_writes_only_where_it_may(confined: Pool, tmp_path: Pa
 
 
 @needs_landlock
-def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) -> None:
+def test_confined_worker_has_no_network_and_starts_no_program(confined: Pool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with pytest.raises(RuntimeError, match="PermissionError"):
@@ -274,8 +274,8 @@ def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) 
         confined.run(work_execute)
 
 
-def test_what_workers_are_forked_from_is_started_beside() -> None:
-    """It has imported what it was told to, whoever starts the first worker."""
+def test_fork_server_starts_in_background() -> None:
+    """Its modules are imported before the first worker starts."""
     script = (
         "import sys\n"
         "from app import pool\n"

@@ -1,4 +1,4 @@
-"""The main job on real maps, through HTTP, on both databases: upload, and get the same information back."""
+"""Upload and download of real maps over HTTP, on both databases, keep their information."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
     path = data / name
-    if kind == "gazebo":  # a world with all that lies below its folder, or beside the folder of the worlds
+    if kind == "gazebo":  # a world with all files below its folder, or beside the folder of the worlds
         root = path.parent.parent if path.parent.name == "worlds" else path.parent
         paths = [p for p in root.rglob("*") if p == path or (p.is_file() and p.parent != path.parent)]
         return {p.relative_to(root).as_posix(): p.read_bytes() for p in paths}
@@ -100,8 +100,8 @@ def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
     return {p.relative_to(path.parent).as_posix(): p.read_bytes() for p in paths}
 
 
-def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
-    """All files of a map, by the short address a robot uses."""
+def download(api: Api, env: str, kind: str) -> dict[str, bytes]:
+    """Download all files of a map, by the short URL for robots."""
     import io
     import zipfile
 
@@ -114,7 +114,7 @@ def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(("api", "name", "kind"), samples(), indirect=["api"])
-def test_every_sample_comes_back_with_the_same_information(
+def test_samples_keep_their_information(
     api: Api, shared: Path, same: Same, name: str, kind: str, request: pytest.FixtureRequest
 ) -> None:
     env = f"s{abs(hash(name)) % 10**12}"
@@ -124,15 +124,15 @@ def test_every_sample_comes_back_with_the_same_information(
         problem = api.upload(env, files, expect=None, format=kind)
         assert 400 <= problem.status_code < 500, REFUSED[name]
         assert problem.json()["errors"]
-        assert api.get(f"environments/{env}").json()["version"] == 0, "nothing is half stored"
+        assert api.get(f"environments/{env}").json()["version"] == 0, "a rejected upload stores nothing"
         return
     api.upload(env, files, format=kind)
     sources = api.get(f"environments/{env}/versions/latest/sources").json()
     assert {s["name"] for s in sources} == set(files)
     for source in sources[:3]:
         response = api.get(f"environments/{env}/versions/latest/sources/{source['name']}")
-        assert response.content == files[source["name"]], "the original is kept byte for byte"
-    back = served(api, env, kind)
+        assert response.content == files[source["name"]], "the original is stored byte for byte"
+    back = download(api, env, kind)
     if name not in UNCOMPARED:
         assert same(kind, files, back) == []
 
@@ -146,7 +146,7 @@ TEMPLATES = [
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
-def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Same, name: str) -> None:
+def test_template_folder_is_one_version(api: Api, shared: Path, same: Same, name: str) -> None:
     root = shared / "data" / "environment_template" / name
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = name.replace("_", "-")
@@ -161,10 +161,10 @@ def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Sa
         assert same("occupancy_grid", original, answer) == []
     if any(n.endswith("network.tmap2.yaml") for n in files):
         network = next(n for n in used if "topological" in n and n.endswith(".tmap2.yaml"))
-        assert same("tmap2", {"a.tmap2.yaml": files[network]}, served(api, env, "tmap2")) == []
+        assert same("tmap2", {"a.tmap2.yaml": files[network]}, download(api, env, "tmap2")) == []
     if any("datum" in n for n in used):
         site = next(n for n in used if "datum" in n)
-        assert same("datum", {"datum.yaml": files[site]}, served(api, env, "datum")) == []
+        assert same("datum", {"datum.yaml": files[site]}, download(api, env, "datum")) == []
 
 
 def names_in(package: bytes) -> list[str]:
@@ -172,8 +172,8 @@ def names_in(package: bytes) -> list[str]:
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
-def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
-    """Zipped in, zipped out: the same information, and the same content as the folder's files by themselves."""
+def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
+    """A zipped upload and download keep the information, and equal an upload of the folder's files."""
     root = shared / "data" / "environment_template" / name
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
     env = f"zip-{name.replace('_', '-')}"
@@ -185,7 +185,7 @@ def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, 
     assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-disposition"] == 'attachment; filename="environment.zip"'
     other = api.get(f"/maps/{loose}/environment/environment.zip").content
-    assert names_in(other) == names_in(answer.content), "maps differ by the environment's name alone"
+    assert names_in(other) == names_in(answer.content), "maps differ only by the environment's name"
     assert same("environment", files, {"environment.zip": answer.content}) == []
     report = api.get(f"environments/{env}/versions/latest/reports/environment").json()
     layers = {e["layer"] for e in api.get(f"environments/{env}/versions/latest/layers").json() if e["count"]}
@@ -193,7 +193,7 @@ def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, 
 
 
 def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[str, Any]) -> None:
-    """OSM's nodes in the local frame of a tmap2, against PROJ's own transverse Mercator."""
+    """Compare OSM nodes in the local frame of a tmap2 with PROJ's own transverse Mercator."""
     name = "osm/urban-usa-mn-minnesota-zoo/osm.xml"
     api.post("environments", {"name": "zoo"})
     version = api.upload("zoo", {"osm.xml": (shared / "data" / name).read_bytes()}).json()
@@ -215,10 +215,10 @@ def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[st
 
 
 @pytest.mark.parametrize("way", [["kml"], ["geojson"], ["kml", "geojson"], ["geojson", "kml"], ["kmz"]])
-def test_a_network_keeps_every_node_edge_and_attribute_on_the_way(
+def test_network_keeps_every_node_edge_and_attribute_through_formats(
     api: Api, shared: Path, same: Same, way: list[str]
 ) -> None:
-    """tmap2 → kml, geojson … → tmap2."""
+    """Convert tmap2 → kml, geojson … → tmap2."""
     path = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/topological"
     original = {"network.tmap2.yaml": (path / "network.tmap2.yaml").read_bytes()}
     env = "way-" + "-".join(way)
@@ -226,8 +226,8 @@ def test_a_network_keeps_every_node_edge_and_attribute_on_the_way(
     api.post("environments", {"name": env, "datum": datum})
     api.upload(env, original)
     for k, kind in enumerate(way):
-        files = served(api, env, kind)
+        files = download(api, env, kind)
         env = f"{env}-{k}"
         api.post("environments", {"name": env, "datum": datum})
         api.upload(env, files, format=kind)
-    assert same("tmap2", original, served(api, env, "tmap2")) == []
+    assert same("tmap2", original, download(api, env, "tmap2")) == []

@@ -1,4 +1,4 @@
-"""How the code is laid out, counted: lengths of functions and files, old names, imports of private modules."""
+"""Structure of the code: lengths of functions and files, names, imports of private modules."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ MAX_FILE_LINES = 600
 
 LONG_FUNCTIONS = {
     "app/generate/_kernels_wfc.py:collapse": "one compiled loop with its backtracking: its parts would copy its state",
-    "app/syntax/yaml/lines.py:load_lines": "the hot loop of the quick reader: its state stays in locals",
+    "app/syntax/yaml/lines.py:load_lines": "the hot loop of the fast parser: its state stays in locals",
 }
-"""Longer ones: why."""
+"""Exceptions with their reasons."""
 
 LONG_FILES = {
     "app/agent/ros/fleetmap_ros/loading.py": "runs as one script under the robot's own Python",
 }
-"""Longer ones: why."""
+"""Exceptions with their reasons."""
 
 VAGUE_NAMES = {
     "told",
@@ -46,7 +46,7 @@ VAGUE_NAMES = {
     "ear",
     "wish",
 }
-"""Participles and question words, which tell a reader nothing as names."""
+"""Participles and question words, which are not allowed as names."""
 
 PUBLIC_NAMES = {
     "app/api/http/schemas.py:where": "a member of problems, as clients see them",
@@ -61,12 +61,12 @@ PUBLIC_NAMES = {
     "app/cli/client.py:tell": "a method of Python's files",
     "app/store/scrub.py:found": "a member of a stored file",
 }
-"""Such names all the same: why."""
+"""Exceptions with their reasons."""
 
 
 @cache
 def modules(folder: str) -> dict[str, ast.Module]:
-    """The syntax tree of each file below a folder, by its path."""
+    """Parse each file below a folder: path -> syntax tree."""
     paths = sorted((TOP / folder).rglob("*.py"))
     return {path.relative_to(TOP).as_posix(): ast.parse(path.read_text()) for path in paths}
 
@@ -79,7 +79,7 @@ def functions(folder: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFun
 
 
 def body_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of what a function does: neither its parameters, which are the options of a command, nor its docstring."""
+    """Count the lines of a function's body, without parameters (options of a command) and docstring."""
     body = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
     return (node.end_lineno or 0) - body[0].lineno + 1 if body else 0
 

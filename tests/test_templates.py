@@ -1,4 +1,4 @@
-"""The named sets hold what writers accept; what holds for a format follows from set and environment."""
+"""Template sets have values that writers accept; a format's values follow from set and environment."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ TMAP2 = formats.get_format("tmap2")
 
 
 @pytest.mark.parametrize("name", templates.SETS)
-def test_every_set_says_what_writers_take(name: str) -> None:
+def test_template_sets_have_only_valid_values(name: str) -> None:
     one = templates.SETS[name]
     assert one.title
     for format_name, values in one.values.items():
         assert values, format_name
         checked = templates.check_values(formats.get_format(format_name), values)
-        assert checked == dict(sorted(values.items())), f"{format_name}: values stand as they are kept"
+        assert checked == dict(sorted(values.items())), f"{format_name}: values must have their stored form"
         defaults = {p["name"]: p["default"] for p in parameters.describe(formats.get_format(format_name).write_options)}
         same = [key for key, value in checked.items() if value == defaults[key]]
-        assert not same, f"{format_name}: {same} say the format's own defaults"
+        assert not same, f"{format_name}: {same} repeat the format's own defaults"
 
 
-def test_no_name_stands_for_two_things() -> None:
-    """``set`` stands beside formats' names and parameters' names in a version's changes."""
+def test_names_are_unambiguous() -> None:
+    """``set`` is beside names of formats and parameters in a version's changes."""
     assert "set" not in formats.all_formats()
     for fmt in formats.all_formats().values():
         assert "set" not in {p["name"] for p in parameters.describe(fmt.write_options)}
 
 
-def test_what_holds() -> None:
+def test_resolved_template_follows_set_and_environment() -> None:
     assert templates.resolve(NO_TEMPLATES, TMAP2) is templates.NO_VALUES
     environment_templates = Templates(
         "outdoor",
@@ -59,7 +59,7 @@ def test_what_holds() -> None:
     assert Templates("indoor") != NO_TEMPLATES
 
 
-def test_what_differs() -> None:
+def test_template_changes_lists_differing_values() -> None:
     a = Templates("default", {"tmap2": FormatTemplate(None, {"action": "go", "osm": False})})
     b = Templates(
         "indoor",
@@ -80,7 +80,7 @@ def test_what_differs() -> None:
     assert template_changes(a, none) == {"templates": {"tmap2": {"pointset": {"from": None, "to": None}}}}
 
 
-def test_values_are_typed_as_json_has_them() -> None:
+def test_values_have_json_types() -> None:
     octomap = formats.get_format("octomap")
     assert templates.check_values(octomap, {"bbox": "0,0,0,1,1,1"}) == {"bbox": [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]}
     assert templates.check_values(TMAP2, {"xy_goal_tolerance": "0.5", "osm": "yes"}) == {
@@ -99,17 +99,17 @@ LANE = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</na
 
 
 def texts(fmt: formats.Format) -> dict[str, str]:
-    """The parameters of a writer that take any text and choose no stored part."""
+    """List a writer's parameters that accept any text and select no stored part."""
     choosing = {"grid", "level", "name", "picture", "world"}
     described = parameters.describe(fmt.write_options)
     return {p["name"]: EVIL for p in described if p["schema"] == {"type": "string"} and p["name"] not in choosing}
 
 
-SAYING = [known.name for known in formats.all_formats().values() if texts(known)]
+WITH_TEXTS = [fmt.name for fmt in formats.all_formats().values() if texts(fmt)]
 
 
-@pytest.mark.parametrize("name", SAYING)
-def test_no_text_breaks_out_of_a_file(name: str) -> None:
+@pytest.mark.parametrize("name", WITH_TEXTS)
+def test_text_values_are_escaped_in_files(name: str) -> None:
     fmt = formats.get_format(name)
     options = templates.check_values(fmt, texts(fmt))
     hints, datum = UploadHints(layer="topology"), Datum(53.2686, -0.5245)
@@ -122,4 +122,4 @@ def test_no_text_breaks_out_of_a_file(name: str) -> None:
     assert {line["from"] for line in converted.report.as_dict()["template"] if line.get("option") in filled} == {
         "request"
     }
-    assert content.count(repr(EVIL)[1:-1]) >= 1, "it came through as a text, whole"
+    assert content.count(repr(EVIL)[1:-1]) >= 1, "the complete text is in the file"

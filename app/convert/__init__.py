@@ -1,5 +1,5 @@
-"""READ: a stored version -> a map in the wanted format.
+"""Read path: convert a stored version to a map in the requested format.
 
-``recipe`` says how a map would be made (cheaply, from the version's manifest), ``worker`` makes it, ``cache`` keeps it
-and lets one of many askers do the work, ``app.pool`` is where the work is done.
+``recipe`` plans a conversion (cheaply, from the version's manifest), ``worker`` executes it, ``cache`` stores the
+result and coalesces concurrent requests, ``app.pool`` runs the workers.
 """

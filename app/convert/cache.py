@@ -1,12 +1,12 @@
-"""Made maps on disk, keyed by content: one of many askers makes a map, all others wait for it.
+"""Cache of converted maps on disk, keyed by content; concurrent callers for a key wait for one conversion.
 
-A map is a folder ``<key[:2]>/<key>`` with its files and ``map.json``, whose first line is the hash of the rest; it
-appears by a rename, so it is whole or absent. A file lock for each key holds across worker processes of the server.
+A map is a folder ``<key[:2]>/<key>`` with its files and ``map.json``, whose first line is the hash of the rest. A
+rename creates it atomically. A file lock per key works across worker processes of the server.
 
-The disk is not trusted. A process hashes an entry when it first meets it, and content again whenever it is read
-(``MadeFile.read``); what does not match is removed and made again. That is why the fsync may come after the rename, in
-the background: an entry that a power cut left half-written never passes the hash. Where the disk refuses (no room,
-read-only), maps are made all the same and kept in memory for a while.
+The disk is not trusted. A process hashes an entry on first use, and file content on every read (``CachedFile.read``); a
+mismatch removes the entry and the map is converted again. So the fsync may run after the rename, in the background: an
+entry left half-written by a power cut never passes the hash. If the disk cannot be written (full, read-only), maps are
+still converted and kept in memory for a while.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from app.errors import BROKEN_STORAGE_ERRNOS, DISK_FULL_ERRNOS, Unavailable, sys
 log = logging.getLogger(__name__)
 
 FRESH_SECONDS = 60.0
-"""A map is marked as used at most this often: its age decides what goes when room is needed."""
+"""Minimum seconds between two updates of an entry's last-use time, which orders eviction."""
 
 MAX_MEMORY_BYTES = 64 * 2**20
-"""Room in memory for maps that the disk refused; the newest stays, whatever its size."""
+"""Size limit in bytes of maps kept in memory after a failed write; the newest stays, whatever its size."""
 
 MAX_CHECKED = 100_000
-"""Entries of which it is remembered that they were hashed."""
+"""Maximum number of entries remembered as verified."""
 
 
 class LostMap(Unavailable):
-    """A cached map that was damaged or removed while it was read; it is made again when it is requested again."""
+    """Cached map that was damaged or removed while it was read; a new request converts it again."""
 
 
 @dataclass(frozen=True, slots=True)
 class CachedFile:
-    """One file of a made map. place: the level and name of the part that it is of, in a map of several.
+    """One file of a cached map. place: level and name of its part, in a map of several parts.
 
-    path: None where it is in memory (``data``), since the disk refused it. on_damage: called with what is wrong.
+    path: None if it is in memory (``data``), because it could not be written. on_damage: called with the reason.
     """
 
     name: str
@@ -68,7 +68,7 @@ class CachedFile:
     on_damage: Callable[[str], None] = field(default=lambda _: None, compare=False, repr=False)
 
     def read(self) -> bytes:
-        """The content, hashed again; LostMap where it is not what was made, or gone."""
+        """Read the content and verify its hash. Raises LostMap if it is damaged or deleted."""
         if self.path is None:
             return self.data or b""
         try:
@@ -79,22 +79,22 @@ class CachedFile:
         return data
 
     def check(self, sha256: str) -> None:
-        """LostMap unless this is the content's hash."""
+        """Raise LostMap if the content's hash differs from ``sha256``."""
         if sha256 != self.sha256:
             raise self.lost_error(None)
 
     def lost_error(self, error: OSError | None) -> LostMap:
-        """The error for content that cannot be read (or has another hash), which is reported as damage."""
+        """Build the error for unreadable content (None: its hash differs), and report the damage."""
         if error is None:
             self.on_damage(f"{self.name!r} does not match its hash")
-        elif error.errno in BROKEN_STORAGE_ERRNOS:  # not where the cache only needed the room
+        elif error.errno in BROKEN_STORAGE_ERRNOS:  # not if the entry was merely evicted
             self.on_damage(f"{self.name!r} cannot be read: {system_reason(error)}")
-        return LostMap(f"the cached {self.name!r} was lost while it was read: request it again")
+        return LostMap(f"the cached file {self.name!r} was lost while it was read: request it again")
 
 
 @dataclass(frozen=True, slots=True)
 class CachedMap:
-    """A made map: its files (main file first), the one thing to download, the report; fresh: made just now."""
+    """Cached map: files (main file first), archive, report. fresh: converted by this call."""
 
     files: tuple[CachedFile, ...]
     archive: CachedFile | None
@@ -103,27 +103,27 @@ class CachedMap:
 
     @property
     def size(self) -> int:
-        """Bytes of all its files."""
+        """Total size of its files in bytes."""
         return sum(file.size for file in self.all_files())
 
     def all_files(self) -> tuple[CachedFile, ...]:
-        """All files, and the archive of them."""
+        """All files and their archive."""
         return (*self.files, *([self.archive] if self.archive else []))
 
     def single_file(self) -> CachedFile:
-        """The file itself where the map is one file, else the zip of all."""
+        """The map's only file, or the zip of all files."""
         return self.archive or self.files[0]
 
     def file(self, name: str) -> CachedFile | None:
-        """One file by its name."""
+        """Return the file with this name."""
         return next((f for f in self.files if f.name == name), None)
 
 
 @dataclass(frozen=True, slots=True)
 class ConvertedMap:
-    """What a maker returns: content by name with media types, an archive of it where there are several, the report.
+    """Result of a conversion: content by name, media types, an archive if there are several files, the report.
 
-    A made file instead of bytes is linked, if its content still has its hash. places: see ``MadeFile.place``.
+    A CachedFile instead of bytes is linked, if its content still matches its hash. places: see ``CachedFile.place``.
     """
 
     files: dict[str, tuple[bytes | CachedFile, str]]
@@ -133,13 +133,13 @@ class ConvertedMap:
 
 
 STALE_AFTER_SECONDS = 3600.0
-"""A map in the making that nobody touched for so long was left by a killed process."""
+"""Age in seconds after which an unfinished entry counts as left behind by a killed process."""
 
 
 class Cache:
-    """At most ``limit`` bytes of made maps; the longest unused go first. damaged: how many entries were found bad.
+    """Cache of at most ``limit`` bytes that evicts the least recently used maps. damaged: number of damaged entries.
 
-    on_damage: called for each of them. problem: why maps are not kept on disk at the moment, None where they are.
+    on_damage: called for each of them. problem: why maps cannot be written to disk now, or None.
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
@@ -163,7 +163,7 @@ class Cache:
         self._total = sum(size for _, size, _ in self._entries())
 
     def get(self, key: str) -> CachedMap | None:
-        """The map, if it is made and intact."""
+        """Return the map if it is cached and intact."""
         cached_map = self._read_checked(key)
         if cached_map is not None:
             return cached_map
@@ -171,7 +171,7 @@ class Cache:
             return self._in_memory.get(key)
 
     def _read_checked(self, key: str) -> CachedMap | None:
-        """The entry on disk, hashed when this process first meets it; a bad one is removed."""
+        """Read the entry on disk; verify it on this process's first use and remove it if it is damaged."""
         entry = self._read_entry(key)
         if entry is None:
             return None
@@ -191,9 +191,9 @@ class Cache:
         return cached_map
 
     def _read_entry(self, key: str) -> tuple[CachedMap, tuple[int, int, int]] | None:
-        """What ``map.json`` describes; None where it is absent, cannot be read at the moment, or is not intact.
+        """Read ``map.json`` and a stamp; None if it is absent, currently unreadable or damaged.
 
-        The stamp with it changes when any of its files is written to or lost.
+        The stamp changes if any file of the entry is written or deleted.
         """
         folder = self._path(key)
         try:
@@ -205,7 +205,7 @@ class Cache:
             return None
         line, _, text = raw.partition(b"\n")
         if line != hashlib.sha256(text).hexdigest().encode() or (described := orjson.loads(text))["key"] != key:
-            earlier = raw.startswith(b"{")  # of an earlier release, which wrote no hash
+            earlier = raw.startswith(b"{")  # earlier releases wrote no hash
             self.discard(key, None if earlier else "map.json does not match its hash")
             return None
         damaged = partial(self.discard, key)
@@ -222,28 +222,31 @@ class Cache:
                 self._checked.popitem(last=False)
 
     def discard(self, key: str, reason: str | None) -> None:
-        """Remove an entry that must not be served. reason: what is wrong with it; None where it is merely outdated."""
+        """Remove an entry that must not be served. reason: the damage; None if it is only outdated."""
         with self._guard:
             self._checked.pop(key, None)
         if reason is not None:
             self.damaged += 1
             self.on_damage()
-            log.warning("cache: a map is damaged and will be made again (key=%s, reason=%s)", key[:16], reason)
+            log.warning("cache: damaged map removed, it will be converted again (key=%s, reason=%s)", key[:16], reason)
         self._remove(self._path(key))
 
     def _remove(self, folder: Path) -> None:
-        """Remove an entry at once, whole. On a disk that cannot be written it stays, and is hashed again."""
+        """Remove an entry atomically. On a read-only disk it stays, and is verified again."""
         away = self._folder / f"making-{uuid4().hex}"
         with contextlib.suppress(OSError):
             folder.rename(away)
         shutil.rmtree(away, ignore_errors=True)
 
     def stored_keys(self) -> list[str]:
-        """All entries on disk."""
+        """List the keys of all entries on disk."""
         return sorted(folder.name for _, _, folder in self._entries())
 
     def check(self, key: str) -> tuple[int, bool]:
-        """Hash an entry, whatever is known of it: (bytes read, whether it is intact). A bad one is removed."""
+        """Verify an entry even if it was verified before; remove it if it is damaged.
+
+        Returns the bytes read and whether it is intact.
+        """
         before = self.damaged
         entry = self._read_entry(key)
         if entry is None:
@@ -257,13 +260,13 @@ class Cache:
         return sum(f.size for f in cached_map.all_files()), True
 
     def sample(self, share: float) -> Iterator[tuple[str, int, bool]]:
-        """Hash some of the entries, chosen at random: (key, bytes, whether it was intact)."""
+        """Verify a random share of the entries. Yields (key, bytes read, whether it was intact)."""
         keys = self.stored_keys()
         for key in random.sample(keys, math.ceil(len(keys) * share)):
             yield key, *self.check(key)
 
     def get_or_make(self, key: str, maker: Callable[[], ConvertedMap]) -> CachedMap:
-        """The map; made now if nobody has, and then by one caller only."""
+        """Return the map; if it is not cached, one caller converts it and the others wait."""
         cached_map = self.get(key)
         if cached_map is not None:
             self.hits += 1
@@ -278,9 +281,9 @@ class Cache:
 
     @contextlib.contextmanager
     def hold_files(self) -> Iterator[Callable[[CachedMap], CachedMap]]:
-        """A function that keeps a made map's files until the block ends, whatever room the cache needs meanwhile.
+        """Yield a function that protects a map's files from eviction until the block ends.
 
-        It raises LostMap where they are gone already.
+        It raises LostMap if they are already deleted.
         """
         folder: Path | None = self._folder / f"making-{uuid4().hex}"
         count = 0
@@ -306,7 +309,7 @@ class Cache:
                         files.append(replace(file, path=folder / str(count)))
                     except FileNotFoundError as error:
                         raise file.lost_error(error) from error
-                    except OSError:  # no room for a name
+                    except OSError:  # disk full
                         files.append(replace(file, path=None, data=file.read()))
             return replace(cached_map, files=tuple(files), archive=None)
 
@@ -333,9 +336,9 @@ class Cache:
         return cached_map
 
     def _write(self, key: str, product: ConvertedMap) -> CachedMap | None:
-        """The entry on disk; None where it is removed or cannot be read as soon as it is there.
+        """Write an entry to disk; None if it is removed or unreadable right after the write.
 
-        OSError where the disk refuses; LostMap where a file of the product is damaged.
+        Raises OSError if it cannot be written, LostMap if a file of the product is damaged.
         """
         making = self._folder / f"making-{uuid4().hex}"
         making.mkdir()
@@ -349,19 +352,19 @@ class Cache:
             target.parent.mkdir(exist_ok=True)
             try:
                 making.rename(target)
-            except OSError:  # another host on the same disk may have been first: equal bytes
-                first = self._read_checked(key)  # a damaged one is removed by this
+            except OSError:  # another host that shares the disk may have been first: equal bytes
+                first = self._read_checked(key)  # removes a damaged one
                 if first is not None:
                     return first
-                self._remove(target)  # what was left of an entry
+                self._remove(target)  # incomplete entry
                 making.rename(target)
         finally:
             shutil.rmtree(making, ignore_errors=True)
         entry = self._read_entry(key)
-        if entry is None:  # another process needed the room, or it does not match its hash, which is reported
+        if entry is None:  # evicted by another process, or damaged, which is reported
             return None
         cached_map, stamp = entry
-        self._mark_checked(key, stamp)  # the hashes are of the bytes as they were made, not as the disk has them
+        self._mark_checked(key, stamp)  # hashed before the write: not read back from disk
         self._sync_later(key)
         return cached_map
 
@@ -373,17 +376,17 @@ class Cache:
             self._syncing.submit(self._sync, key)
 
     def _sync(self, key: str) -> None:
-        """Have an entry written to the disk itself; one that cannot be is removed."""
+        """Flush an entry to the disk; remove it if that fails."""
         folder = self._path(key)
         try:
             for path in (*folder.iterdir(), folder, folder.parent):
                 sync(path)
-        except OSError as error:  # else it is gone, since the cache needed the room, or is hashed again as any other
+        except OSError as error:  # other errors: it was evicted, or the next use verifies it
             if error.errno in BROKEN_STORAGE_ERRNOS | DISK_FULL_ERRNOS:
-                self.discard(key, f"it could not be written: {system_reason(error)}")
+                self.discard(key, f"cannot be written: {system_reason(error)}")
 
     def _keep_in_memory(self, key: str, product: ConvertedMap) -> CachedMap:
-        """The map in memory."""
+        """Keep the map in memory."""
 
         def described(name: str, content: bytes | CachedFile, media_type: str) -> CachedFile:
             data = content.read() if isinstance(content, CachedFile) else content
@@ -400,19 +403,19 @@ class Cache:
         return cached_map
 
     def _note_problem(self, reason: str | None) -> None:
-        """Log that the disk refuses, or works again: once each."""
+        """Log once that the disk cannot be written, and once that it works again."""
         if (reason is None) != (self.problem is None):
             if reason is None:
-                log.warning("cache: maps are kept on disk again")
+                log.warning("cache: writing to disk works again")
             else:
-                log.error("cache: the disk refuses, maps are made and kept in memory (reason=%s)", reason)
+                log.error("cache: writing to disk failed, maps are kept in memory (reason=%s)", reason)
         self.problem = reason
         if reason is None:
             with self._guard:
                 self._in_memory.clear()
 
     def find_by_hash(self, sha256: str, max_bytes: int) -> bytes | None:
-        """The content of a made file that is still here, by its SHA-256; None where it is gone or larger."""
+        """Return the content of a cached file by its SHA-256; None if it is not cached or larger than ``max_bytes``."""
         try:
             path = self._folder / self._hash_path(sha256).read_text()
             if path.stat().st_size > max_bytes:
@@ -436,7 +439,7 @@ class Cache:
         return self._folder / "hashes" / sha256[:2] / sha256
 
     def _evict(self) -> None:
-        """Called when there is too much; other processes may be doing the same, which does no harm."""
+        """Remove entries until the size limit holds. Safe to run in several processes at once."""
         entries = sorted(self._entries())
         total = sum(size for _, size, _ in entries)
         for _, size, folder in entries[:-1]:  # the newest stays, whatever its size
@@ -449,7 +452,7 @@ class Cache:
         self._total = total
 
     def _hashes_of_folder(self, folder: Path) -> list[str]:
-        """The hashes that lead to this folder."""
+        """List the hashes indexed for this folder."""
         try:
             described = orjson.loads((folder / "map.json").read_bytes().partition(b"\n")[2])
             every = [*described["files"], *([described["archive"]] if described["archive"] else [])]
@@ -459,7 +462,7 @@ class Cache:
             return []
 
     def _entries(self) -> list[tuple[float, int, Path]]:
-        """Each made map: when it was last used, its size, its folder."""
+        """List the entries: time of last use, size in bytes, folder."""
         out = []
         for folder in self._folder.glob("[0-9a-f][0-9a-f]/*"):
             with contextlib.suppress(OSError):
@@ -468,15 +471,15 @@ class Cache:
 
     @contextlib.contextmanager
     def _key_lock(self, key: str) -> Iterator[None]:
-        """One caller at a time for a key, among threads and processes."""
+        """Lock a key among threads and processes."""
         with self._guard:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
-            path = self._folder / "locks" / key[:2]  # few files; neighbours in the hash wait for each other, rarely
+            path = self._folder / "locks" / key[:2]  # few lock files; keys that share one rarely collide
             with contextlib.ExitStack() as stack:
                 try:
                     fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
-                except OSError as error:  # without room for a lock two processes may make the same map
+                except OSError as error:  # without a lock file two processes may convert the same map
                     self._note_problem(system_reason(error))
                 yield
         with self._guard:
@@ -504,7 +507,7 @@ def _write(folder: Path, stored: str, name: str, data: bytes | CachedFile, media
 
 
 def _link(source: Path, target: Path) -> None:
-    """A second name of a file, or a copy where the file system has no such thing. FileNotFoundError as usual."""
+    """Hard-link a file, or copy it if the file system has no hard links. Raises FileNotFoundError."""
     try:
         target.hardlink_to(source)
     except FileNotFoundError:
@@ -526,13 +529,13 @@ def _hash(path: Path) -> str:
 
 
 def _check_files(cached_map: CachedMap) -> None:
-    """LostMap unless all files of an entry match their hashes; what is wrong is reported as damage."""
+    """Verify all files of an entry and report damage. Raises LostMap if one does not match its hash."""
     for file in cached_map.all_files():
         assert file.path is not None
         try:
             digest = _hash(file.path)
         except FileNotFoundError as error:
-            if (file.path.parent / "map.json").exists():  # else the whole entry was removed meanwhile
+            if (file.path.parent / "map.json").exists():  # otherwise the entry was removed meanwhile
                 file.on_damage(f"{file.name!r} is missing")
             raise file.lost_error(error) from error
         except OSError as error:
@@ -541,7 +544,7 @@ def _check_files(cached_map: CachedMap) -> None:
 
 
 def sync(path: Path) -> None:
-    """Have a file or folder written to the disk itself."""
+    """Flush a file or folder to the disk (fsync)."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

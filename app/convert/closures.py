@@ -1,7 +1,7 @@
-"""Apply closures on the way out: areas become keepout zones and cells, edges are left out of networks or marked.
+"""Apply closures to exported maps: areas become keepout zones and cells, edges are omitted from networks or marked.
 
-Areas are put beside the stored zones before anything is derived, so that masks and grids made of zones hold them. Edges
-are taken out of the network that a format is about to write, stored or derived.
+Areas are added to the stored zones before anything is derived, so that masks and grids derived from zones contain them.
+Edges are removed from the network that a format is about to write, stored or derived.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NO_EFFECT = "none"
 
 MAX_CELLS = 2**28
 MAX_METRES_FROM_DATUM = 100_000.0
-"""A closed area in degrees lies within this distance of the datum, in metres."""
+"""Maximum distance of a closed area in degrees from the datum, in metres."""
 
 MAX_AREA_METRES = 10_000.0
 """Maximum extent of a closed area, in metres."""
@@ -59,7 +59,7 @@ def add_areas(version: Version) -> Version:
 
 
 def drop_areas(version: Version) -> Version:
-    """Take them out again: the version as it is stored."""
+    """Remove the closed areas: the version as it is stored."""
     return replace(version, parts=tuple(entry for entry in version.parts if not _is_area_part(entry)))
 
 
@@ -72,10 +72,10 @@ def load(store: Store, version: Version, keys: Collection[PartKey]) -> Layers:
 
 
 def drop_timed_marks(layers: Layers, areas: Collection[PartKey] = ()) -> Layers:
-    """Drop what is blocked until a time in the layers themselves: closures alone say what is blocked for a time.
+    """Drop marks in the layers that block something until a time: only closures block temporarily.
 
-    Releases before closures put such marks into versions, and maps with closures in them may be uploaded again. areas:
-    parts that are closed areas.
+    Releases without closures stored such marks in versions, and exported maps with closures may be uploaded again.
+    areas: parts that are closed areas.
     """
     return replace(
         layers,
@@ -99,7 +99,7 @@ def _drop_timed_marks(part: Features) -> Features:
 
 
 def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dict[str, Any]:
-    """What a map's bytes depend on besides its parts; empty if no closure can change them."""
+    """Collect the closures that a map's bytes depend on, for the recipe key; empty if none can change them."""
     closures = version.closures
     if closures is None:
         return {}
@@ -114,12 +114,12 @@ def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dic
 
 
 def place_problem(closure: Closure, version: Version) -> str | None:
-    """Why a closed area has no place in a version; None if it has one."""
+    """Return why a closed area cannot be located in a version, or None."""
     levels = [level.name for level in version.levels]
     if closure.level not in levels:
-        return f"version {version.number} has no level {closure.level[:80]!r}; it has {', '.join(levels)[:500]}"
+        return f"version {version.number} has no level {closure.level[:80]!r}; its levels: {', '.join(levels)[:500]}"
     if closure.crs == "wgs84" and version.datum is None:
-        return f"version {version.number} has no datum, so degrees have no place in it"
+        return f"version {version.number} has no datum, which coordinates in degrees require"
     try:
         box = shapely.total_bounds(_zones([closure]).in_local(_frame(version.datum)))
     except FleetMapError as error:
@@ -127,7 +127,7 @@ def place_problem(closure: Closure, version: Version) -> str | None:
     if max(box[2] - box[0], box[3] - box[1]) > MAX_AREA_METRES:
         return f"it is wider than {MAX_AREA_METRES / 1000:g} km"
     if closure.crs == "wgs84" and not (np.abs(box) <= MAX_METRES_FROM_DATUM).all():
-        return f"it reaches more than {MAX_METRES_FROM_DATUM / 1000:g} km from the datum"
+        return f"it extends more than {MAX_METRES_FROM_DATUM / 1000:g} km from the datum"
     return None
 
 
@@ -139,7 +139,7 @@ MAX_CACHED_PLACES = 64
 
 
 def _areas(version: Version) -> dict[PartKey, list[Closure]]:
-    """The closed areas that have a place in a version, by the part that they become."""
+    """Group the closed areas that can be located in a version by the part that they become."""
     closures = version.closures
     if closures is None or not closures.items:
         return {}
@@ -182,7 +182,7 @@ def _box(zones: Features, chosen: NDArray[np.bool_]) -> Box | None:
 
 
 def _zones(areas: Sequence[Closure]) -> Features:
-    """Closed areas as keepout zones."""
+    """Convert closed areas to keepout zones."""
     anchors: tuple[Anchor, ...] = ("local", "wgs84")
     both = []
     for anchor in anchors:
@@ -206,8 +206,10 @@ def _frame(datum: Datum | None) -> LocalFrame | None:
 
 @dataclass(frozen=True, slots=True)
 class ClosureLine:
-    """What one closure did to a map. edge: the closed edge, None for an area. edges: ids, ``MAX_LISTED`` at most.
-    why: the reason for no effect."""
+    """Effect of one closure on a map, as a line of its report.
+
+    edge: the closed edge, None for an area. edges: ids, at most ``MAX_LISTED``. why: the reason for no effect.
+    """
 
     id: str
     level: str
@@ -218,7 +220,7 @@ class ClosureLine:
     why: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The line as JSON, without its empty members."""
+        """Convert the line to JSON, without empty members."""
         out: dict[str, Any] = {"id": self.id, "level": self.level, "expires": self.expires}
         out |= {} if self.edge is None else {"edge": self.edge}
         out |= {"effect": self.effect, "edges": list(self.edges)}
@@ -226,16 +228,16 @@ class ClosureLine:
 
     @classmethod
     def from_dict(cls, line: Mapping[str, Any]) -> ClosureLine:
-        """The line from its JSON."""
+        """Read the line from JSON."""
         return cls(**{**line, "edges": tuple(line["edges"])})
 
 
 @dataclass(slots=True)
 class ClosureReport:
-    """What closures did to one map.
+    """Effects of closures on one map.
 
-    lines: one for each closure with an effect. omitted: number of edges that were taken out. kept: number of blocked
-    edges that stay in a format that cannot express it. emptied: whether no edge would have been left.
+    lines: one for each closure with an effect. omitted: number of removed edges. kept: number of blocked edges that
+    stay in a format that cannot mark them. emptied: whether no edge would have been left.
     """
 
     lines: list[ClosureLine] = field(default_factory=list)
@@ -249,8 +251,7 @@ def close(
 ) -> tuple[Layers, ClosureReport]:
     """Apply closures, and the network's own blocked edges, to the layers that a format is about to write.
 
-    drawn: parts that a derivation made of zones on the way: they hold the areas already. mark: keep closed edges, with
-    a mark.
+    drawn: parts derived from zones: they contain the areas already. mark: keep closed edges, with a mark.
     """
     report = ClosureReport()
     mode: ClosureMode = "apply" if closures is None else closures.mode
@@ -268,7 +269,7 @@ def close(
             if key not in drawn and areas:
                 parts[key], complete = _burn(part, areas, layers.frame)
             for area in areas:
-                effects[area.id].cells = "keepout cells" if complete else "keepout cells (cut off at the mask's edge)"
+                effects[area.id].cells = "keepout cells" if complete else "keepout cells (cropped at the mask's edge)"
         elif isinstance(part, Features) and key.layer == "zones":
             for overlay_id in (zones[i] for i in part.ids if i in zones):
                 effects[overlay_id].zone = True
@@ -282,7 +283,7 @@ def close(
 
 @dataclass(slots=True)
 class _Effect:
-    """What one closure did to one map."""
+    """Effect of one closure on one map."""
 
     edges: list[str] = field(default_factory=list)
     zone: bool = False
@@ -295,20 +296,20 @@ class _Effect:
 
 
 def line(closure: Closure, effect: _Effect | None = None, *, mark: bool = False, why: str | None = None) -> ClosureLine:
-    """A report's line about one closure. why: the reason for no effect."""
+    """Build a report's line about one closure. why: the reason for no effect."""
     effect = effect or _Effect()
     edges = tuple(effect.edges[:MAX_LISTED])
     return ClosureLine(closure.id, closure.level, closure.expires, effect.text(mark=mark), edges, closure.edge, why)
 
 
 def report_lines(version: Version, stored: Iterable[ClosureLine]) -> tuple[ClosureLine, ...]:
-    """A line for each closure in force: the effect in a map's stored report, or why there is none."""
+    """Build a line for each closure in force: its effect from a map's stored report, or why it has none."""
     effects = {one.id: one for one in stored}
     out = []
     for closure in () if version.closures is None else version.closures.items:
         why: str | None = "this map has no such edge"
         if closure.edge is None:
-            why = place_problem(closure, version) or "this map has nothing that the area could close"
+            why = place_problem(closure, version) or "this map contains nothing inside the area"
         out.append(effects.get(closure.id) or line(closure, why=why))
     return tuple(out)
 
@@ -340,7 +341,7 @@ def _close_edges(
     effects: Mapping[str, _Effect],
     report: ClosureReport,
 ) -> Features:
-    """A network without its closed edges, or with a mark on them."""
+    """Remove the closed edges of a network, or mark them."""
     until: dict[int, str] = {}
     for closure, places in _find_closed_edges(key, part, items, frame):
         for k in places:
@@ -355,7 +356,7 @@ def _close_edges(
         return left
     if not until:
         return part
-    # Drawing formats write a drawn line and leave out what was made of it: a marked edge speaks for itself.
+    # Drawing formats write a drawn line and omit the edges read from it: unlink marked edges to write them too.
     loose = {part.properties[k].get("drawn_from") for k in until} - {None}
     properties = []
     for k, p in enumerate(part.properties):
@@ -368,7 +369,7 @@ def _close_edges(
 def _find_closed_edges(
     key: PartKey, part: Features, items: Sequence[Closure], frame: LocalFrame | None
 ) -> Iterator[tuple[Closure, list[int]]]:
-    """Closures of a network with the positions of the edges that each closes: by id, or by crossing its area."""
+    """Yield each closure of a network with the indices of the edges that it closes, by id or by crossing its area."""
     areas = [c for c in items if c.polygon is not None and c.level == key.level]
     named = [c for c in items if c.edge is not None]
     if not areas and not named:
@@ -386,14 +387,14 @@ def _find_closed_edges(
             try:
                 area = _area_in_metres(closure, frame)
             except FleetMapError:
-                continue  # without a place here, which the report says
+                continue  # cannot be located here, as the report explains
             hit = np.sort(tree.query(area, predicate="intersects"))
             if len(hit):
                 yield closure, places[hit].tolist()
 
 
 def _area_in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
-    """A closed area in local metres. Raises MissingDatum."""
+    """Convert a closed area to local metres. Raises MissingDatum."""
     return _zones([closure]).in_local(frame)[0]
 
 
@@ -401,9 +402,9 @@ def _area_in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
 
 
 def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | None) -> tuple[OccupancyGrid, bool]:
-    """A stored keepout mask with closed areas occupied, and whether it holds all of them.
+    """Mark closed areas as occupied in a stored keepout mask. Returns it and whether it covers all areas.
 
-    The mask grows by free cells if an area reaches beyond it, up to MAX_CELLS.
+    The mask grows by free cells if an area extends beyond it, up to MAX_CELLS.
     """
     from rasterio.features import rasterize
     from rasterio.transform import Affine
@@ -417,7 +418,7 @@ def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | Non
         try:
             shapes.append(shapely.affinity.affine_transform(_area_in_metres(area, frame), [*to_cells, *shift]))
         except FleetMapError:
-            continue  # without a place here, which the report says
+            continue  # cannot be located here, as the report explains
     if not shapes:
         return grid, False
     left, bottom, right, top = shapely.total_bounds(np.array(shapes, object))

@@ -1,4 +1,4 @@
-"""Files -> files, without a server or a store: ``fleetmap convert`` and ``POST /convert``."""
+"""Convert files to files without a store: ``fleetmap convert`` and ``POST /convert``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from app.upload_reader import EnvironmentContext, UploadHints
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """The map's files, main file first, the report on it, and what was doubtful in the input."""
+    """Converted map: files, main file first, its report, and warnings about the input."""
 
     files: dict[str, bytes]
     report: Report
@@ -41,11 +41,11 @@ def offline(
     derived: bool = True,
     limits: Limits | None = None,
 ) -> Converted:
-    """Read files, derive what the wanted format lacks, write it.
+    """Read files, derive missing layers, and write the target format.
 
-    options: the wanted format's own, and the parameters of derivations on the way.
+    options: options of the target format, and parameters of the derivations.
 
-    Raises what reading and planning raise; see ``app.upload_reader.read`` and ``app.convert.recipe.plan_chain``.
+    Raises the errors of ``app.upload_reader.read`` and ``app.convert.recipe.plan_chain``.
     """
     return _offline(lambda: files, to, hints or UploadHints(), datum, options or {}, limits or Limits(), derived)
 
@@ -59,17 +59,17 @@ def _offline(
     limits: Limits,
     derived: bool,
 ) -> Converted:
-    """``offline`` of files that are loaded when they are read, and not held while the map is made."""
+    """Run ``offline`` on files that are loaded on demand and released before the map is written."""
     fmt = formats.get_format(to)
     option_values = dict(options)
     recipes.writer_options(fmt, option_values)
     needed: frozenset[Layer] = fmt.layers | fmt.needs.also.union(*fmt.needs.one_of)
     if "topology" in fmt.layers:
-        needed |= {"occupancy"}  # edges may lead through what it shows
-    required_layers = None if "objects" in needed else needed  # whatever can be read can be an object
+        needed |= {"occupancy"}  # for warnings about edges that cross occupied cells
+    required_layers = None if "objects" in needed else needed  # any file can contain objects
     if site.selects_all(fmt, option_values):
         required_layers = None  # further parts may be derived from any layer
-    cells = bool(option_values) or not fmt.traits.outlines  # an option may ask for the images, too
+    cells = bool(option_values) or not fmt.traits.outlines  # an option may need the images, too
     complete = required_layers is None and cells
     knowing = EnvironmentContext(datum, None, required_layers, cells, fmt.traits.is_drawing or fmt.traits.is_container)
     upload_bundle = upload_reader.read(upload_reader.unpack(load(), limits), hints, knowing, limits)
@@ -78,7 +78,7 @@ def _offline(
     except (CannotConvert, Invalid, NotFound):
         if complete:
             raise
-        # Nothing is ever derived from layers that were read in part: a world without its meshes has no walls.
+        # Never derive from partially read layers: a world without its meshes has no walls.
         upload_bundle = upload_reader.read(
             upload_reader.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits
         )
@@ -102,9 +102,9 @@ def _convert_layers(
 
 
 def write_layers(layers: Layers, to: str, options: Mapping[str, str], came: Provenance) -> Converted:
-    """Layers -> files: what the wanted format lacks is derived.
+    """Write layers in the target format and derive missing ones.
 
-    options: the format's, and those of derivations on the way. came: how the layers came, for the report.
+    options: options of the format, and parameters of the derivations. came: provenance of the layers, for the report.
     """
     fmt = formats.get_format(to)
     recipes.writer_options(fmt, options)
@@ -122,7 +122,7 @@ def offline_paths(
     options: Mapping[str, str],
     limits: Limits,
 ) -> Converted:
-    """The same from spooled files: what a worker process is asked to do."""
+    """Run ``offline`` on spooled files (in a worker)."""
     return _offline(
         lambda: {name: path.read_bytes() for name, path in paths.items()}, to, hints, datum, options, limits, True
     )

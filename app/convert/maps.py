@@ -1,4 +1,4 @@
-"""The service that gives maps: plans, makes, caches, reports."""
+"""Map service: plan, convert, cache and report."""
 
 from __future__ import annotations
 
@@ -51,21 +51,21 @@ from app.syntax import shell
 from app.upload_reader import UploadHints
 
 Run = Callable[..., Any]
-"""``run(function, *args, stop=…)``: call a module-level function somewhere safe, return its result (``Pool.run``)."""
+"""Runner of a module-level function: ``run(function, *args, stop=…)`` returns its result (``Pool.run``)."""
 
 
 MAX_HOLD_ATTEMPTS = 5
-"""How often a map that left the cache at once is made again, before there is no room for it."""
+"""Maximum number of conversions of a map that the cache evicts at once."""
 
 FAILURE_SECONDS = 60.0
-"""How long an optional map that could not be made is not tried again."""
+"""Seconds before a failed optional map is tried again."""
 
 MAX_CACHED_RESULTS = 1000
-"""Of how many maps it is remembered why they could not be made, or which edges lead through obstacles."""
+"""Maximum number of maps with a cached failure, or with cached warnings about edges that cross obstacles."""
 
 
 class Maps:
-    """Maps of stored versions, made on demand in worker processes and kept by content."""
+    """Maps of stored versions, converted on demand in worker processes and cached by content."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Maps:
         cache_bytes: int = 4 * 2**30,
         run_trial: Run | None = None,
     ) -> None:
-        """run_trial: as ``run``, for jobs that should not wait for maps in the making; default: ``run``."""
+        """Create the service. run_trial: as ``run``, for jobs that must not wait for conversions; default: ``run``."""
         self._store, self._run, self._limits = store, run, limits
         self._run_trial = run_trial or run
         self.cache = Cache(cache_dir, cache_bytes)
@@ -96,11 +96,11 @@ class Maps:
         file: str | None = None,
         listed: bool = False,
     ) -> Recipe:
-        """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous.
+        """Plan a conversion; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous.
 
-        values: what the request says; the environment's templates say the rest. file: the one file of the map that is
-        wanted; its name may say more (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2).
-        listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
+        values: of the request; the environment's templates supply the rest. file: the requested file of the map; its
+        name may select a part (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2). listed:
+        as in a manifest: files are named as those of the whole site, and no zip is created.
         """
         plan = self._planner(version, name, values or {}, derive=derive, file=file, listed=listed)
 
@@ -113,7 +113,7 @@ class Maps:
     def _planner(
         self, version: Version, name: str, values: Mapping[str, str], *, derive: bool, file: str | None, listed: bool
     ) -> Callable[[frozenset[str]], Recipe]:
-        """A function that plans a request's map without some derivations. Raises what ``recipe`` raises."""
+        """Return a function that plans a request's map without some derivations. Raises the errors of ``recipe``."""
         version = applied_closures.add_areas(version)
         fmt = formats.get_format(name)
         filled = templates.resolve(version.templates, fmt)
@@ -137,8 +137,7 @@ class Maps:
         return lambda without: _with_origin(plan(without), origin)
 
     def _check_known_failure(self, recipe: Recipe) -> None:
-        """CannotDerive where a step is known to fail on this content. A map that may be empty is planned all the
-        same."""
+        """Raise CannotDerive if a step has failed on this content before, unless the map may be empty."""
         for one in [recipe, *(member.recipe for member in recipe.members)]:
             if one.members or not one.steps or (one.spread is not None and one.spread.optional):
                 continue
@@ -148,14 +147,14 @@ class Maps:
                     raise tried.as_error()
 
     def get_cached(self, recipe: Recipe) -> CachedMap | None:
-        """The map, only if it is made already."""
+        """Return the map if it is cached."""
         return self.cache.get(recipe.key)
 
     def get_or_convert(self, recipe: Recipe, stop: CancelHandle | None = None) -> tuple[Recipe, CachedMap]:
-        """The map, and its recipe: another than this one where a step of it finds nothing to use. Blocks until it is
-        made. stop: ends the making from another thread, with Cancelled.
+        """Return the map and its recipe, which differs from the given one if a step of that finds nothing to use.
 
-        CannotConvert where no chain works.
+        Blocks until the map is converted. stop: cancels the conversion from another thread; it then raises Cancelled.
+        Raises CannotConvert if no chain works.
         """
         try:
             return recipe, self._convert(recipe, stop)
@@ -171,13 +170,13 @@ class Maps:
         return first_working(recipe.replan, convert)
 
     def _convert(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
-        """The map by this very recipe. What fails is remembered: a step that finds nothing to use for all maps."""
+        """Convert exactly this recipe and cache failures: that of a step which finds nothing to use, for all maps."""
         try:
             if recipe.members:
                 return self.get_cached(recipe) or self._assemble(recipe, stop)
             return self.cache.get_or_make(recipe.key, lambda: self._run_conversion(recipe, stop))
         except CannotDerive as error:
-            if not recipe.members:  # else it is the member's
+            if not recipe.members:  # otherwise the member stores it
                 key = _trial_key(recipe.version, recipe.chain)
                 self._trials.add(key, ChainFailure.from_error(error), lasting=_is_lasting(recipe.chain))
             raise
@@ -186,7 +185,7 @@ class Maps:
             raise
 
     def failure(self, recipe: Recipe) -> FleetMapError | None:
-        """Why the map could not be made a moment ago, where it was tried: content and parameters are to blame."""
+        """Return the error of a recent conversion that content or parameters made impossible, or None."""
         with self._guard:
             since, error = self._failures.get(recipe.key, (0.0, None))
         return error if time.monotonic() - since < FAILURE_SECONDS else None
@@ -199,9 +198,9 @@ class Maps:
                 self._failures.popitem(last=False)
 
     def _assemble(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
-        """A map of several: each is made by itself. Those that are there already stay while the others are made."""
+        """Assemble a map of several members, each converted by itself; cached members are protected meanwhile."""
         for _ in range(MAX_HOLD_ATTEMPTS):
-            # A member whose file turns out to be damaged leaves the cache, and is made again.
+            # A member with a damaged file is removed from the cache and converted again.
             with contextlib.suppress(LostMap), self.cache.hold_files() as hold:
                 cached_maps = [self._convert_and_hold(member.recipe, hold, stop) for member in recipe.members]
                 return self.cache.get_or_make(recipe.key, partial(join_members, recipe, cached_maps))
@@ -211,9 +210,9 @@ class Maps:
         self, recipe: Recipe, hold: Callable[[CachedMap], CachedMap], stop: CancelHandle | None
     ) -> CachedMap:
         for _ in range(MAX_HOLD_ATTEMPTS):
-            with contextlib.suppress(LostMap):  # the cache needed the room in this very moment
+            with contextlib.suppress(LostMap):  # evicted at this moment
                 return hold(self._convert(recipe, stop))
-        raise Unavailable("the cache of maps is too small for what is made at once: try again, or enlarge it")
+        raise Unavailable("the map cache is too small for the current conversions: try again or enlarge the cache")
 
     def fetch(
         self,
@@ -224,20 +223,20 @@ class Maps:
         derive: bool = True,
         file: str | None = None,
     ) -> CachedFile:
-        """The map's wanted file, or the zip of all; blocks until it is made.
+        """Return the requested file of a map, or the zip of all files; blocks until the map is converted.
 
-        Raises what ``recipe`` and ``get_or_convert`` do; NotFound where the map has no such file.
+        Raises the errors of ``recipe`` and ``get_or_convert``, and NotFound if the map has no such file.
         """
         return select_file(*self.get_or_convert(self.recipe(version, name, values, derive=derive, file=file)), file)
 
     def get_blocking(
         self, version: Version, name: str, values: Mapping[str, str] | None = None, *, derive: bool = True
     ) -> CachedMap:
-        """The map; blocks until it is made. Raises what ``recipe`` and ``get_or_convert`` do."""
+        """Return the map; blocks until it is converted. Raises the errors of ``recipe`` and ``get_or_convert``."""
         return self.get_or_convert(self.recipe(version, name, values, derive=derive))[1]
 
     def report(self, recipe: Recipe) -> Report:
-        """The report for this version: what was raw, derived, filled in and dropped."""
+        """Build the map report for this version: raw, derived, filled-in and dropped content."""
         recipe, cached_map = self.get_or_convert(recipe)
         written = cached_map.report
         if recipe.members:
@@ -246,8 +245,8 @@ class Maps:
         version = recipe.version
         stored = {e.key: e for e in version.parts}
         anew = {step.gives for step in recipe.steps}
-        # Equal content may have come from other files in another version: sources are this version's own. What a step
-        # on the way has made anew beside a stored part of that name came from the step's own sources.
+        # Equal content may come from other files in another version: use this version's sources. A part that a step
+        # derived again, although one of that name is stored, has the step's sources.
         lines = tuple(
             _with_provenance(line, stored[line.key].provenance)
             if line.key in stored and line.layer not in anew
@@ -270,7 +269,7 @@ class Maps:
         return report.with_value_origin(recipe.origin, version.templates)
 
     def _crossings(self, recipe: Recipe) -> list[Problem]:
-        """Warnings of edges that lead through obstacles which the map itself does not hold."""
+        """Warn about edges that cross obstacles which the map itself does not contain."""
         version, fmt, keys = recipe.version, recipe.format, recipe.chain.keys
         network = [k for k in keys if k.layer == "topology"]
         if recipe.steps or fmt.traits.is_container or not network or "topology" not in fmt.layers:
@@ -292,13 +291,13 @@ class Maps:
         return problems
 
     def _unused_templates(self, recipe: Recipe) -> list[str]:
-        """What the environment's templates say and this release cannot use."""
+        """List the environment's template values that this release cannot use."""
         used = formats.all_formats().values() if recipe.format.traits.is_container else [recipe.format]
         reasons = [reason for fmt in used for reason in templates.resolve(recipe.version.templates, fmt).ignored]
         return list(dict.fromkeys(reasons))
 
     def variables(self, version: Version) -> dict[str, str]:
-        """What the place is called (``FARM_NAME`` …): an environment_template's literal variables, by name."""
+        """Return an environment_template's literal variables by name (``FARM_NAME`` …)."""
         keys = [e.key for e in version.parts if e.key.layer == "objects" and e.key.name == environment.NAME]
         out: dict[str, str] = {}
         for part in self._store.content.load(version, keys).vector("objects").values() if keys else ():
@@ -307,7 +306,7 @@ class Maps:
         return dict(sorted(out.items()))
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
-        """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""
+        """List for every format: direct, derivable or missing, the derivation chain, and what to supply."""
         available = recipes.available_layers(version)
         out = []
         for fmt in formats.all_formats().values():
@@ -316,7 +315,7 @@ class Maps:
             line: dict[str, Any] = {"format": fmt.name, "state": "missing", "chain": [], "missing": []}
             try:
                 chain, choose = self._find_chain(version, fmt, available)
-            except Ambiguous as error:  # it can be made, once the caller says which one
+            except Ambiguous as error:  # derivable once the caller selects one
                 line |= {"state": "direct", "choose": error.detail}
             except FleetMapError as error:
                 line["missing"] = [*recipes.missing_layers(fmt, available), *(p.problem for p in error.problems)]
@@ -329,7 +328,7 @@ class Maps:
         return out
 
     def source_parts(self, version: Version, name: str) -> tuple[PartKey, ...]:
-        """The stored parts that a format's map would be made of; empty where it cannot be made."""
+        """List the stored parts that a format's map would be converted from; empty if it cannot be."""
         try:
             return self._find_chain(version, formats.get_format(name), recipes.available_layers(version))[0].keys
         except FleetMapError:
@@ -338,8 +337,10 @@ class Maps:
     def _find_chain(
         self, version: Version, fmt: formats.Format, available: recipes.AvailableLayers
     ) -> tuple[recipes.DerivationChain, str | None]:
-        """The cheapest chain whose derivations work on what is stored, found by doing them once for each content; and
-        what the caller has to name for it, where it works only so."""
+        """Find the cheapest chain whose derivations work on the stored layers, by running them once per content.
+
+        Returns it, and what the caller must specify if it works only then.
+        """
         template_values = templates.resolve(version.templates, fmt).values
         options = formats.write_options(fmt, template_values)
         unnamed: tuple[recipes.DerivationChain, str | None] | None = None
@@ -374,7 +375,7 @@ class Maps:
             return unnamed
 
     def _check_content(self, version: Version, fmt: formats.Format, chain: recipes.DerivationChain) -> None:
-        """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
+        """Raise CannotConvert if the layers have too little content for the format (a network without edges)."""
         if fmt.needs.missing_content is None:
             return
         failure = self._find_failure(
@@ -384,14 +385,14 @@ class Maps:
             raise CannotConvert(failure.reason, [Problem(failure.reason)])
 
     def _find_chain_failure(self, version: Version, chain: recipes.DerivationChain) -> ChainFailure | None:
-        """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
+        """Find the step of a chain that fails on the stored layers, and why (an empty step: no single one)."""
         chain = recipes.reduce_chain(chain)
         return self._find_failure(_trial_key(version, chain), chain, making.find_chain_failure, version, chain)
 
     def _find_failure(
         self, key: str, chain: recipes.DerivationChain, function: Callable[..., Any], *args: Any
     ) -> ChainFailure | None:
-        """What a worker finds in the way, if it was not found before."""
+        """Return a trial's failure, from the cache or from a worker."""
         with contextlib.suppress(KeyError):
             return self._trials[key]
         store_location = (self._store.database_url, str(self._store.blob_dir))
@@ -437,7 +438,7 @@ class Maps:
                 **cancel_arguments,
             )
         except WorkerDied as error:
-            raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error
+            raise CannotConvert(f"conversion to {recipe.format.name} failed: {error.detail}") from error
         typed: dict[str, tuple[bytes | CachedFile, str]] = {
             name: (data, making.media_type(recipe.format, name)) for name, data in written.files.items()
         }
@@ -448,7 +449,7 @@ class Maps:
 
 
 def select_file(recipe: Recipe, cached_map: CachedMap, file: str | None) -> CachedFile:
-    """The wanted file of a made map, or the zip of all. file: as the request names it. NotFound where it has none."""
+    """Select the requested file of a map, or the zip of all files. file: as in the request. Raises NotFound."""
     if file is None:
         return cached_map.single_file()
     file_name = recipe.file or file
@@ -459,12 +460,12 @@ def select_file(recipe: Recipe, cached_map: CachedMap, file: str | None) -> Cach
     if cached_file is None:
         names = [f.name for f in cached_map.files]
         near = did_you_mean(file, names)
-        raise NotFound(f"this map has no file {file!r}{near}; its files are: {', '.join(names[:20]) or 'none'}")
+        raise NotFound(f"this map has no file {file!r}{near}; its files: {', '.join(names[:20]) or 'none'}")
     return cached_file
 
 
 def join_members(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedMap:
-    """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
+    """Join the files of all members; of two with equal names keep the first and report the other as dropped."""
     files: dict[str, tuple[bytes | CachedFile, str]] = {}
     places: dict[str, tuple[str, str]] = {}
     clashes: list[Dropped] = []
@@ -473,7 +474,7 @@ def join_members(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedM
             name = member.folder + file.name
             place = file.place or member.place
             if name in files:
-                why = f"a file of {places[name][1]!r} has the same name: rename one of the two"
+                why = f"a file of {places[name][1]!r} has the same name; rename one of the two"
                 clashes.append(Dropped(f"file {name} of {place[1] if place else name!r}", 1, why))
                 continue
             files[name] = (file, file.media_type)
@@ -491,7 +492,7 @@ def join_members(recipe: Recipe, cached_maps: Sequence[CachedMap]) -> ConvertedM
 
 
 class _LazyFiles(Mapping[str, bytes]):
-    """Files by name, read when they are needed."""
+    """Files by name, read on demand."""
 
     def __init__(self, files: Mapping[str, bytes | CachedFile]) -> None:
         self._files = files
@@ -514,11 +515,11 @@ def _with_provenance(line: LayerLine, provenance: Provenance) -> LayerLine:
 
 
 def _stale_warnings(recipe: Recipe) -> list[Problem]:
-    """Warnings of the parts that were derived from content that has changed since."""
+    """Warn about parts that were derived from content that has changed since."""
     stale = applied_closures.drop_areas(recipe.version).stale
     return [
         Problem(
-            f"it was derived from what has changed since ({', '.join(why)}): derive it anew",
+            f"stale: derived from inputs that have changed since ({', '.join(why)}). Derive it again",
             where=f"{key.layer} {key.level}/{key.name}",
         )
         for key, why in stale.items()
@@ -532,7 +533,7 @@ def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
 
 
 def _trial_key(version: Version, chain: recipes.DerivationChain, fmt: formats.Format | None = None) -> str:
-    """The hash of what the outcome of a trial depends on: a chain's steps and, with ``fmt``, what a format lacks."""
+    """Hash the inputs of a trial: a chain's steps and, with ``fmt``, the format whose needs are checked."""
     keys = recipes.reduce_chain(chain).keys if fmt is None else chain.keys
     entries = {e.key: e.hash for e in version.parts}
     ingredients = {
@@ -547,5 +548,5 @@ def _trial_key(version: Version, chain: recipes.DerivationChain, fmt: formats.Fo
 
 
 def _is_lasting(chain: recipes.DerivationChain) -> bool:
-    """Whether a trial of these steps comes out the same at any time: a model may be supplied or removed."""
+    """Return whether the result of a trial is permanent: not if a step uses a model, which may be added or removed."""
     return not any(dict(step.given).get("model") for step in chain.steps)

@@ -1,7 +1,7 @@
-"""How a map would be made: decided from what is there, without loading a layer.
+"""Plan the conversion to a map from the part list, without loading a layer.
 
-A recipe's key hashes all that the bytes depend on (the parts that are used, the datum, the steps, the parameters, the
-writer's version), so an equal key means equal bytes: it is the cache's key and the ETag.
+A recipe's key hashes everything that the bytes depend on (parts used, datum, steps, parameters, the writer's version).
+Equal keys mean equal bytes, so the key is cache key and ETag.
 """
 
 from __future__ import annotations
@@ -36,18 +36,17 @@ HOW_TO_SUPPLY: Mapping[Layer, str] = {
     "zones": "zones: upload a drawing with layer=zones",
     "resources": "the files that belong to the objects: upload them together with the objects' file",
 }
-"""What a user can do about a missing layer."""
+"""Advice for the user about a missing layer, by layer."""
 
 
 @dataclass(frozen=True, slots=True)
 class AvailableLayers:
-    """What there is to make maps from: the parts that have content, and whether there is a datum.
+    """Inputs of a conversion: the parts with content, and whether there is a datum.
 
-    anchors: of each part, which of ``local`` and ``wgs84`` its items are. empty_parts: parts without items; an empty
-        file is
-    a map of its own format, and of no other. pinned: by layer, the derivations and parameters that a version was
-    given its content by; where that content is stale, it is left out of ``keys`` and made anew by them. drawn: parts
-    that a step made for maps alone (see ``Derivation.is_terminal``), which are no evidence for other derivations.
+    anchors: by part, which of ``local`` and ``wgs84`` its features have. empty_parts: parts without features; an empty
+    file is a map of its own format only. pinned: by layer, the derivations and parameters that its content was derived
+    with; stale content is excluded from ``keys`` and derived again with them. drawn: parts that a step created for maps
+    only (see ``Derivation.is_terminal``), which are no evidence for other derivations.
     """
 
     keys: frozenset[PartKey]
@@ -58,7 +57,7 @@ class AvailableLayers:
     drawn: frozenset[PartKey] = frozenset()
 
     def for_format(self, fmt: Format) -> AvailableLayers:
-        """The same with the blank parts that came from this format; a folder of maps holds all of them."""
+        """Add the empty parts that were uploaded in this format; a folder of maps contains all of them."""
         if fmt.traits.is_container:
             return replace(self, keys=self.keys | self.empty_parts, empty_parts=frozenset())
         format_keys = {
@@ -68,18 +67,18 @@ class AvailableLayers:
 
     @property
     def layers(self) -> frozenset[Layer]:
-        """The layers with content; a datum alone is location enough."""
+        """Layers with content; a datum is sufficient for location."""
         return frozenset({k.layer for k in self.keys} | ({"location"} if self.datum else set()))
 
     @property
     def dead(self) -> frozenset[Layer]:
-        """The layers that nothing can be derived from, since all of their parts are drawn."""
+        """Layers that nothing can be derived from, since all their parts are drawn."""
         return frozenset({k.layer for k in self.drawn} - {k.layer for k in self.keys - self.drawn})
 
 
 @dataclass(frozen=True, slots=True)
 class DerivationChain:
-    """A way to a format: the derivation steps (none: direct), and the parts to load."""
+    """Derivation chain to a format: the steps (none: direct) and the parts to load."""
 
     steps: tuple[Step, ...]
     keys: tuple[PartKey, ...]
@@ -87,11 +86,10 @@ class DerivationChain:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How a chain's last layer becomes one map of all its parts, for formats whose files hold one part each.
+    """Selection of the parts of a chain's last layer to write as one map, for formats with one part per file.
 
     default: the level whose files are at the top. names: of the parts to write, empty for all. stored: (level, name)
-    of parts that are stored, and are not written here. optional: where the layers have nothing of the kind, the map
-    has no files.
+    of stored parts, which are not written here. optional: without such content in the layers, the map has no files.
     """
 
     default: str
@@ -102,13 +100,13 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """One map of one version: everything ``make`` needs to know, and the key of what it will give.
+    """Recipe of one map of one version: all inputs of the conversion, and the key of its result.
 
-    origin: where the parameters that are no defaults came from (request, environment, a set); it is no part of the key.
-    spread: every part that the chain gives, instead of one. members: the maps that this one is put together from.
-    archive: whether a zip of those is wanted. file: the wanted file's name in the map, where one is wanted. failed: the
-    cheaper ways that the content does not allow; no part of the key either. replan: this request's recipe without these
-    derivations (see ``derive.first_working``); None where no other is looked for.
+    origin: where the non-default parameters came from (request, environment, a set); not part of the key. spread: every
+    part that the chain produces, instead of one. members: the maps that this one is assembled from. archive: whether to
+    create a zip of those. file: name of the requested file in the map, if any. failed: cheaper chains that the content
+    does not allow; not part of the key either. replan: plans this request without these derivations (see
+    ``derive.first_working``); None if there is no alternative.
     """
 
     version: Version
@@ -126,21 +124,21 @@ class Recipe:
 
     @property
     def etag(self) -> str:
-        """A strong entity tag, with its quotes."""
+        """Strong entity tag, with quotes."""
         return f'"{self.key[:32]}"'
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The derivations on the way, in order."""
+        """Derivations of the chain, in order."""
         return self.chain.steps
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A map that is a part of a larger one. folder: where its files go, with its slash.
+    """Map that is part of a larger one. folder: prefix of its files, with its slash.
 
-    place: the level and name of the part that it is of; None where it is of several, of which these levels and names
-    (None: all) are used. only_default: on each level only the part that is written where none is named.
+    place: level and name of its part; None if it has several parts, of which these levels and names (None: all) are
+    used. only_default: on each level use only the default part.
     """
 
     recipe: Recipe
@@ -152,7 +150,7 @@ class Member:
 
 
 def available_layers(version: Version) -> AvailableLayers:
-    """What a version holds."""
+    """Describe the content of a version."""
     entries = [e for e in version.parts if e.count > 0]
     pinned = _pinned_layers(version, entries)
     entries = [e for e in entries if e.key.layer not in pinned]
@@ -165,7 +163,7 @@ def available_layers(version: Version) -> AvailableLayers:
 
 
 def available_in(layers: Layers) -> AvailableLayers:
-    """What layers at hand hold."""
+    """Describe the content of layers in memory."""
     keys: set[PartKey] = set()
     blank: set[PartKey] = set()
     anchors: dict[PartKey, frozenset[str]] = {}
@@ -181,10 +179,9 @@ def available_in(layers: Layers) -> AvailableLayers:
 
 
 def _pinned_layers(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
-    """The layers all of whose parts were derived and are stale: they are made anew, as they were made before.
+    """Find the layers whose parts are all derived and stale: they are derived again with the same steps.
 
-    What people have edited, or what lies beside parts that a source has told, stays as it is (the version says that it
-    is stale).
+    Layers with edited or uploaded parts stay as they are (the version lists them as stale).
     """
     stale = version.stale
     derivations = derive.all_derivations()
@@ -194,7 +191,7 @@ def _pinned_layers(version: Version, entries: Sequence[PartEntry]) -> dict[Layer
         if all(e.key in stale and e.provenance.information == "derived" and not e.provenance.is_edited for e in parts):
             steps = [step for e in parts for step in e.provenance.steps]
             if any(step.get("step") not in derivations for step in steps):
-                continue  # fetched from the net: no map does that by itself
+                continue  # fetched online, which a conversion never does
             out[layer] = {str(s["step"]): dict(s.get("parameters") or {}) for s in steps if "step" in s}
     return out
 
@@ -208,17 +205,19 @@ def plan_chain(
     values: Mapping[str, str] | None = None,
     without: frozenset[str] = frozenset(),
 ) -> DerivationChain:
-    """The cheapest way to a format. MissingLayer or MissingDatum say what to supply; Ambiguous names the choices.
+    """Find the cheapest chain to a format.
 
-    values: what was asked for, by name; what is no option of the format is a parameter of a step on the way. Where no
-    step of the cheapest way has it, the layer is made anew by a step that has (a slice of a world beside a stored
-    grid). without: derivations that are known to find nothing to use.
+    Raises MissingLayer or MissingDatum (with what to supply), or Ambiguous (with the choices).
+
+    values: requested values by name; those that are no options of the format are parameters of a step of the chain. If
+    no step of the cheapest chain has such a parameter, a step that has it derives the layer again (a slice of a world
+    although a grid is stored). without: derivations that found nothing to use.
     """
     option_values = dict(values or {})
     available = available.for_format(fmt)
     for layer, before in available.pinned.items():
         rivals = {n for n, d in derive.all_derivations().items() if d.gives == layer and n not in before}
-        if not without & before.keys():  # else what made it finds nothing any more: any other way will do
+        if not without & before.keys():  # its derivation finds nothing any more: allow any other
             without |= rivals
     if fmt.needs.datum and not available.datum:
         raise MissingDatum(f"{fmt.name} needs {HOW_TO_SUPPLY['location']}")
@@ -230,11 +229,11 @@ def plan_chain(
     if rest and (best is None or not rest <= _parameters_of(best)):
         available, best = _plan_with_parameters(fmt, available, without, frozenset(rest), derived=derived)
     if best is None:
-        raise MissingLayer(f"{fmt.name} cannot be made: supply {' or '.join(missing_layers(fmt, available))}")
+        raise MissingLayer(f"cannot convert to {fmt.name}: supply {' or '.join(missing_layers(fmt, available))}")
     carried = fmt.layers | {layer for step in best.steps for layer in step.reads}
     keys = sorted(k for k in available.keys if k.layer in carried)
     chosen: Sequence[PartKey] = [k for k in keys if k.layer in fmt.layers]
-    if not any(step.gives in fmt.layers for step in best.steps):  # else it is chosen once all parts are there
+    if not any(step.gives in fmt.layers for step in best.steps):  # a derived one is chosen after all steps
         chosen = fmt.selection.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
     if not _has_complete_map(fmt, available):
@@ -249,7 +248,7 @@ def plan_chain(
 def _chain_to_named_part(
     fmt: Format, available: AvailableLayers, options: Any, option_values: Mapping[str, str], without: frozenset[str]
 ) -> DerivationChain | None:
-    """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
+    """Find a chain to a part requested by name that is not stored, if a derivation creates parts of that name."""
     parts = fmt.selection.parts
     if parts is None or (name := getattr(options, parts.name)) is None:
         return None
@@ -286,19 +285,19 @@ def _best_chain(
 
 
 def _has_complete_map(fmt: Format, available: AvailableLayers) -> bool:
-    """Whether a map of this very format is stored, so that nothing else is needed."""
+    """Return whether a map of this format is stored, so that no other layer is needed."""
     return fmt.needs.accepts_family and any(k.layer == "objects" and k.name == fmt.family for k in available.keys)
 
 
 def _parameters_of(plan: derive.Plan) -> frozenset[str]:
-    """The names of all parameters on a way."""
+    """Return the names of all parameters of a plan's steps."""
     return frozenset().union(*(derive.parameter_names(step.name) for step in plan.steps))
 
 
 def _plan_with_parameters(
     fmt: Format, available: AvailableLayers, without: frozenset[str], names: frozenset[str], *, derived: bool
 ) -> tuple[AvailableLayers, derive.Plan]:
-    """A way with a step that knows all these parameters, and the stock without what that step makes anew."""
+    """Find a plan with a step that has all these parameters; return it after the inputs without that step's layer."""
     useful = frozenset().union(*fmt.needs.one_of)
     everything = derive.all_derivations()
     candidates: list[tuple[float, str, AvailableLayers, derive.Plan]] = []
@@ -308,7 +307,7 @@ def _plan_with_parameters(
         remaining_keys = frozenset(k for k in available.keys if k.layer != step.gives)
         less = replace(available, keys=remaining_keys, drawn=available.drawn & remaining_keys)
         rivals = frozenset(n for n, d in everything.items() if d.gives == step.gives and n != name)
-        # Only by what the step gives: a format that a grid alone is enough for would do without its objects.
+        # Only the alternatives with the step's layer: a format that needs only a grid would ignore its objects.
         alternatives = [required for required in fmt.needs.one_of if step.gives in required]
         plans = [
             plan
@@ -324,27 +323,27 @@ def _plan_with_parameters(
         return less, plan
     if any(names <= derive.parameter_names(name) for name in without):
         lacking = " or ".join(missing_layers(fmt, available)) or "other layers"
-        raise MissingLayer(f"{fmt.name} cannot be made with {', '.join(sorted(names))}: supply {lacking}")
+        raise MissingLayer(f"cannot convert to {fmt.name} with {', '.join(sorted(names))}: supply {lacking}")
     derivation_parameters = sorted(
         {n for d, step in everything.items() if step.gives in useful for n in derive.parameter_names(d)}
     )
     format_parameters = [p["name"] for p in parameters.describe(fmt.write_options)]
     accepted = ", ".join(format_parameters) or "none"
-    further = f"; where a layer is derived, also {', '.join(derivation_parameters)}" if derivation_parameters else ""
+    further = f"; if a layer is derived, also {', '.join(derivation_parameters)}" if derivation_parameters else ""
     wrong = sorted(names)
     near = did_you_mean(wrong[0], [*format_parameters, *derivation_parameters])
-    problem = f"no such parameter of {fmt.name} here{near}; accepted: {accepted}{further}"
+    problem = f"no such parameter of {fmt.name} for this map{near}; accepted: {accepted}{further}"
     raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
 
 
 def reduce_chain(chain: DerivationChain) -> DerivationChain:
-    """The same with only those parts that its steps read."""
+    """Reduce a chain to the parts that its steps read."""
     read = {layer for step in chain.steps for layer in step.reads}
     return replace(chain, keys=tuple(k for k in chain.keys if k.layer in read))
 
 
 def missing_layers(fmt: Format, available: AvailableLayers) -> list[str]:
-    """What to supply for a format, one text for each alternative."""
+    """List what to supply for a format, one text per alternative."""
     out = []
     for required in fmt.needs.one_of:
         lacking = [HOW_TO_SUPPLY[layer] for layer in LAYERS if layer in required - available.layers]
@@ -353,8 +352,8 @@ def missing_layers(fmt: Format, available: AvailableLayers) -> list[str]:
 
 
 def detours(failed: Sequence[ChainFailure]) -> list[Problem]:
-    """The warnings of a map that was made another way than the usual one: which step failed, and why."""
-    return [Problem(f"made another way, since {one.step} failed: {one.reason}") for one in failed if one.step]
+    """Warn that a map was derived with another chain than the cheapest one: name the failed step and the reason."""
+    return [Problem(f"{one.step} failed: {one.reason}; another derivation was used") for one in failed if one.step]
 
 
 def recipe(
@@ -365,9 +364,9 @@ def recipe(
     derived: bool = True,
     without: frozenset[str] = frozenset(),
 ) -> Recipe:
-    """The recipe of a version's map. NotFound, Invalid, MissingLayer, MissingDatum or Ambiguous if there is none.
+    """Plan a version's map. Raises NotFound, Invalid, MissingLayer, MissingDatum or Ambiguous if it is impossible.
 
-    values: the format's options and the parameters of derivations on the way, as texts. without: see ``plan_chain``.
+    values: options of the format and parameters of the derivations, as strings. without: see ``plan_chain``.
     """
     fmt = formats.get_format(name)
     options = writer_options(fmt, values)
@@ -380,20 +379,23 @@ def recipe(
 def recipe_of_chain(
     version: Version, fmt: Format, options: Any, chain: DerivationChain, spread: Spread | None = None
 ) -> Recipe:
-    """The recipe of a map by this chain. spread: see ``Recipe``."""
+    """Build the recipe of a map from a chain. spread: see ``Recipe``."""
     entries = {e.key: e for e in version.parts}
     return Recipe(version, fmt, options, chain, _key(version, fmt, options, chain, entries, spread), spread=spread)
 
 
 def writer_options(fmt: Format, values: Mapping[str, str]) -> Any:
-    """The format's own options among what was asked for; Invalid for a name that nothing on any way could mean."""
+    """Select the format's options from the requested values.
+
+    Raises Invalid for a name that is neither an option nor a parameter of any derivation.
+    """
     option_names = {f.name for f in dataclasses.fields(fmt.write_options)}
     steps = frozenset().union(*(derive.parameter_names(name) for name in derive.all_derivations()))
     return formats.write_options(fmt, {n: v for n, v in values.items() if n in option_names or n not in steps})
 
 
 def defaults(stored_templates: Templates, fmt: Format) -> Any:
-    """The options of a format's writer as an environment's templates give them."""
+    """Build the options of a format's writer from an environment's templates."""
     return formats.write_options(fmt, templates.resolve(stored_templates, fmt).values)
 
 
@@ -420,7 +422,7 @@ def _key(
         ingredients["title"] = version.environment
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
-    if fmt.traits.is_container:  # its bytes are those of other writers and, where they lack a layer, of derivations
+    if fmt.traits.is_container:  # it contains other formats' maps and derived layers
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]
         format_defaults = {
@@ -433,16 +435,16 @@ def _key(
 
 
 def _check_anchor(fmt: Format, available: AvailableLayers, keys: list[PartKey]) -> None:
-    """Refuse early what would fail on the way for want of a datum."""
+    """Raise MissingDatum early if the conversion would fail without a datum."""
     if fmt.needs.anchor is None or available.datum:
         return
     other = "wgs84" if fmt.needs.anchor == "local" else "local"
     grids_only = fmt.needs.anchor == "wgs84"
     for key in keys:
         if other in available.anchors.get(key, ()) or (grids_only and key.layer == "occupancy"):
-            part_frame = "places on earth" if other == "wgs84" else "local metres"
-            fmt_frame = "local metres" if other == "wgs84" else "places on earth"
+            part_frame = "WGS 84 degrees" if other == "wgs84" else "local metres"
+            fmt_frame = "local metres" if other == "wgs84" else "WGS 84 degrees"
             raise MissingDatum(
-                f"the {key.layer} are {part_frame} and {fmt.name} speaks of {fmt_frame}: supply "
+                f"layer {key.layer} is in {part_frame} and {fmt.name} needs {fmt_frame}: supply "
                 f"{HOW_TO_SUPPLY['location']}"
             )

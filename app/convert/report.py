@@ -1,6 +1,6 @@
-"""The report of a map: what each layer in it came from, and what was filled in, dropped or doubtful.
+"""Map reports: origin of each layer, filled-in values, dropped content and warnings.
 
-It is made of values; they become JSON at the edge: in answers, on the command line, and beside the files on disk.
+Reports are values; they are converted to JSON for responses, the command line, and the cache on disk.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from app.templates import DEFAULT, resolve
 
 @dataclass(frozen=True, slots=True)
 class LayerLine:
-    """One part in a map: raw, derived, generated or template, by which steps, from which sources and credits.
+    """Origin of one part in a map: raw, derived, generated or template, with steps, sources and credits.
 
-    steps: as JSON, as provenance holds them.
+    steps: as JSON, as in the provenance.
     """
 
     layer: Layer
@@ -40,11 +40,11 @@ class LayerLine:
 
     @property
     def key(self) -> PartKey:
-        """The part."""
+        """Key of the part."""
         return PartKey(self.layer, self.level, self.name)
 
     def as_dict(self) -> dict[str, Any]:
-        """The line as JSON."""
+        """Convert the line to JSON."""
         return {
             "layer": self.layer,
             "level": self.level,
@@ -57,16 +57,16 @@ class LayerLine:
 
     @classmethod
     def from_dict(cls, line: Mapping[str, Any]) -> LayerLine:
-        """The line from its JSON."""
+        """Read the line from JSON."""
         lists = {name: tuple(line[name]) for name in ("steps", "sources", "attribution")}
         return cls(line["layer"], line["level"], line["name"], line["information"], **lists)
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The report of a map in one format. template: values that were filled in. version: of the environment's map.
+    """Report of a map in one format. template: filled-in values. version: of an environment's map.
 
-    attribution: the licences and credits of all layers, each once.
+    attribution: licences and credits of all layers, without duplicates.
     """
 
     format: str
@@ -79,7 +79,7 @@ class Report:
     version: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as JSON; ``version`` only where there is one."""
+        """Convert the report to JSON; without ``version`` if there is none."""
         return {
             "format": self.format,
             "layers": [line.as_dict() for line in self.layers],
@@ -92,7 +92,7 @@ class Report:
 
     @classmethod
     def from_dict(cls, report: Mapping[str, Any]) -> Report:
-        """The report from its JSON."""
+        """Read the report from JSON."""
         return cls(
             report["format"],
             tuple(map(LayerLine.from_dict, report["layers"])),
@@ -105,8 +105,10 @@ class Report:
         )
 
     def with_value_origin(self, origin: Mapping[str, str], templates: Templates = NO_TEMPLATES) -> Report:
-        """The same, with where each filled-in value came from. origin: of the map's own parameters; those of maps
-        inside it follow from the environment's templates."""
+        """Add the origin of each filled-in value.
+
+        origin: of the map's own parameters; that of nested maps follows from the environment's templates.
+        """
         lines = []
         for line in self.template:
             origins = origin if line.format is None else resolve(templates, formats.get_format(line.format)).origin
@@ -115,7 +117,7 @@ class Report:
 
 
 def merge_reports(reports: Sequence[tuple[str, Report]]) -> Report:
-    """Join the reports of several maps, each with the folder of its files; equal lines stay once."""
+    """Join the reports of several maps, each with the folder of its files; remove duplicate lines."""
     every = [report for _, report in reports]
     warnings = [
         replace(one, file=folder + one.file) if one.file is not None else one
@@ -138,26 +140,26 @@ L = TypeVar("L", LayerLine, Filled)
 
 
 def _unique(lines: Iterable[L]) -> tuple[L, ...]:
-    """Equal lines once; they hold JSON, which has no hash."""
+    """Remove duplicates from lines that contain JSON and so cannot be hashed."""
     return tuple({orjson.dumps(line.as_dict(), option=orjson.OPT_SORT_KEYS): line for line in lines}.values())
 
 
 def all_credits(lines: Iterable[LayerLine]) -> tuple[str, ...]:
-    """The licences and credits of all these layers, each once."""
+    """Collect the licences and credits of these layers, without duplicates."""
     return tuple(dict.fromkeys(text for line in lines for text in line.attribution))
 
 
 def unsupported_layers(fmt: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> tuple[Dropped, ...]:
-    """Layers that this format has no words for: of a stored version, or (entries: None) at hand."""
+    """List the layers that a format cannot express: of a stored version, or (entries: None) of layers in memory."""
     counts: dict[str, int] = {}
     if entries is not None:
         for key, entry in entries.items():
             if key.layer not in fmt.layers and entry.count:
-                items = entry.count if key.layer in VECTOR_LAYERS else 1  # grids and pictures, not their cells
+                items = entry.count if key.layer in VECTOR_LAYERS else 1  # count grids and images, not their cells
                 counts[key.layer] = counts.get(key.layer, 0) + items
     else:
         for key, part in layers.parts.items():
             if key.layer not in fmt.layers:
                 counts[key.layer] = counts.get(key.layer, 0) + (len(part) if isinstance(part, Features) else 1)
-    why = f"{fmt.name} has no place for it"
+    why = f"{fmt.name} cannot represent it"
     return tuple(Dropped(layer, counts[layer], why) for layer in LAYERS if counts.get(layer))

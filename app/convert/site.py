@@ -1,9 +1,9 @@
-"""The whole site in one format: every level, every named part, and every mask that can be drawn from zones.
+"""Plan a map of the whole site: every level, every named part, and every mask that can be derived from zones.
 
-Formats whose files hold one part each declare the options that select it (``Format.parts``). Where such an option is
-``*``, the map is put together from ordinary maps, each made and cached by its own key: one for each stored part, and
-one for each derivation that makes parts which are not stored. Files of the default level are at the top, those of
-other levels below a folder of the level's name.
+Formats with one part per file declare the options that select it (``Format.parts``). If such an option is ``*``, the
+map is assembled from ordinary maps, each converted and cached under its own key: one for each stored part, and one for
+each derivation that creates parts which are not stored. Files of the default level are at the top, those of other
+levels in a folder with the level's name.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from app.model.layers import MAP, Layer, PartKey
 from app.store.values import Version
 
 ALL = "*"
-"""The value of an option that selects all: levels, or parts by name."""
+"""Option value that selects all levels or all named parts."""
 
 SITE_WIDE_LAYERS: frozenset[Layer] = frozenset({"location", "resources"})
-"""Layers that are of all levels, whichever one they are stored on."""
+"""Layers that belong to all levels, whichever one they are stored on."""
 
 MAX_FOLDER_BYTES = 120
 DIGEST_DIGITS = 16
@@ -40,11 +40,11 @@ _SAFE = re.compile(r"[A-Za-z0-9_-](?:[A-Za-z0-9_ -]*[A-Za-z0-9_-])?")
 
 
 def level_folder_name(level: str) -> str:
-    """Name the folder of a level's files: letters, digits, ``_``, ``-`` and inner spaces stay, all else is
-    percent-encoded, as in an address.
+    """Build the name of the folder for a level's files.
 
-    No folder holds a dot and every file does, so none has the name of a file. A name that becomes too long is cut,
-    and ends in ``~`` and the start of its SHA-256.
+    Letters, digits, ``_``, ``-`` and inner spaces stay; everything else is percent-encoded, as in a URL. Folder names
+    contain no dot and file names do, so they never collide. A name that becomes too long is cut, and ends in ``~`` and
+    the start of its SHA-256.
     """
     text = level if _SAFE.fullmatch(level) else "".join(map(_encode_character, level))
     if len(text) > MAX_FOLDER_BYTES:
@@ -60,24 +60,24 @@ def _encode_character(character: str) -> str:
 
 
 def level_of_folder(folder: str, levels: Iterable[str]) -> str | None:
-    """Find the level that a folder is named after."""
+    """Find the level of a folder by the folder's name."""
     return next((level for level in levels if level_folder_name(level) == folder), None)
 
 
 def selects_all(fmt: Format, values: Mapping[str, Any]) -> bool:
-    """Whether several parts are selected."""
+    """Return whether several parts are selected."""
     parts = fmt.selection.parts
     return parts is not None and ALL in (values.get(parts.name), values.get(parts.level))
 
 
 def whole_site_options(fmt: Format) -> dict[str, str]:
-    """Build the options that select the whole site; none where one map is of all levels anyway."""
+    """Build the options that select the whole site; empty if one map covers all levels anyway."""
     parts = fmt.selection.parts
     return {} if parts is None else {parts.level: ALL, parts.name: ALL}
 
 
 def single_part_options(fmt: Format, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Take the options that select one part; those that are ``*`` are left to the default."""
+    """Return the options that select one part; without those that are ``*``, which take their default."""
     parts = fmt.selection.parts
     selectors = () if parts is None else (parts.name, parts.level)
     return {option: value for option, value in values.items() if option not in selectors or value != ALL}
@@ -85,12 +85,12 @@ def single_part_options(fmt: Format, values: Mapping[str, Any]) -> dict[str, Any
 
 @dataclass(frozen=True, slots=True)
 class _Site:
-    """What a site's map is put together from.
+    """Inputs of a whole-site map.
 
-    stored: the parts of the format's layer; empty where they are derived. main: the chain that derives them then.
-    lacking: why there is neither.
-    makers: the derivations of parts that are not stored. default: the level whose files are at the top. values: what
-    was requested besides the parts; own_values: without what only the makers know.
+    stored: the parts of the format's layer; empty if they are derived. main: the chain that derives them then. lacking:
+    the error if there is neither. makers: the derivations of parts that are not stored. default: the level whose files
+    are at the top. values: requested values besides the part selection; own_values: without parameters that only the
+    makers have.
     """
 
     version: Version
@@ -107,16 +107,16 @@ class _Site:
 
     @property
     def levels(self) -> frozenset[str]:
-        """All levels that a folder may be named after."""
+        """Levels that may have a folder."""
         keys = {entry.key.level for entry in self.version.parts}
         return frozenset(keys | {level.name for level in self.version.levels})
 
     def prefix(self, level: str) -> str:
-        """The folder of a level's files, with its slash."""
+        """Return the folder of a level's files, with its slash."""
         return "" if level == self.default else level_folder_name(level) + "/"
 
     def derivation_for(self, name: str, level: str) -> Derivation | None:
-        """The derivation that may make this part; whether it does depends on what the zones are."""
+        """Return the derivation that may create this part; whether it does depends on the zones."""
         if any((key.level, key.name) == (level, name) for key in self.stored):
             return None
         for maker in self.makers:
@@ -128,7 +128,7 @@ class _Site:
 
 
 def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: bool, without: frozenset[str]) -> _Site:
-    """Find out what is stored and what can be derived. values: without the options that select parts."""
+    """Collect the stored and the derivable parts. values: without the options that select parts."""
     parts = fmt.selection.parts
     assert parts is not None
     available = recipes.available_layers(version).for_format(fmt)
@@ -159,7 +159,7 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
 
 
 def _default_level(version: Version, keys: Iterable[PartKey]) -> str:
-    """``ground`` where the parts that files are made of are there (too), else the lowest level that has one."""
+    """Return ``ground`` if it has one of the parts to write, else the lowest level that has one."""
     placed = {key.level for key in keys if key.layer not in SITE_WIDE_LAYERS}
     levels = placed or {key.level for key in keys}
     if not levels or GROUND in levels:
@@ -177,10 +177,10 @@ def recipe(
     without: frozenset[str],
     archive: bool,
 ) -> Recipe:
-    """Plan a map of several parts; raises what planning one part raises.
+    """Plan a map of several parts. Raises the errors of planning one part.
 
-    values: one of the options that select parts is ``*``. A level that is not given is the default one; a name that is
-    not given is each level's default part. archive: whether a zip of the files is wanted.
+    values: one of the options that select parts is ``*``. Without a level, the default one is used; without a name,
+    each level's default part. archive: whether to create a zip of the files.
     """
     parts = fmt.selection.parts
     assert parts is not None
@@ -206,12 +206,12 @@ def recipe(
 
 
 def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None, *, derived: bool) -> Iterable[Member]:
-    """One map for each stored part; on each level the default part keeps its default file name."""
+    """Yield one map for each stored part; on each level the default part has the default file name."""
     for level in sorted({key.level for key in site.stored}, key=lambda one: (one != site.default, one)):
         if levels is not None and level not in levels:
             continue
         names = [key.name for key in site.stored if key.level == level]
-        names.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of two with equal file names the first is kept
+        names.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of equal file names the first wins
         selection: list[str | None] = [None]
         if name == ALL:
             default = default_name(site.parts, names)
@@ -227,7 +227,7 @@ def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None
 
 
 def default_name(parts: Parts, names: Sequence[str]) -> str | None:
-    """The part of a level that is written where none is named: the usual one, else the only one."""
+    """Return the default part of a level: the one with the default name, else the only one."""
     if parts.default in names:
         return parts.default
     return names[0] if len(names) == 1 else None
@@ -242,7 +242,7 @@ def _spread(
     only_default: bool = False,
     maker: Derivation | None = None,
 ) -> Member:
-    """All that the last step of a chain gives, as one map; a member may select some of its files."""
+    """Build one map of all parts that the last step of a chain creates; a member may select some of its files."""
     makes = () if maker is None else tuple(sorted(maker.part_names))
     stored_parts = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
     spread = Spread(site.default, makes, stored_parts, optional=maker is not None)
@@ -262,7 +262,7 @@ def _spread(
 
 
 def _chain_of_derivation(site: _Site, maker: Derivation) -> DerivationChain:
-    """The chain of a derivation that makes named parts: it may take the frame of the layer's usual part."""
+    """Build the chain of a derivation that creates named parts; it may use the frame of the layer's default part."""
     keys = (k for k in site.available.keys if k.layer in maker.needs or (k.layer, k.name) == (maker.gives, MAP))
     before = site.available.pinned.get(maker.gives, {}).get(maker.name, {})
     return DerivationChain(derive.with_parameters([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
@@ -275,7 +275,7 @@ def _derived_member(
 
 
 def _can_add_part(site: _Site, maker: Derivation, levels: frozenset[str] | None) -> bool:
-    """Whether a level that has what the derivation needs lacks one of the parts that it makes."""
+    """Return whether a level with the derivation's inputs lacks one of its outputs."""
     stored_parts = {(key.level, key.name) for key in site.stored}
     able = {key.level for key in site.available.keys if key.layer in maker.needs}
     return any(
@@ -285,11 +285,11 @@ def _can_add_part(site: _Site, maker: Derivation, levels: frozenset[str] | None)
 
 
 def _raise_missing(site: _Site, level: str | None, name: str | None, *, derived: bool) -> None:
-    """Say what there is instead, in the words of a request for one part."""
+    """Raise the error that planning one part would raise, or NotFound."""
     selected = {site.parts.level: level, site.parts.name: name}
     values = {**site.own_values, **{k: v for k, v in selected.items() if v not in (None, ALL)}}
     recipes.recipe(site.version, site.format.name, values, derived=derived)
-    raise NotFound(f"{site.format.name}: nothing that is stored fits these levels and names")
+    raise NotFound(f"{site.format.name}: no stored part matches this level and name")
 
 
 def _assemble_recipe(site: _Site, members: Sequence[Member], *, archive: bool) -> Recipe:
@@ -320,9 +320,9 @@ def file_recipe(
     derived: bool,
     without: frozenset[str],
 ) -> Recipe | None:
-    """Plan the one map that a file of the site is in, by the file's name; None where it is no file of the site.
+    """Plan the map that contains one file of the site, by the file's name; None if it is no file of the site.
 
-    values: of the request; a level or a name in them that is not ``*`` must agree with the file's. NotFound where the
+    values: of the request; a level or a name in them that is not ``*`` must match the file's. Raises NotFound if the
     file's folder is no level.
     """
     parts = fmt.selection.parts
@@ -331,12 +331,12 @@ def file_recipe(
     level, name = (None if values.get(o) == ALL else values.get(o) for o in (parts.level, parts.name))
     folder, _, base = file.rpartition("/")
     if not folder and level is not None:
-        return None  # as a file of that level's own map
+        return None  # a file of that level's own map
     site = _site(version, fmt, rest, derived=derived, without=without)
     of_file = level_of_folder(folder, site.levels) if folder else site.default
     if of_file is None or (level is not None and level != of_file):
         levels = ", ".join(sorted(site.levels))
-        raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; there are the levels {levels}")
+        raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; levels: {levels}")
     hints = dict(fmt.selection.from_filename(base))
     if name is None and parts.name in hints:
         name = _part_with_stem(site, of_file, hints[parts.name])
@@ -345,7 +345,7 @@ def file_recipe(
     if maker is not None:
         site = replace(site, values={**kinds, **site.values})
         return replace(_derived_member(site, maker, None, None).recipe, file=file)
-    if site.main is not None and not kinds:  # as the manifest lists it, made once
+    if site.main is not None and not kinds:  # same map as in the manifest: convert once
         return replace(_spread(site, site.main, None, None).recipe, file=file)
     if not folder and not _is_on_default_level(site, name):
         return None
@@ -357,14 +357,14 @@ def file_recipe(
 
 
 def _default_kinds(fmt: Format) -> dict[str, str]:
-    """Collect the options that the names of the format's default files imply, where they agree: PGM is the default."""
+    """Collect the options that all default file names of the format imply: PGM is the default."""
     hints = [dict(fmt.selection.from_filename(name)) for name in fmt.files]
     values = {option: {one[option] for one in hints if option in one} for one in hints for option in one}
     return {option: next(iter(choices)) for option, choices in values.items() if len(choices) == 1}
 
 
 def _part_with_stem(site: _Site, level: str, stem: str) -> str:
-    """The stored part of a level whose files have this name: its own name, where it may stand in a file's."""
+    """Return the name of the stored part of a level whose files have this stem, else the stem."""
     names = [key.name for key in site.stored if key.level == level]
     if stem in names:
         return stem
@@ -372,14 +372,14 @@ def _part_with_stem(site: _Site, level: str, stem: str) -> str:
 
 
 def _is_on_default_level(site: _Site, name: str | None) -> bool:
-    """Whether the default level has a part of this name (None: any)."""
+    """Return whether the default level has a part of this name (None: any)."""
     if site.main is not None:
-        return site.default != GROUND  # else the rule for one part finds it by itself
+        return site.default != GROUND  # on ground, planning one part finds it
     return any(key.level == site.default and name in (None, key.name) for key in site.stored)
 
 
 def select(files: Iterable[Any], member: Member) -> list[Any]:
-    """The files of a member's map that belong to the site. ``place`` of each: level and name of the part."""
+    """Select the files of a member's map that belong to the site. ``place`` of each: level and name of the part."""
     candidates = [f for f in files if member.place is not None or _fits(f.place, member)]
     if not member.only_default:
         return candidates
@@ -401,5 +401,5 @@ def _fits(place: tuple[str, str] | None, member: Member) -> bool:
 
 
 def no_parts_error(recipe: Recipe) -> NotFound:
-    """The error for a site whose derivations gave no part that fits."""
-    return NotFound(f"{recipe.format.name}: no part has this level and name, and none of them can be derived")
+    """Build the error for a site without a matching stored or derivable part."""
+    return NotFound(f"{recipe.format.name}: no part has this level and name, and none can be derived")

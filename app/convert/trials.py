@@ -1,7 +1,7 @@
-"""What trials of derivations have found, by content: in memory, and in a file for the next start.
+"""Cached results of derivation trials, by content: in memory and in a file that survives restarts.
 
-A line of the file is the SHA-256 of its rest and ``[key, hindrance]`` as JSON; of two lines of a key the later counts.
-A damaged line is passed over, so that its trial is made again, and where the disk refuses there is only the memory.
+A line of the file is the SHA-256 of its rest and ``[key, failure]`` as JSON; the last line of a key wins. Damaged lines
+are skipped, so that their trials run again. If the disk cannot be written, only the memory is used.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import orjson
 from app.derive import ChainFailure
 
 MAX_TRIALS = 10_000
-"""Trials that are remembered; the file is written anew at twice as many lines."""
+"""Maximum number of cached trials; the file is compacted at twice as many lines."""
 
 
 class Trials:
-    """The outcome of trials by key: a Hindrance, or None where all steps work. Thread-safe."""
+    """Results of trials by key: a ChainFailure, or None if all steps work. Thread-safe."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -34,12 +34,12 @@ class Trials:
             self._set(key, failure)
 
     def __getitem__(self, key: str) -> ChainFailure | None:
-        """KeyError where it was not tried."""
+        """Return the result of a trial. Raises KeyError if it has not run."""
         with self._guard:
             return self._results[key]
 
     def add(self, key: str, failure: ChainFailure | None, *, lasting: bool) -> None:
-        """Remember an outcome. lasting: also for the next start."""
+        """Cache a result. lasting: also in the file, for the next start."""
         with self._guard:
             self._set(key, failure)
             if not lasting:
@@ -49,11 +49,11 @@ class Trials:
                 if self._lines > 2 * MAX_TRIALS:
                     self._rewrite()
                 else:
-                    with self._path.open("ab", buffering=0) as file:  # one write: whole lines, whoever else writes
+                    with self._path.open("ab", buffering=0) as file:  # one write: lines stay whole
                         file.write(_line(key, failure))
 
     def _set(self, key: str, failure: ChainFailure | None) -> None:
-        self._results.pop(key, None)  # the latest last: the oldest goes first
+        self._results.pop(key, None)  # newest last: the oldest is evicted first
         self._results[key] = failure
         while len(self._results) > MAX_TRIALS:
             self._results.pop(next(iter(self._results)))
@@ -68,7 +68,7 @@ class Trials:
             digest, _, text = line.partition(b" ")
             if digest != _digest(text):
                 continue
-            with contextlib.suppress(TypeError, ValueError):  # of a release that knows other fields
+            with contextlib.suppress(TypeError, ValueError):  # written by a release with other fields
                 key, failure = orjson.loads(text)
                 yield key, None if failure is None else ChainFailure(**failure)
 

@@ -1,6 +1,6 @@
-"""Imported for its effect: what every first conversion would pay for is loaded.
+"""Preload the modules that every first conversion needs (imported for its effect).
 
-Worker processes are forked from one that has imported this. Native code of derivations (numba) is left out: most
+Worker processes are forked from one that has imported this. Native code of derivations (numba) is excluded: most
 servers never need it.
 """
 

@@ -1,4 +1,4 @@
-"""Carry out a recipe: load the parts, derive what is missing, write the format, and tell what was lost or made up."""
+"""Execute a recipe: load the parts, derive missing layers, write the format, and report losses and filled-in values."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WrittenMap:
-    """A map: its files, main file first, and the report on it. places: of the files of a map of several parts, the
-    level and the name of the part that each is of."""
+    """Written map: files (main file first) and report. places: level and name of each file's part, if several."""
 
     files: dict[str, bytes]
     report: Report
@@ -46,8 +45,8 @@ class WrittenMap:
 
 @lru_cache(maxsize=4)
 def open_store(database_url: str, blob_dir: str) -> Store:
-    """A worker's own view of the store, kept between jobs."""
-    from app.store.store import Store  # converting files needs no database
+    """Open the store in a worker; cached between jobs."""
+    from app.store.store import Store  # not needed to convert files
 
     return Store(database_url, Path(blob_dir), readonly=True)
 
@@ -61,7 +60,7 @@ def convert_version(
     chain: DerivationChain,
     spread: Spread | None = None,
 ) -> WrittenMap:
-    """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
+    """Convert a stored version (in a worker). Parts are addressed by content, so concurrent changes have no effect."""
     store = open_store(database_url, blob_dir)
     fmt = formats.get_format(name)
     layers = applied_closures.load(store, version, chain.keys)
@@ -76,7 +75,7 @@ def convert_version(
 def find_chain_failure(
     database_url: str, blob_dir: str, version: Version, chain: DerivationChain
 ) -> ChainFailure | None:
-    """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
+    """Find the step of a chain that fails on a version's content, or None if all work (in a worker)."""
     layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
         derive.try_steps(chain.steps, layers)
@@ -90,7 +89,7 @@ def find_chain_failure(
 def stored_crossings(
     database_url: str, blob_dir: str, version: Version, name: str, keys: Sequence[PartKey]
 ) -> list[Problem]:
-    """In a worker: warn of stored edges that lead through the version's obstacles. keys: the parts of the map."""
+    """Warn about stored edges that cross the version's obstacles (in a worker). keys: the parts of the map."""
     fmt = formats.get_format(name)
     seen = [e.key for e in version.parts if e.key.layer in ("occupancy", "objects") and e.key not in keys]
     layers = applied_closures.load(open_store(database_url, blob_dir), version, [*keys, *seen])
@@ -102,7 +101,7 @@ def stored_crossings(
 def find_missing_content(
     database_url: str, blob_dir: str, version: Version, name: str, chain: DerivationChain
 ) -> ChainFailure | None:
-    """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
+    """Find content that a format needs and its existing layers lack, or None (in a worker)."""
     fmt = formats.get_format(name)
     layers = applied_closures.load(open_store(database_url, blob_dir), version, chain.keys)
     try:
@@ -127,14 +126,15 @@ def write(
     around: Layers | None = None,
     title: str = UNTITLED,
 ) -> WrittenMap:
-    """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
-    came from, and under which licences and credits. templates: for the maps that a format holds. closures: to apply.
-    spread: write every part that is derived. around: further layers, in which edges may meet obstacles. title: the
-    environment's name, for formats with a place for one.
+    """Derive and write a map.
+
+    entries (of a stored version), or origin and credit (of files): provenance, licences and credits of each part.
+    templates: for nested maps. closures: to apply. spread: write every derived part. around: further layers whose
+    obstacles edges may cross. title: the environment's name, for formats that have a title.
     """
     notes = derive.DerivationNotes()
     options = recipes.writer_options(fmt, values)
-    if entries is None:  # of files; what is stored was loaded without them
+    if entries is None:  # from files; stored versions are loaded without marks
         layers = applied_closures.drop_timed_marks(layers)
     source = _Source(layers, chain, entries, origin, credit, templates, closures, around or Layers(), title)
     if spread is None:
@@ -152,7 +152,7 @@ def write(
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """What a map is made from, as ``write`` is given it."""
+    """Inputs of ``write``."""
 
     layers: Layers
     way: DerivationChain
@@ -168,7 +168,7 @@ class _Source:
 def _write_each(
     fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes, spread: Spread
 ) -> WrittenMap:
-    """One map of every part that was derived, each written as it would be by itself."""
+    """Write every derived part as it would be written by itself, and join the maps."""
     parts = fmt.selection.parts
     if parts is None:
         raise AssertionError(f"{fmt.name} declares no parts")
@@ -197,7 +197,7 @@ def _write_each(
 def _write_one(
     fmt: Format, derived_layers: Layers, options: Any, source: _Source, notes: derive.DerivationNotes
 ) -> WrittenMap:
-    """One map of what was derived and what was there."""
+    """Write one map of derived and existing layers."""
     layers, chain, entries, origin = source.layers, source.way, source.entries, source.origin
     credit, closures = source.credit, source.closures
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
@@ -209,14 +209,14 @@ def _write_one(
     chosen = fmt.selection.choose(sorted(k for k in derived_layers.parts if k.layer in fmt.layers), context.options)
     used = Layers({k: derived_layers.parts[k] for k in chosen}, derived_layers.datum, derived_layers.levels)
     closed = applied_closures.ClosureReport()
-    if not fmt.traits.is_container:  # a folder's inner maps apply closures themselves
+    if not fmt.traits.is_container:  # nested maps apply closures themselves
         drawn = derived_layers.parts.keys() - layers.parts.keys()
         applied, closed = applied_closures.close(fmt, used, closures, drawn)
         if closed.emptied and _has_no_edges(fmt, applied):
             applied, closed = applied_closures.close(fmt, used, closures, drawn, mark=True)
         used = applied
     lines = _report_layers(used, layers, chain, entries or {}, origin or {}, noted)
-    context.attribution = tuple(sorted(all_credits(lines)))  # whichever part came first: equal content, equal bytes
+    context.attribution = tuple(sorted(all_credits(lines)))  # sorted: equal content gives equal bytes
     files = formats.write(fmt, used, context)
     _report_blocked_edges(fmt, closed, context)
     if not fmt.traits.is_container:  # as above
@@ -225,7 +225,7 @@ def _write_one(
         )
     keys = {line.key for line in lines}
     lines += [line for line in inner if line.key not in keys]
-    # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
+    # Other layers of a stored version are not part of the recipe's key: ``Maps.report`` adds them.
     unsupported = unsupported_layers(fmt, None, layers) if entries is None else ()
     report = Report(
         fmt.name,
@@ -240,22 +240,22 @@ def _write_one(
 
 
 def crossing_edges(fmt: Format, written: Layers, around: Layers) -> list[Problem]:
-    """Warn of edges that lead through obstacles in a map of these layers. around: layers with grids and objects."""
+    """Warn about edges that cross obstacles in a map of these layers. around: layers with grids and objects."""
     return crossings(written, around, shape_of=fmt.name if fmt.traits.keeps_bends == "foreign" else None)
 
 
 def _has_no_edges(fmt: Format, layers: Layers) -> bool:
-    """Whether the format cannot be written without an edge."""
+    """Return whether the format cannot be written because no edge is left."""
     return fmt.needs.missing_content is not None and fmt.needs.missing_content(layers) is not None
 
 
 def _report_blocked_edges(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
-    """Report edges that nobody may use: those left out, and those that stay open to who plans on this map."""
+    """Report blocked edges: omitted ones, and those that planners can still use."""
     context.drop("blocked edges", closed.omitted, f"{fmt.name} cannot mark an edge as blocked for its planners")
     if closed.kept:
         edges = "1 blocked edge stays" if closed.kept == 1 else f"{closed.kept} blocked edges stay"
-        why = "it was requested with closures=mark, or no edge would be left"
-        context.warn(f"{edges} in this map ({why}): planners of {fmt.name} use them unless closed otherwise")
+        why = "requested with closures=mark, or no edge would be left"
+        context.warn(f"{edges} in this map ({why}); planners of {fmt.name} use them unless closed otherwise")
 
 
 def from_layers(
@@ -271,9 +271,9 @@ def from_layers(
     around: Layers | None = None,
     title: str = UNTITLED,
 ) -> WrittenMap:
-    """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise.
+    """Convert layers with the cheapest chain that works. Raises the errors of planning, deriving and writing.
 
-    around: the layers in which edges may meet obstacles, if there are more than these.
+    around: the layers whose obstacles edges may cross, if there are more than these.
     """
     if site.selects_all(fmt, option_values):
         return _write_every_part(
@@ -314,7 +314,7 @@ def _write_every_part(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
     credit: Mapping[PartKey, Sequence[str]] | None,
 ) -> WrittenMap:
-    """The map of several parts (``app.convert.site``), of layers that are in memory."""
+    """Write a map of several parts (``app.convert.site``) from layers in memory."""
     version = _as_version(layers)
 
     def plan(without: frozenset[str]) -> Recipe:
@@ -342,14 +342,14 @@ def _write_every_part(
 
 @dataclass(frozen=True, slots=True)
 class _PlacedFile:
-    """A file's name, and the level and name of the part that it is of, where it says so itself."""
+    """File name, with the level and name of its part if known."""
 
     name: str
     place: tuple[str, str] | None
 
 
 def _as_version(layers: Layers) -> Version:
-    """What planning needs to know of layers that no store has."""
+    """Describe layers in memory as a version, for planning."""
     stock = recipes.available_in(layers)
     parts = []
     for key in sorted(layers.parts):
@@ -368,7 +368,7 @@ def _inner(
     values: Mapping[str, Any],
     derived: bool,
 ) -> NestedMap:
-    """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
+    """Write a nested map for ``WriteContext``; add the layers that it derives to ``derivations``."""
     fmt = formats.get_format(name)
     option_values = {**resolve(source.templates, fmt).values, **values}
     written_map = from_layers(
@@ -391,7 +391,7 @@ def _inner(
 
 
 def media_type(fmt: Format, name: str) -> str:
-    """The media type of one of a format's files, by its ending."""
+    """Return the media type of one of a format's files, by its extension."""
     end = name.rpartition(".")[2]
     for pattern, declared in fmt.files.items():
         if pattern.rpartition(".")[2] == end:
@@ -400,7 +400,7 @@ def media_type(fmt: Format, name: str) -> str:
 
 
 def zip_files(files: Mapping[str, bytes]) -> bytes:
-    """Several files as one archive, the same bytes each time."""
+    """Create a zip of several files with reproducible bytes."""
     return archives.pack(files)
 
 
@@ -412,7 +412,7 @@ def _report_layers(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]],
     noted: Mapping[PartKey, Sequence[str]],
 ) -> list[LayerLine]:
-    """For each part in the map: raw, derived or template, by which steps, from which sources."""
+    """Build the report line of each part in the map: raw, derived or template, with steps and sources."""
     out = []
     steps = {step.gives: step for step in chain.steps}
     for key in sorted(used.parts):
@@ -440,7 +440,7 @@ def _report_layers(
 
 
 def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set[Layer]]:
-    """The steps that lead to a derived layer, and the stored layers they start from."""
+    """Return the steps that lead to a derived layer, and the stored layers that they start from."""
     done: set[Step] = set()
     roots: set[Layer] = set()
     todo = [layer]

@@ -1,6 +1,6 @@
-"""WRITE: bytes or edits -> layers -> one version, with its event, in one transaction; or nothing.
+"""Write path: uploaded bytes or edits -> layers -> one version and its event, in one transaction.
 
-``prepare`` runs in a worker process (it reads hostile bytes and computes); ``service`` commits what it found.
+``prepare`` runs in a worker process (it parses untrusted bytes and computes); ``service`` commits the result.
 """
 
 from app.ingest.alignment import AlignmentRequest

@@ -1,4 +1,4 @@
-"""A grid laid onto another map of the site: a version in which it lies elsewhere, its cells untouched."""
+"""Align a grid with another map of the site: a version with a moved grid origin and unchanged cells."""
 
 from __future__ import annotations
 
@@ -22,16 +22,19 @@ from app.store.changes import Changes, Prepared, Replace
 from app.store.values import Version
 
 ALIGNED = "aligned"
-"""The step in a part's provenance that tells of it."""
+"""Name of the alignment step in a part's provenance."""
 
 GRID_DERIVATIONS: Mapping[str, str] = {"objects": "objects_to_occupancy", "voxels": "voxels_to_occupancy"}
-"""The derivation by which a layer is looked at as a grid."""
+"""Derivation that turns a layer into a grid, by layer."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentRequest:
-    """What is to be laid onto what. pairs: points (from, to) in metres, instead of a map. values: parameters of the
-    derivation that makes a grid of the layer. angle: radians. least: the share that has to agree."""
+    """Request to align a grid with a target map.
+
+    pairs: points (from, to) in metres, instead of a map. values: parameters of the derivation that turns the layer into
+    a grid. angle: radians. least: minimum share that must agree.
+    """
 
     grid: str = MAP
     level: str = GROUND
@@ -49,7 +52,7 @@ class AlignmentRequest:
 
 @dataclass(frozen=True, slots=True)
 class AlignmentResult:
-    """What was found. prepared: None where it is only told."""
+    """Result of an alignment. prepared: None for a dry run."""
 
     summary: dict[str, Any]
     warnings: tuple[Problem, ...]
@@ -57,9 +60,9 @@ class AlignmentResult:
 
 
 def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: AlignmentRequest) -> AlignmentResult:
-    """In a worker: find where the grid lies, and put it there unless that is only to be told.
+    """Find the alignment of a grid and prepare the moved grid, unless it is a dry run (in a worker).
 
-    Raises NotFound (no such grid), Invalid (parameters), CannotConvert (nothing fits well enough).
+    Raises NotFound (no such grid), Invalid (parameters), CannotConvert (no alignment fits well enough).
     """
     store = open_store(database_url, blob_dir)
     key = PartKey("occupancy", request.level, request.grid)
@@ -68,11 +71,9 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
     if key not in entries:
         stored = [f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy"]
         name = f"{request.level}/{request.grid}"
-        raise NotFound(
-            f"there is no grid {name}{did_you_mean(name, stored)}; stored grids: {', '.join(stored) or 'none'}"
-        )
+        raise NotFound(f"unknown grid {name}{did_you_mean(name, stored)}; stored grids: {', '.join(stored) or 'none'}")
     if not request.pairs and request.layer == "occupancy" and key == target:
-        reason = "a grid lies on itself already: name another one, a layer (objects, voxels), or pairs of points"
+        reason = "a grid cannot be aligned with itself: name another grid, a layer (objects, voxels) or pairs of points"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
     if request.layer != "occupancy" and not request.pairs:
         target_keys = [k for k in entries if k.layer in (request.layer, "resources", "location")]
@@ -92,7 +93,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
         fits = alignment.align_grids(grid, target_grid, angle=request.angle, reach=request.reach, near=request.near)
         fit, report = fits[0], {"others": [f.as_dict() for f in fits[1:4]]}
         if len(fits) > 1 and fits[1].score >= fit.score - 0.05:
-            notes.warn("another place fits about as well (see others): the site has a symmetry; give a smaller angle")
+            notes.warn("another position fits about as well (see others), for example by symmetry; set a smaller angle")
     moved = fit.move_grid(grid)
     report = {
         "grid": {"level": request.level, "name": request.grid},
@@ -103,14 +104,14 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
     }
     if fit.score < request.least:
         reason = (
-            f"the maps do not fit: at the best place {fit.score:.0%} agree within {request.near:g} m, "
-            f"and {request.least:.0%} are asked for (least)"
+            f"the maps do not fit: at the best position {fit.score:.0%} agree within {request.near:g} m, "
+            f"but {request.least:.0%} are required (least)"
         )
         if not request.dry_run:
-            raise CannotConvert(f"{reason}; give pairs of points, a larger near, or look at it with dry_run", [])
+            raise CannotConvert(f"{reason}; give pairs of points or a larger near, or inspect it with dry_run", [])
         notes.warn(reason)
     if any(k.layer in ("topology", "zones", "imagery") or (k.layer == "occupancy" and k != key) for k in entries):
-        notes.warn("other layers keep their place: what was drawn on the grid in local metres does not move with it")
+        notes.warn("only the grid moves; features drawn on it in local metres keep their coordinates")
     if request.dry_run:
         return AlignmentResult(report, tuple(notes.warnings), None)
     old = entries[key].provenance.with_edit_step()
@@ -120,7 +121,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
 
 
 def previous_alignment(version: Version, request: AlignmentRequest) -> dict[str, Any] | None:
-    """What a version's provenance says of such an alignment, for a request that is sent again."""
+    """Read the alignment report from a version's provenance, for a repeated request."""
     for entry in version.parts:
         if entry.key == PartKey("occupancy", request.level, request.grid):
             steps = [s for s in entry.provenance.steps if s.get("step") == ALIGNED]
@@ -133,14 +134,14 @@ def _fit_by_points(request: AlignmentRequest, notes: DerivationNotes) -> tuple[a
         np.array(request.pairs, np.float64).reshape(-1, 2, 2), near=request.near
     )
     if disagreeing:
-        notes.warn(f"{len(disagreeing)} pairs disagree with the others and were not used: {disagreeing[:20]}")
+        notes.warn(f"{len(disagreeing)} pairs disagree with the others and are ignored: {disagreeing[:20]}")
     if abs(scale - 1.0) > 0.02:
-        notes.warn(f"the second points are {scale:.3f} times as far apart: is the grid's resolution right?")
+        notes.warn(f"the second points are {scale:.3f} times as far apart as the first; check the grid's resolution")
     return fit, {"disagreeing": disagreeing, "scale": round(scale, 6)}
 
 
 def _derive_target(loaded: Layers, request: AlignmentRequest, target: PartKey, notes: DerivationNotes) -> OccupancyGrid:
-    """The layer as the grid that a derivation makes of it."""
+    """Derive a grid from the target layer."""
     step = derive.all_derivations()[GRID_DERIVATIONS[request.layer]].step()
     unknown = request.values.keys() - derive.parameter_names(step.name)
     if unknown:
@@ -152,5 +153,5 @@ def _derive_target(loaded: Layers, request: AlignmentRequest, target: PartKey, n
     grid = derived_layers.parts.get(PartKey("occupancy", target.level, MAP))
     if not isinstance(grid, OccupancyGrid):
         levels = ", ".join(k.level for k in derived_layers.grids())
-        raise NotFound(f"{step.name} makes no grid of the level {target.level}; it makes: {levels}")
+        raise NotFound(f"{step.name} creates no grid on level {target.level}: choose one of its levels: {levels}")
     return grid

@@ -1,4 +1,4 @@
-"""A missing layer computed from others and committed: a version whose provenance says how, and from what."""
+"""Derive a missing layer and commit it; the version's provenance records steps and inputs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from app.store.values import PartEntry, Version, frame_input
 
 @dataclass(frozen=True, slots=True)
 class DerivationRequest:
-    """What is to be derived. values: parameters by name, of the method and of the steps before it. replace: also what
-    a source has told."""
+    """Request to derive a layer.
+
+    values: parameters by name, of the method and of the steps before it. replace: also replace uploaded content.
+    """
 
     method: str
     values: Mapping[str, Any]
@@ -27,11 +29,14 @@ class DerivationRequest:
 
 
 def check(request: DerivationRequest) -> None:
-    """NotFound for an unknown method (with the known ones), Invalid for a parameter that no derivation has."""
+    """Check method and parameter names.
+
+    Raises NotFound for an unknown method (and lists the valid ones), Invalid for a parameter that no derivation has.
+    """
     derivations = derive.all_derivations()
     if request.method not in derivations:
         near = did_you_mean(request.method, derivations)
-        raise NotFound(f"there is no derivation {request.method!r}{near}; known ones: {', '.join(derivations)}")
+        raise NotFound(f"unknown derivation {request.method!r}{near}; derivations: {', '.join(derivations)}")
     method_values = {n: v for n, v in request.values.items() if n in derive.parameter_names(request.method)}
     parameters.parse(derivations[request.method].parameters, method_values, f"parameter of {request.method}")
     everything = frozenset().union(*(derive.parameter_names(name) for name in derivations))
@@ -46,9 +51,9 @@ def check(request: DerivationRequest) -> None:
 def prepare_derivation(
     database_url: str, blob_dir: str, base: Version, request: DerivationRequest
 ) -> tuple[Prepared, tuple[Problem, ...]]:
-    """In a worker: carry out a derivation on a version, with what has to be derived before it.
+    """Run a derivation on a version, with the steps that it depends on (in a worker).
 
-    Raises MissingLayer (with what is needed), CannotDerive, Conflict (a source has told that layer).
+    Raises MissingLayer (and names the missing layers), CannotDerive, Conflict (the layer was uploaded or edited).
     """
     store = open_store(database_url, blob_dir)
     derivation = derive.all_derivations()[request.method]
@@ -64,7 +69,7 @@ def prepare_derivation(
     def attempt(
         steps: tuple[Step, ...], _: Sequence[ChainFailure]
     ) -> tuple[tuple[Step, ...], dict[PartKey, PartEntry], Layers, DerivationNotes]:
-        """Carry out all steps but the last: the chain, the stored parts that it reads, the layers, the notes."""
+        """Run all steps but the last. Returns the chain, the stored parts it reads, the layers and the notes."""
         needed = {layer for step in steps for layer in step.reads}
         used = {k: e for k, e in stored.items() if k.layer in needed}
         used |= {
@@ -72,14 +77,14 @@ def prepare_derivation(
             for k, e in existing_parts.items()
             if derivation.gives in needed or (derivation.part_names and k.name == MAP)
         }
-        # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
+        # Load more than the required layers: a derivation may use optional ones (a fence).
         loaded = store.content.load(base, sorted(used))
         notes = DerivationNotes()
         chain = derive.with_parameters(steps, request.values)
         before = derive.run(chain[:-1], Layers(loaded.parts, base.datum, base.levels), notes)
         return chain, used, before, notes
 
-    # Outside of ``attempt``: where the method itself finds nothing, no other way to it is looked for.
+    # Outside of ``attempt``: if the method itself finds nothing, do not try another chain.
     chain, used, before, notes = derive.first_working(plan, attempt, _no_chain_error)
     derived_layers = derive.run(chain[-1:], before, notes)
     _check_values(request, chain)
@@ -88,7 +93,7 @@ def prepare_derivation(
     }
     fresh = {k: p for k, p in fresh.items() if not is_empty(p)}
     if not fresh:
-        raise CannotDerive(f"{request.method} made nothing of what is stored", step=request.method)
+        raise CannotDerive(f"{request.method} found nothing to create in the stored layers", step=request.method)
     _check_free(request, fresh.keys(), existing_parts)
     provenance = Provenance(
         "derived",
@@ -104,30 +109,30 @@ def prepare_derivation(
 
 
 def _is_display_only(entry: PartEntry) -> bool:
-    """Whether a part was made for people to look at, so that it is no evidence."""
+    """Return whether a part was created for display only, so that it is no evidence."""
     return not entry.provenance.is_edited and derive.ends_in_display_step(entry.provenance.steps)
 
 
 def _steps(derivation: derive.Derivation, available: frozenset[Layer], without: frozenset[str]) -> tuple[Step, ...]:
-    """The cheapest chain that ends in a derivation; MissingLayer if there is none."""
+    """Return the cheapest chain that ends in a derivation. Raises MissingLayer if there is none."""
     before = derive.plan(available, derivation.needs, without | {derivation.name})
     if before is None:
         lacking = ", ".join(sorted(derivation.needs - available))
-        raise MissingLayer(f"{derivation.name} needs {lacking}, and the environment has none: upload a map that has")
+        raise MissingLayer(f"{derivation.name} needs {lacking}, which the environment lacks: upload a map with it")
     return (*before.steps, derivation.step())
 
 
 def _no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> MissingLayer:
-    tried = f"; what is stored does not do: {'; '.join(one.reason for one in failed)}" if failed else ""
+    tried = f"; stored layers cannot replace it: {'; '.join(one.reason for one in failed)}" if failed else ""
     return MissingLayer(f"{error.detail}{tried}")
 
 
 def _check_values(request: DerivationRequest, chain: Sequence[Step]) -> None:
-    """Nothing is silently ignored: a parameter of a step that is not on the way is refused."""
+    """Reject parameters of steps that are not in the chain. Raises Invalid."""
     taken = frozenset().union(*(derive.parameter_names(step.name) for step in chain))
     for name in request.values:
         if name not in taken:
-            problem = f"no step on the way takes it ({', then '.join(step.name for step in chain)})"
+            problem = f"no step of the chain has this parameter ({', then '.join(step.name for step in chain)})"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 
@@ -141,11 +146,11 @@ def _check_free(request: DerivationRequest, keys: Any, existing_parts: Mapping[P
         edited = entry.provenance.is_edited
         why = "was derived and then edited" if edited else f"is {entry.provenance.information}"
         raise Conflict(
-            f"the {key.layer} {key.level}/{key.name} {why}: to put a derived one in its place, ask with replace=true"
+            f"the {key.layer} {key.level}/{key.name} {why}: to replace it with a derived one, set replace=true"
         )
 
 
 def input_line(entry: PartEntry) -> dict[str, Any]:
-    """A part as one of the inputs in a derived part's provenance."""
+    """Describe a part as an input in a derived part's provenance."""
     key = entry.key
     return {"layer": key.layer, "level": key.level, "name": key.name, "hash": entry.hash}

@@ -1,8 +1,7 @@
-"""Edits (put, delete, cells) -> changes of the store, checked against the version they build on.
+"""Turn edits (put, delete, cells) into a change set, checked against the version they build on.
 
-A feature may be put back as ``GET …/layers/{layer}`` shows it: what was not edited in it stays exactly as it is stored,
-also where the answer rounded or converted it. A feature that is edited keeps its anchor, whatever ``crs`` its new place
-is told in.
+A feature may be put back as ``GET …/layers/{layer}`` returns it: its unedited members stay exactly as stored, even if
+the response rounded or converted them. An edited feature keeps its anchor, whatever the ``crs`` of its new geometry.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from app.store.values import Version
 EDITED = Provenance("raw", "edit")
 
 SAME_METRES, SAME_DEGREES = 2e-9, 2e-12
-"""Twice what an answer rounds coordinates to: a place that differs by less was not edited."""
+"""Twice the rounding of coordinates in responses: a smaller difference is no edit."""
 
 _SHAPES: Mapping[str, frozenset[str]] = {
     "node": frozenset({"Point"}),
@@ -40,14 +39,14 @@ _SHAPES: Mapping[str, frozenset[str]] = {
     "location": frozenset({"Polygon", "MultiPolygon"}),
     "zones": frozenset({"Polygon", "MultiPolygon"}),
 }
-"""Which geometries each item may have; objects may have any."""
+"""Allowed geometry types by kind of feature; objects may have any."""
 
 _DEFAULT_NAME: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "objects": "edit"}
 
 
 @dataclass(slots=True)
 class _Draft:
-    """One vector part while it is edited: what is put and deleted, over what is stored."""
+    """Vector part being edited: features put and deleted, on top of the stored ones."""
 
     stored: Features | None
     puts: dict[str, tuple[Any, Properties, bool]] = field(default_factory=dict)
@@ -68,13 +67,13 @@ class _Draft:
         return self.puts[item] if item in self.puts else self.before(item)
 
     def before(self, item: str) -> tuple[Any, Properties, bool]:
-        """The item as it is stored."""
+        """Return the stored feature."""
         assert self.stored is not None
         k = self.place[item]
         return self.stored.geometry[k], self.stored.properties[k], bool(self.stored.local[k])
 
     def connected_edges(self, node: str) -> list[str]:
-        """The stored edges that start or end at a node."""
+        """List the stored edges that start or end at a node."""
         if self._edges is None:
             self._edges = defaultdict(list)
             for item, p in zip(self.place, self.stored.properties if self.stored is not None else (), strict=True):
@@ -84,16 +83,16 @@ class _Draft:
         return self._edges.get(node, [])
 
     def edited_ids(self) -> set[str]:
-        """The stored items that go, or become something else."""
+        """Return the ids of the stored features that are deleted or changed."""
         return self.deletes | {i for i, new in self.puts.items() if i in self.place and not _equal(self.before(i), new)}
 
 
 def edit_changes(
     store: Store, base: Version, changes: Sequence[Mapping[str, Any]]
 ) -> tuple[Changes, tuple[Problem, ...]]:
-    """All edits together as one change. Raises Invalid with the place of every edit that cannot be made."""
+    """Combine all edits into one change set. Raises Invalid with the location of every invalid edit."""
     if not changes:
-        raise Invalid("there is nothing to change: give at least one of put, delete or cells in 'changes'")
+        raise Invalid("the request contains no edit: give at least one put, delete or cells in 'changes'")
     session = _Session(store, base)
     problems: list[Problem] = []
     for k, change in enumerate(changes):
@@ -122,7 +121,7 @@ class _Session:
         self._known_ids = {level.name for level in base.levels}
 
     def apply(self, change: Mapping[str, Any]) -> None:
-        """One edit: op put, delete or cells."""
+        """Apply one edit: op put, delete or cells."""
         operation = change.get("op")
         members_by_operation = {
             "put": {"op", "layer", "level", "name", "feature", "crs"},
@@ -133,13 +132,14 @@ class _Session:
             raise Invalid(f"op must be put, delete or cells, got {operation!r}")
         extra = set(change) - members_by_operation[operation]
         if extra:
-            raise Invalid(f"{operation} has no member {sorted(extra)[0]!r}")
+            raise Invalid(f"unknown member {sorted(extra)[0]!r} of {operation}")
         {"put": self._apply_put, "delete": self._apply_delete, "cells": self._apply_cells}[operation](change)
 
     def dangling(self) -> list[Problem]:
-        """Edges that these edits leave without a node at one end. A lift's edge may end in another level's network.
+        """List the edges that these edits leave without a node at one end.
 
-        What dangled before is not this edit's: it was warned of when it came.
+        A lift's edge may end in another level's network. Edges that dangled before are not listed: the upload that
+        brought them warned about them.
         """
         out = []
         for key, draft in self._drafts.items():
@@ -156,12 +156,12 @@ class _Session:
                     if not self._is_node(draft, node) and not (
                         item in put and self._was_dangling(draft, item, end, node)
                     ):
-                        problem = f"edge {item} has {end} {node!r}, which is no node: put the node, or delete the edge"
+                        problem = f"{end} {node!r} of edge {item} is not a node: put the node or delete the edge"
                         out.append(Problem(problem, where=item))
         return out
 
     def _is_node(self, draft: _Draft, item: Any) -> bool:
-        """Whether a node of this id is in the network, or in that of another level."""
+        """Return whether this network, or that of another level, has a node with this id."""
         if not isinstance(item, str):
             return False
         if draft.has_item(item):
@@ -173,13 +173,13 @@ class _Session:
 
     @staticmethod
     def _was_dangling(draft: _Draft, item: str, end: str, node: Any) -> bool:
-        """Whether the stored edge ended there already, in nothing, and not by these edits."""
+        """Return whether the stored edge had this dangling end before these edits."""
         return item in draft.place and draft.before(item)[1].get(end) == node and node not in draft.deletes
 
     def loosen(self) -> None:
-        """Cut the tie of network items to a drawn line where either of them was edited.
+        """Unlink network features from the drawn line they were read from if either was edited.
 
-        Drawing formats write the line and leave out what was made from it; that holds only while both say the same.
+        Drawing formats write the line and omit features read from it, which is right only while both agree.
         """
         families = {f.family for f in formats.all_formats().values() if f.traits.is_drawing}
         touched: dict[str, set[str]] = defaultdict(set)
@@ -207,7 +207,7 @@ class _Session:
                     draft.puts[item] = (geometry, remaining, local)
 
     def changes(self) -> Changes:
-        """What the store is asked to do."""
+        """Build the change set for the store."""
         operations: list[Put | Delete | Replace] = []
         for key, draft in sorted(self._drafts.items()):
             if draft.deletes:
@@ -231,7 +231,7 @@ class _Session:
         )
 
     def _provenance(self, key: PartKey) -> Provenance:
-        """An edited part stays what it was made of: raw, derived …; what was derived is no longer made anew."""
+        """Return the provenance of an edited part: it keeps its kind (raw, derived …) and is not derived again."""
         return next((e.provenance for e in self._base.parts if e.key == key), EDITED).with_edit_step()
 
     def _draft(self, key: PartKey) -> _Draft:
@@ -253,11 +253,11 @@ class _Session:
             raise Invalid("put needs 'feature', a GeoJSON Feature")
         item = feature.get("id")
         if not isinstance(item, str) or not item:
-            raise Invalid("the feature needs an 'id', a text")
+            raise Invalid("the feature's 'id' must be a string")
         properties = feature.get("properties") or {}
         if not isinstance(properties, Mapping):
             raise Invalid("the feature's 'properties' must be an object")
-        # As the layer's answer says it, so that a feature can be put back where it was taken from.
+        # Accept what GET returns, so that a client can put a feature back.
         shown = {"level": feature.get("level"), "name": feature.get("part")}
         change = {**{k: v for k, v in shown.items() if isinstance(v, str) and v}, **change}
         if layer == "location":
@@ -287,7 +287,7 @@ class _Session:
             self._drag_edges(draft, item, before, (geometry, local))
 
     def _take_datum(self, properties: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A location's properties without ``datum``, which is the environment's own and not kept twice."""
+        """Remove ``datum`` from a location's properties: the environment stores it."""
         datum_values = properties.get("datum")
         if datum_values is not None:
             names = ("latitude", "longitude", "altitude", "heading")
@@ -299,7 +299,7 @@ class _Session:
         return {name: value for name, value in properties.items() if name != "datum"}
 
     def _as_before(self, before: tuple[Any, Properties, bool], geometry: Any, local: bool) -> tuple[Any, bool]:
-        """A stored item's new place in the item's own anchor; the stored one where it was not moved."""
+        """Convert a feature's new geometry to its anchor; an unmoved feature keeps the stored geometry."""
         stored, _, anchored = before
         if stored.is_empty:
             return geometry, local
@@ -311,28 +311,28 @@ class _Session:
         return (geometry if anchored == local else self._other(geometry, local)), anchored
 
     def _straight(self, draft: _Draft, properties: Mapping[str, Any]) -> tuple[Any, bool]:
-        """An edge without a geometry runs straight from node to node."""
+        """Build the straight geometry of an edge that has none, from node to node."""
         ends = []
         for end in ("source", "target"):
             if not draft.has_item(properties[end]):
-                return NO_GEOMETRY, True  # told as dangling when all edits are known
+                return NO_GEOMETRY, True  # reported as dangling after all edits
             ends.append(draft.row(properties[end]))
             if ends[-1][0].geom_type != "Point" or ends[-1][0].is_empty:
-                raise Invalid(f"{properties[end]!r} is no node with a place: give the edge a geometry, a LineString")
+                raise Invalid(f"node {properties[end]!r} has no position: give the edge a LineString geometry")
         local = ends[0][2]
         places = [g if anchor == local else self._other(g, anchor) for g, _, anchor in ends]
         return shapely.LineString([shapely.get_coordinates(p, include_z=p.has_z)[0][:2] for p in places]), local
 
     def _other(self, geometry: Any, local: bool) -> Any:
         if self._frame is None:
-            raise MissingDatum("the environment has no datum, so local metres and places on earth cannot be joined")
+            raise MissingDatum("the environment has no datum: set one to combine local and WGS 84 coordinates")
         one = np.array([geometry], object)
         return (self._frame.geometries_to_wgs84(one) if local else self._frame.geometries_to_local(one))[0]
 
     def _drag_edges(
         self, draft: _Draft, node: str, before: tuple[Any, Properties, bool], now: tuple[Any, bool]
     ) -> None:
-        """Edges that ended at a node's old place end at its new one, unless this change puts them itself."""
+        """Move the ends of connected edges with a moved node, unless these edits put the edge itself."""
         if draft.stored is None or before[0].equals_exact(now[0], 0.0):
             return
         for item in draft.connected_edges(node):
@@ -355,17 +355,17 @@ class _Session:
     def _apply_delete(self, change: Mapping[str, Any]) -> None:
         layer, item = self._layer(change), change.get("id")
         if not isinstance(item, str) or not item:
-            raise Invalid("delete needs 'id', the id of a feature")
+            raise Invalid("delete needs 'id', a feature id")
         key = self._find_part(layer, item, change)
         draft = self._draft(key)
         if not draft.has_item(item):
-            raise NotFound(f"there is no feature {item!r} in {layer}")
+            raise NotFound(f"feature {item!r} not found in {layer}")
         draft.puts.pop(item, None)
         if item in draft.place:
             draft.deletes.add(item)
 
     def _find_part(self, layer: Layer, item: str, change: Mapping[str, Any]) -> PartKey:
-        """The part that an edit means: the named one, else the one that holds the id, else the usual one."""
+        """Return the part to edit: the named one, else the one with this id, else the default part."""
         level, name = change.get("level"), change.get("name")
         fitting = sorted(
             k
@@ -375,7 +375,7 @@ class _Session:
         holding = [k for k in fitting if self._draft(k).has_item(item)]
         if len(holding) > 1:
             choices = ", ".join(f"level {k.level} name {k.name}" for k in holding)
-            raise Invalid(f"several parts of {layer} hold {item!r}: give 'level' and 'name', one of: {choices}")
+            raise Invalid(f"several parts of {layer} contain {item!r}: give 'level' and 'name', one of: {choices}")
         if holding:
             return holding[0]
         usual = PartKey(layer, level or GROUND, name or _DEFAULT_NAME[layer])
@@ -383,7 +383,7 @@ class _Session:
         return same[0] if layer == "topology" and len(same) == 1 else usual
 
     def _geometry(self, feature: Mapping[str, Any], change: Mapping[str, Any]) -> tuple[Any, bool]:
-        """A feature's geometry and whether it is local: ``place`` is local metres (JSON-FG), else ``crs`` decides."""
+        """Return a feature's geometry and whether it is local: ``place`` is local (JSON-FG), else ``crs`` decides."""
         place = feature.get("place")
         local = place is not None or self._is_local(change)
         shape = place if place is not None else feature.get("geometry")
@@ -414,7 +414,7 @@ class _Session:
         bound = np.array([MAX_METRES, MAX_METRES] if local else [180.0, 90.0])
         if polygon.is_empty or (np.abs(shapely.get_coordinates(polygon)) > bound).any():
             unit = f"±{MAX_METRES:g} metres" if local else "longitude ±180, latitude ±90 degrees"
-            raise Invalid(f"the polygon must have corners, all of them within {unit}")
+            raise Invalid(f"the polygon must not be empty, and all its corners must be within {unit}")
         if not local:
             polygon = self._other(polygon, False)
         mask = cells_within(grid, polygon)
@@ -422,7 +422,7 @@ class _Session:
             raise Invalid(f"the polygon covers no cell centre of grid {key.name}")
         cells = grid.cells.copy()
         cells[mask] = value
-        # Once people have drawn in it, a grid tells more than the objects that it was a slice of.
+        # An edited grid has more information than the objects that it was derived from.
         grid = without_unknown_grey(grid, mask)
         properties = {word: value for word, value in grid.properties.items() if word != "slice"}
         self._grids[key] = replace(grid, cells=cells, properties=properties)
@@ -438,16 +438,16 @@ class _Session:
         if not fitting:
             grid_names = sorted(k.name for k in self._keys if k.layer == "occupancy")
             near = did_you_mean(name or "", grid_names)
-            raise NotFound(f"there is no grid {name!r}{near}; known grids: {', '.join(grid_names) or 'none'}")
+            raise NotFound(f"unknown grid {name!r}{near}; stored grids: {', '.join(grid_names) or 'none'}")
         if len(fitting) == 1:
             return fitting[0]
         if name is None and len(by_name["map"]) == 1:
             return by_name["map"][0]
-        raise Invalid(f"several grids fit: name one with 'grid' (and 'level'): {', '.join(k.name for k in fitting)}")
+        raise Invalid(f"several grids match: name one with 'grid' (and 'level'): {', '.join(k.name for k in fitting)}")
 
 
 def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """bool [height, width], row 0 at the bottom: cells whose centre lies in a polygon of the local frame."""
+    """Mark the cells whose centre is inside a polygon of the local frame: bool [height, width], row 0 at the bottom."""
     x, y, yaw = grid.origin
     c, s = np.cos(yaw), np.sin(yaw)
 
@@ -463,7 +463,7 @@ def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[
     if not len(columns) or not len(rows):
         return mask
     shapely.prepare(shape)
-    for start in range(0, len(rows), 512):  # blocks, so that a large polygon takes bounded memory
+    for start in range(0, len(rows), 512):  # in blocks, to bound the memory of a large polygon
         block = rows[start : start + 512]
         u, v = np.meshgrid(columns + 0.5, block + 0.5)
         inside = shapely.contains_xy(shape, u, v)
@@ -472,13 +472,13 @@ def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[
 
 
 def parse_geometry(geometry: Any) -> Any:
-    """A GeoJSON geometry; Invalid where it is none."""
+    """Parse a GeoJSON geometry. Raises Invalid if it is none."""
     if not isinstance(geometry, Mapping):
         raise Invalid(f"a geometry must be a GeoJSON object, got {type(geometry).__name__}")
     try:
         return shapely.geometry.shape(geometry)
     except Exception as error:
-        raise Invalid(f"not a GeoJSON geometry: {error}") from error
+        raise Invalid(f"invalid GeoJSON geometry: {error}") from error
 
 
 def _equal(a: tuple[Any, Properties, bool], b: tuple[Any, Properties, bool]) -> bool:
@@ -486,7 +486,7 @@ def _equal(a: tuple[Any, Properties, bool], b: tuple[Any, Properties, bool]) -> 
 
 
 def _is_nearly_equal(a: Any, b: Any, tolerance: float) -> bool:
-    """Whether two geometries are built alike, each coordinate within the tolerance; heights within two nanometres."""
+    """Compare two geometries: same structure, coordinates within the tolerance, heights within 2 nm."""
     if a.geom_type != b.geom_type or a.has_z != b.has_z or not a.equals_exact(b, 0.0 if a.is_empty else tolerance):
         return False
     if not a.has_z:
@@ -496,7 +496,7 @@ def _is_nearly_equal(a: Any, b: Any, tolerance: float) -> bool:
 
 
 def _check_shape(kind: str, item: str, geometry: Any) -> None:
-    """Refuse a node that is no point, an edge that is no line, a fence or zone that is no polygon."""
+    """Check that a node is a point, an edge a line, a fence or zone a polygon. Raises Invalid."""
     allowed = _SHAPES.get(kind)
     if allowed is None or (geometry.geom_type in allowed and not geometry.is_empty):
         return
@@ -508,7 +508,7 @@ def _check_shape(kind: str, item: str, geometry: Any) -> None:
 def _network_item(item: str, properties: Mapping[str, Any]) -> Mapping[str, Any]:
     kind = properties.get("kind") or ("edge" if "source" in properties else "node")
     if kind not in ("node", "edge"):
-        raise Invalid(f"a feature of the topology has kind node or edge, got {kind!r}")
+        raise Invalid(f"kind of a topology feature must be node or edge, got {kind!r}")
     if kind == "edge" and not all(isinstance(properties.get(e), str) for e in ("source", "target")):
         raise Invalid(f"edge {item} needs 'source' and 'target', the ids of its nodes")
     return {**properties, "kind": kind}

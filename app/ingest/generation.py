@@ -1,4 +1,4 @@
-"""A site made up and committed: a version whose provenance says by which generator, seed and parameters."""
+"""Generate a site and commit it; the version's provenance records generator, seed and parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.store.values import PartEntry, Version
 
 @dataclass(frozen=True, slots=True)
 class GenerationRequest:
-    """What is to be made up. replace: also in place of what a source has told or people have edited."""
+    """Request to generate a site. replace: also replace uploaded or edited content."""
 
     generator: str
     seed: int
@@ -28,11 +28,11 @@ class GenerationRequest:
 def prepare_generation(
     database_url: str, blob_dir: str, base: Version, order: GenerationRequest
 ) -> tuple[Prepared, tuple[Problem, ...]]:
-    """In a worker: carry out a generation on a version.
+    """Run a generator on a version (in a worker).
 
-    What a whole site's generator made here before goes where the new site has no such part, and is not looked at: the
-    fence of the last site does not bind the next one. Raises MissingLayer, CannotGenerate, Conflict (a source has told
-    that part).
+    A generator of whole sites ignores the parts that such a generator created before, and deletes those that the new
+    site lacks: the last site's fence does not bind the next one. Raises MissingLayer, CannotGenerate, Conflict (the
+    part was uploaded or edited).
     """
     store = open_store(database_url, blob_dir)
     generator, _ = generate.check(order.generator, order.seed, order.values)
@@ -65,7 +65,7 @@ def prepare_generation(
 
 
 def _is_generated(entry: PartEntry) -> bool:
-    """Whether it is a generator's work and nobody's since."""
+    """Return whether a part was generated and not edited since."""
     return entry.provenance.information == "generated" and not entry.provenance.is_edited
 
 
@@ -75,7 +75,10 @@ def _check_free(
     generated_layers: Layers,
     existing_parts: Mapping[PartKey, PartEntry],
 ) -> None:
-    """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
+    """Check that a generator may replace these parts: its inputs and generated parts, others only on request.
+
+    Raises Conflict.
+    """
     for key in sorted(generated_layers.parts):
         entry = existing_parts.get(key)
         if entry is None or order.replace or key.layer in generator.editable_layers or _is_generated(entry):
@@ -83,5 +86,5 @@ def _check_free(
         edited, kind = entry.provenance.is_edited, entry.provenance.information
         why = f"was {kind} and then edited" if edited else f"is {kind}"
         raise Conflict(
-            f"the {key.layer} {key.level}/{key.name} {why}: to put a made-up one in its place, ask with replace=true"
+            f"the {key.layer} {key.level}/{key.name} {why}: to replace it with a generated one, set replace=true"
         )

@@ -1,4 +1,4 @@
-"""A re-upload whose ids differ is matched to the head by geometry first, so that identities and diffs stay small."""
+"""Match re-uploaded features with new ids to the head by geometry, to keep ids stable and diffs small."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from app.store.values import Version
 
 
 def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Features:
-    """The new collection with the head's ids where a feature stands at the very place of one whose id has gone.
+    """Give new features the ids of equal head features that the upload no longer contains.
 
-    Features whose ids the head knows keep them, and so do those whose id is the name that people gave them (a renamed
-    waypoint is another waypoint to the robots). Of the others, one takes the id of a head feature that the upload does
-    not name, if kind, anchor and geometry are equal and the pair is the only one of its place; an edge must join the
-    same nodes, too.
+    Features whose id exists in the head keep it, and so do those whose id is a name given by people (a renamed waypoint
+    is another waypoint to the robots). Any other feature takes the id of a head feature that the upload does not
+    contain, if kind, anchor and geometry are equal and the pair is unique at its position; an edge must also join the
+    same nodes.
     """
     stored = store.content.load(base, [key]).parts.get(key)
     if not isinstance(stored, Features) or not len(stored) or not len(new):
@@ -31,7 +31,7 @@ def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Featu
     strange = [k for k, i in enumerate(new.ids) if i not in stored_ids and new.properties[k].get("name") != i]
     missing = [k for k, i in enumerate(stored.ids) if i not in present]
     renamed: dict[str, str] = {}
-    for edges in (False, True):  # edges last, when their nodes are known
+    for edges in (False, True):  # edges last: they need the ids of their nodes
         wanting = [k for k in strange if (new.properties[k].get("kind") == "edge") is edges]
         left = [k for k in missing if (stored.properties[k].get("kind") == "edge") is edges]
         if not wanting or not left:
@@ -51,7 +51,7 @@ def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Featu
 
 
 def _places(f: Features, indices: Sequence[int], renamed: dict[str, str]) -> dict[tuple[Any, ...], list[int]]:
-    """The features at each place: anchor, kind, shape and, for an edge, the nodes it joins."""
+    """Index features by position: anchor, kind, geometry and, for an edge, the nodes it joins."""
     shapes = shapely.to_wkb(f.geometry[np.array(indices, np.intp)])
     out: dict[tuple[Any, ...], list[int]] = defaultdict(list)
     for k, shape in zip(indices, shapes, strict=True):

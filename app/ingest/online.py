@@ -1,9 +1,9 @@
-"""Pictures from a provider on the net, fetched for a site: Mapbox static images, WMS, and tiles (XYZ or WMTS).
+"""Fetch imagery of a site from an online provider: Mapbox static images, WMS, and tiles (XYZ or WMTS).
 
-Off unless an operator names a provider, and then only its host is asked: a redirect to another one is refused. Answers
-are untrusted: their size and time are bounded before they are read, and they are decoded in a worker process, as
-uploads are. All pictures come in Web Mercator (EPSG:3857). The token goes into addresses that are asked for, and
-nowhere else: no message, log, cache or version has it.
+Off unless the operator configures a provider. Requests go only to its host; redirects to another host are rejected.
+Responses are untrusted: their size and time are bounded before they are read, and a worker process decodes them, as it
+does uploads. All images are in Web Mercator (EPSG:3857). The token occurs only in request URLs, never in messages,
+logs, caches or versions.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ if TYPE_CHECKING:
 METHOD = "location_to_imagery"
 MERCATOR = "EPSG:3857"
 HALF = 20037508.342789244
-"""Metres from the middle to the edge of the Web Mercator square."""
+"""Half the side of the Web Mercator square, in metres."""
 
 Kind = Literal["xyz", "wms", "mapbox"]
 BLOCK: Mapping[str, int] = {"wms": 2048, "mapbox": 1280}
-"""Pixels along a side of one picture that such a provider makes at most."""
+"""Maximum side of one requested image in pixels, by kind of provider."""
 
 MAPBOX_TILE = 512
-"""Pixels of a tile by which Mapbox counts its zoom levels."""
+"""Side of the tiles that define Mapbox zoom levels, in pixels."""
 
 MAX_REQUESTS = 400
 MAX_PIXELS = 2**26
@@ -73,9 +73,12 @@ MAGIC: Mapping[bytes, str] = {b"\x89PNG\r\n\x1a\n": "png", b"\xff\xd8\xff": "jpg
 
 @dataclass(frozen=True, slots=True)
 class Provider:
-    """Where pictures come from. url: of tiles with {z}, {x}, {y} (or {-y}, from below; or WMTS's {TileMatrix},
-    {TileCol}, {TileRow}), of a WMS with its layers in the query, or of a Mapbox style up to ``static``. token: in the
-    place of {token}, else for Mapbox as access_token. seconds: for all requests of one picture. tile: pixels a side."""
+    """Imagery provider.
+
+    url: of tiles with {z}, {x}, {y} (or {-y}, counted from the south; or {TileMatrix}, {TileCol}, {TileRow} of WMTS),
+    of a WMS with its layers in the query, or of a Mapbox style up to ``static``. token: replaces {token}; without that
+    placeholder sent as access_token to Mapbox. seconds: time limit for all requests of one image. tile: side in pixels.
+    """
 
     url: str
     kind: Kind
@@ -91,11 +94,11 @@ class Provider:
 
     @property
     def host(self) -> str:
-        """The only host that is asked."""
+        """Host that requests go to."""
         return urlsplit(self.url).netloc.rpartition("@")[2]
 
     def provenance_step(self, chosen: Parameters) -> dict[str, Any]:
-        """The step as a version's provenance says it."""
+        """Build the step for a version's provenance."""
         parameters = {p["name"]: getattr(chosen, p["name"]) for p in describe(Parameters)}
         parameters |= {"provider": self.host, "kind": self.kind}
         return {"step": METHOD, "from": ["location"], "to": "imagery", "parameters": parameters}
@@ -103,27 +106,27 @@ class Provider:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What picture."""
+    """Parameters of the image to fetch."""
 
     resolution: float = parameter(
-        0.3, "metres a pixel on the ground; tiles come in the next finer zoom", minimum=0.01, maximum=1000.0, unit="m"
+        0.3, "ground size of a pixel; tiles use the next finer zoom level", minimum=0.01, maximum=1000.0, unit="m"
     )
-    padding: float = parameter(10.0, "around the fence", minimum=0.0, maximum=10_000.0, unit="m")
+    padding: float = parameter(10.0, "margin around the fence", minimum=0.0, maximum=10_000.0, unit="m")
     radius: float | None = parameter(
-        None, "where there is no fence: how far from the datum to each side", minimum=1.0, maximum=50_000.0, unit="m"
+        None, "distance from the datum to each side, if there is no fence", minimum=1.0, maximum=50_000.0, unit="m"
     )
-    picture: str = parameter("satellite", "name to store the picture under")
-    level: str = parameter("ground", "level of the picture")
+    picture: str = parameter("satellite", "name of the stored picture")
+    level: str = parameter("ground", "level of the stored picture")
 
     @property
     def key(self) -> PartKey:
-        """The part that it becomes."""
+        """Key of the part that the image is stored as."""
         return PartKey("imagery", self.level, self.picture)
 
 
 @dataclass(frozen=True, slots=True)
 class TileRequest:
-    """One request: its place and size in the picture's pixels, and its address without the token."""
+    """One request: position and size in pixels of the whole image, and the URL without the token."""
 
     column: int
     row: int
@@ -134,7 +137,7 @@ class TileRequest:
 
 @dataclass(frozen=True, slots=True)
 class Mosaic:
-    """All requests of a picture, its size in pixels and its transform in Web Mercator."""
+    """All requests of an image, its size in pixels and its transform in Web Mercator."""
 
     blocks: tuple[TileRequest, ...]
     width: int
@@ -144,20 +147,23 @@ class Mosaic:
 
 # --- the site ---------------------------------------------------------------------------------------------------------
 def check_free(base: Version, chosen: Parameters, *, replace: bool) -> None:
-    """Conflict where a source has told a picture of that name."""
+    """Raise Conflict if an image of that name was uploaded or edited, unless ``replace`` is set."""
     old = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
     if old is not None and not replace and (old.provenance.information != "derived" or old.provenance.is_edited):
         raise Conflict(
-            f"the picture {chosen.level}/{chosen.picture} is {old.provenance.information}: to put a fetched one in its "
-            "place, ask with replace=true, or name another picture"
+            f"the picture {chosen.level}/{chosen.picture} is {old.provenance.information}: set replace=true to replace "
+            "it, or choose another name with picture"
         )
 
 
 def site_box(site: Layers, chosen: Parameters) -> tuple[float, float, float, float]:
-    """West, south, east, north of the fence with its padding, in degrees. MissingDatum, or MissingLayer."""
+    """Compute the box of the fence and its padding: west, south, east, north in degrees.
+
+    Raises MissingDatum, or MissingLayer if there is neither a fence nor a radius.
+    """
     frame = site.frame
     if frame is None:
-        raise MissingDatum('a picture of the site needs its place on earth: PATCH the environment with {"datum": {…}}')
+        raise MissingDatum('fetching imagery needs a datum: PATCH the environment with {"datum": {…}}')
     areas = [area for part in site.vector("location").values() for area in part.in_local(frame)]
     boxes = shapely.bounds([a for a in areas if shapely.get_dimensions(a) == 2 and not a.is_empty])
     if len(boxes):
@@ -165,19 +171,19 @@ def site_box(site: Layers, chosen: Parameters) -> tuple[float, float, float, flo
     elif chosen.radius is not None:
         low, high = np.full(2, -chosen.radius), np.full(2, chosen.radius)
     else:
-        raise MissingLayer("there is no fence around the site: upload one as location, or ask with radius=… (metres)")
+        raise MissingLayer("the environment has no fence: upload one as layer location, or set radius (metres)")
     (x0, y0), (x1, y1) = low - chosen.padding, high + chosen.padding
     lonlat = frame.to_wgs84(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
     (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
     return float(west), float(south), float(east), float(north)
 
 
-# --- what to ask for -------------------------------------------------------------------------------------------------
+# --- requests --------------------------------------------------------------------------------------------------------
 def plan_mosaic(provider: Provider, box: tuple[float, float, float, float], resolution: float) -> Mosaic:
-    """The requests that cover a box (west, south, east, north in degrees). Invalid where they would be too many."""
+    """Plan the requests that cover a box (west, south, east, north in degrees). Raises Invalid if they are too many."""
     west, south, east, north = box
     if not (-180 <= west < east <= 180 and -85.05 <= south < north <= 85.05):
-        raise Invalid("the site lies where Web Mercator has no pictures: across the date line or at a pole")
+        raise Invalid("the site is outside Web Mercator: it crosses the date line or is at a pole")
     low, high = between(WGS84, MERCATOR, np.array([[west, south], [east, north]])).tolist()
     stretch = 1.0 / math.cos(math.radians((south + north) / 2))
     zoom, size = 0, resolution * stretch
@@ -191,10 +197,10 @@ def plan_mosaic(provider: Provider, box: tuple[float, float, float, float], reso
     side = provider.tile if provider.kind == "xyz" else BLOCK[provider.kind]
     count = (math.ceil(width / side) + 1) * (math.ceil(height / side) + 1)
     if count > MAX_REQUESTS or width * height > MAX_PIXELS:
-        cost = f"{width} × {height} pixels in about {count} requests"
+        cost = f"{width} × {height} pixels and about {count} requests"
         raise Invalid(
-            f"the picture would have {cost}; at most {MAX_PIXELS} pixels and {MAX_REQUESTS} requests are made: give "
-            "a coarser resolution",
+            f"the picture would take {cost}, the maximum is {MAX_PIXELS} pixels and {MAX_REQUESTS} requests: set a "
+            "coarser resolution",
             [Problem("too fine for a site of this size", where="resolution")],
         )
     make = {"xyz": _tiles, "wms": _maps, "mapbox": _statics}[provider.kind]
@@ -246,7 +252,7 @@ def _statics(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterat
 
 
 def _cut(edges: Edges, side: int) -> Iterator[tuple[int, int, int, int]]:
-    """(column, row, width, height) of blocks of at most a side."""
+    """Yield blocks (column, row, width, height) of at most ``side`` pixels a side."""
     width, height = edges[2] - edges[0], edges[3] - edges[1]
     for row in range(0, height, side):
         for column in range(0, width, side):
@@ -254,13 +260,13 @@ def _cut(edges: Edges, side: int) -> Iterator[tuple[int, int, int, int]]:
 
 
 def _with_query(url: str, query: Mapping[str, str]) -> str:
-    # What stands in braces is filled in later.
+    # Placeholders in braces are filled in later.
     return urlunsplit(urlsplit(url)._replace(query=urlencode(query, safe="{}:,/")))
 
 
-# --- asking -----------------------------------------------------------------------------------------------------------
+# --- fetching ---------------------------------------------------------------------------------------------------------
 class _RetryableError(Exception):
-    """It may work another time. The text says what was wrong; wait: seconds that the provider asks for."""
+    """Temporary failure of a provider. wait: seconds that the provider requests before a retry."""
 
     def __init__(self, text: str, wait: float = 0.0) -> None:
         super().__init__(text)
@@ -268,20 +274,20 @@ class _RetryableError(Exception):
 
 
 class Fetcher:
-    """Asks a provider, within its limits."""
+    """Fetches images from a provider, within its limits."""
 
     def __init__(self, provider: Provider, *, sleep: Callable[[float], None] = time.sleep) -> None:
         self.provider, self._sleep = provider, sleep
-        # Their lines of every request would have the token.
+        # Their request log lines would contain the token.
         for name in ("httpx", "httpcore"):
             logging.getLogger(name).setLevel(logging.WARNING)
 
     def fetch(self, blocks: Sequence[TileRequest]) -> list[bytes | None]:
-        """The pictures of all blocks, None where the provider has none (404).
+        """Fetch the images of all blocks; None for each that the provider does not have (404).
 
-        Raises CannotDerive where it refuses or sends something else, Unavailable where it is down or too slow.
+        Raises CannotDerive if the provider refuses or sends something else, Unavailable if it is down or too slow.
         """
-        import httpx  # most servers never ask a provider, and start sooner without
+        import httpx  # slow to import, and most servers use no provider
 
         p = self.provider
         deadline = time.monotonic() + p.seconds
@@ -322,7 +328,7 @@ class Fetcher:
     def _request_tile(
         self, client: httpx.Client, block: TileRequest, deadline: float, room: _ByteBudget
     ) -> bytes | None:
-        """One answer. The address with the token is in no message."""
+        """Fetch one block. No error message contains the URL with the token."""
         import httpx
 
         url = self._address(block.url)
@@ -334,15 +340,15 @@ class Fetcher:
                         continue
                     return self._body(answer, deadline, room)
         except httpx.TimeoutException:
-            raise _RetryableError("does not answer in time") from None
+            raise _RetryableError("does not respond in time") from None
         except httpx.InvalidURL:
-            raise self._provider_error("leads to an address that is none") from None
+            raise self._provider_error("redirects to an invalid URL") from None
         except httpx.HTTPError as error:
             raise _RetryableError(f"cannot be reached ({type(error).__name__})") from None
         raise self._provider_error(f"redirects more than {MAX_REDIRECTS} times")
 
     def _address(self, url: str) -> str:
-        """The address with the token in it."""
+        """Insert the token into a URL."""
         token = quote(self.provider.token, safe="")
         if self.provider.kind == "mapbox" and "{token}" not in url and token:
             return f"{url}{'&' if '?' in url else '?'}access_token={token}"
@@ -352,7 +358,7 @@ class Fetcher:
         target = urljoin(url, location)
         old, new = urlsplit(url), urlsplit(target)
         if (old.scheme, old.netloc) != (new.scheme, new.netloc):
-            raise self._provider_error("redirects to another host, which is not followed")
+            raise self._provider_error("redirects to another host, which is not allowed")
         return target
 
     def _body(self, answer: httpx.Response, deadline: float, room: _ByteBudget) -> bytes | None:
@@ -360,24 +366,24 @@ class Fetcher:
         if status == 404:
             return None
         if status in (401, 403):
-            raise self._provider_error(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and what it allows")
+            raise self._provider_error(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and its permissions")
         if status == 429 or status >= 500:
             retry_after = answer.headers.get("retry-after", "")
             raise _RetryableError(
-                f"answers {status}", float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0
+                f"returns {status}", float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0
             )
         if status != 200:
-            raise self._provider_error(f"answers {status}")
+            raise self._provider_error(f"returns {status}")
         kind = answer.headers.get("content-type", "").partition(";")[0].strip().lower()[:80]
         if kind and not kind.startswith("image/") and kind != "application/octet-stream":
             raise self._provider_error(f"sends {kind!r} instead of a picture: check FLEETMAP_IMAGERY_URL")
         if answer.headers.get("content-encoding", "identity").lower() != "identity":
-            raise self._provider_error("sends a compressed answer that was not asked for")
+            raise self._provider_error("sends a compressed response although none was requested")
         length = answer.headers.get("content-length", "")
         if length.isascii() and length.isdigit() and int(length) > self.provider.max_bytes:
             raise self._too_large()
         out = bytearray()
-        # As it comes: chunks of a given size would be waited for, however slowly they drip.
+        # Without a chunk size: httpx would wait until a chunk is full, past the deadline of a slow response.
         for chunk in answer.iter_raw():
             if not room.take(len(chunk)):
                 raise self._too_large()
@@ -395,10 +401,10 @@ class Fetcher:
     def _too_large(self) -> CannotDerive:
         max_bytes = self.provider.max_bytes
         return self._provider_error(
-            f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): ask for a coarser resolution"
+            f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): set a coarser resolution"
         )
 
-    # --- what was fetched before ---
+    # --- cache ---
     def _file(self, block: TileRequest) -> Path | None:
         folder = self.provider.cache_dir
         return None if folder is None else folder / hashlib.sha256(block.url.encode()).hexdigest()
@@ -415,7 +421,7 @@ class Fetcher:
         return data if any(data.startswith(magic) for magic in MAGIC) else None
 
     def _write_cache(self, block: TileRequest, data: bytes) -> None:
-        """Remember an answer; what was not used for the longest time goes. A full disk is no reason to fail."""
+        """Cache a response and evict the least recently used ones. Ignores a full disk."""
         file = self._file(block)
         if file is None or len(data) > self.provider.cache_bytes:
             return
@@ -428,14 +434,14 @@ class Fetcher:
 
 
 class _ByteBudget:
-    """Bytes that all answers of a picture together may have."""
+    """Byte budget of all responses for one image."""
 
     def __init__(self, max_bytes: int) -> None:
         self._left, self._lock = max_bytes, threading.Lock()
         self.stopped = threading.Event()
 
     def take(self, count: int) -> bool:
-        """Whether there is room for so many more."""
+        """Take ``count`` bytes from the budget. Returns False if it has fewer left."""
         with self._lock:
             self._left -= count
             return self._left >= 0
@@ -459,8 +465,11 @@ def _trim(folder: Path, max_bytes: int) -> None:
 # --- in a worker ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class FetchedImagery:
-    """What a provider sent, and what is to become of it. provenance_step: the step as the version's provenance says it.
-    site: the fences that it was fetched for, as the provenance's inputs."""
+    """Responses of a provider, and how to store them.
+
+    provenance_step: the step for the version's provenance. site: the fences that bounded the request, as the
+    provenance's inputs.
+    """
 
     sheet: Mosaic
     answers: tuple[bytes | None, ...]
@@ -473,14 +482,14 @@ class FetchedImagery:
 def prepare_picture(
     database_url: str, blob_dir: str, base: Version, fetched: FetchedImagery, limits: Limits
 ) -> tuple[Prepared, tuple[Problem, ...]]:
-    """In a worker: decode what a provider sent, put it together, and prepare the version that has it.
+    """Decode the responses, assemble the image and prepare the version that contains it (in a worker).
 
-    Raises CannotDerive for an answer that is no picture of the size that was asked for.
+    Raises CannotDerive if a response is no image of the requested size.
     """
     picture, missing = assemble_image(fetched.sheet, fetched.answers, fetched.attribution, limits)
     warnings = []
     if missing:
-        why = f"the provider has no picture for {missing} of {len(fetched.answers)} parts: they are transparent"
+        why = f"the provider has no picture for {missing} of {len(fetched.answers)} tiles; they are transparent"
         warnings.append(Problem(why))
     inputs = (*fetched.site, {"datum": base.datum.as_dict() if base.datum else None})
     provenance = Provenance("derived", None, (), None, (dict(fetched.provenance_step),), fetched.attribution, inputs)
@@ -493,7 +502,7 @@ def prepare_picture(
 def assemble_image(
     mosaic: Mosaic, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
 ) -> tuple[GeoImage, int]:
-    """(the picture, how many of its parts the provider does not have). CannotDerive where it has none."""
+    """Assemble the image. Returns it and the number of missing tiles. Raises CannotDerive if all are missing."""
     pixels = np.zeros((mosaic.height, mosaic.width, 4), np.uint8)
     missing = 0
     for block, data in zip(mosaic.blocks, answers, strict=True):
@@ -513,7 +522,7 @@ def assemble_image(
 
 
 def _decode_tile(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.uint8]:
-    """An answer's pixels as RGBA: uint8 [height, width, 4]. It is read as an upload is."""
+    """Decode a response like an upload, to RGBA: uint8 [height, width, 4]."""
     end = next(kind for magic, kind in MAGIC.items() if data.startswith(magic))
     name = f"answer.{end}"
     hints = UploadHints(format="satellite", options={"metres_per_pixel": "1"})
@@ -525,7 +534,7 @@ def _decode_tile(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.
     height, width, bands = part.pixels.shape
     if (height, width) != (block.height, block.width) or part.pixels.dtype != np.uint8:
         raise CannotDerive(
-            f"the imagery provider sends a picture of {width} × {height} pixels instead of {block.width} × "
+            f"the imagery provider sends pictures of {width} × {height} pixels instead of {block.width} × "
             f"{block.height}: check FLEETMAP_IMAGERY_TILE_SIZE",
             step=METHOD,
         )

@@ -1,4 +1,4 @@
-"""In a worker: an upload's files -> what it would change. Reads the store, writes nothing."""
+"""Prepare an upload in a worker: files -> change set. Reads the store, writes nothing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Mode = Literal["replace", "merge"]
 
 @dataclass(frozen=True, slots=True)
 class FileNote:
-    """An uploaded file, or a member of an uploaded archive: what it is and whether it is used."""
+    """Uploaded file, or member of an uploaded archive: its format and whether it is used."""
 
     name: str
     format: str | None
@@ -43,7 +43,7 @@ class FileNote:
 
 @dataclass(frozen=True, slots=True)
 class PreparedUpload:
-    """What an upload would change, with all that was doubtful. members: content of unpacked archives."""
+    """Changes that an upload would make, with warnings. members: content of unpacked archives."""
 
     prepared: Prepared
     notes: tuple[FileNote, ...]
@@ -53,7 +53,7 @@ class PreparedUpload:
 
 @lru_cache(maxsize=4)
 def open_store(database_url: str, blob_dir: str) -> Store:
-    """A worker's own view of the store, kept between jobs."""
+    """Open the store in a worker; cached between jobs."""
     return Store(database_url, Path(blob_dir), readonly=True)
 
 
@@ -66,14 +66,16 @@ def prepare_upload(
     mode: Mode,
     limits: Limits,
 ) -> PreparedUpload:
-    """Read spooled files against a version: the version they would make. Raises what ``app.upload_reader.read``
-    raises."""
+    """Read spooled files and prepare the version that they would create on top of ``base``.
+
+    Raises the errors of ``app.upload_reader.read``.
+    """
     store = open_store(database_url, blob_dir)
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = upload_reader.unpack(uploaded, limits)
     upload_bundle = upload_reader.read(files, hints, EnvironmentContext(base.datum, read_fence(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
-    # Sorted, so objects come before the topology that was drawn from them.
+    # Sorted: objects come before the topology that was read from the same drawing.
     operations: list[Operation] = [
         operation_for(store, base, upload_bundle, key, mode, files, renamed) for key in sorted(upload_bundle.parts)
     ]
@@ -87,7 +89,7 @@ def prepare_upload(
     levels: Any = KEEP
     joined_levels = join_levels(base.levels, upload_bundle.levels)
     listed = {level.name for level in joined_levels}
-    # A level that only the upload's ``level`` names lies at 0 m until something tells its elevation.
+    # A level that only the upload's ``level`` names has elevation 0 m until a source states it.
     joined_levels = join_levels(
         joined_levels, [Level(name) for name in sorted({key.level for key in upload_bundle.parts} - listed)]
     )
@@ -101,7 +103,7 @@ def prepare_upload(
 
 
 def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
-    """A voxel map that another file replaces leaves the point cloud behind that it was made of."""
+    """List the point clouds to drop because an upload replaces the voxel map that was built from them."""
     existing_keys = {entry.key for entry in base.parts}
     clouds = [
         PartKey("resources", k.level, cloud_name(k.name)) for k in sorted(upload_bundle.parts) if k.layer == "voxels"
@@ -110,29 +112,29 @@ def _stale_clouds(base: Version, upload_bundle: Bundle) -> list[Drop]:
 
 
 def _unused_hints(hints: UploadHints, upload_bundle: Bundle) -> list[Problem]:
-    """What the sender said and nothing came of, so that a misunderstanding is noticed."""
+    """Warn about upload hints without effect."""
     out = []
     drawings = {f.name for f in formats.all_formats().values() if f.traits.is_drawing}
     if hints.layer is not None and not any(use.format in drawings for use in upload_bundle.files.values()):
-        told_for = ", ".join(sorted(drawings))
-        out.append(Problem(f"it is for drawings ({told_for}), and there is none in the upload", where="layer"))
+        drawing_formats = ", ".join(sorted(drawings))
+        out.append(Problem(f"the upload contains no drawing ({drawing_formats}); layer is ignored", where="layer"))
     if hints.grid is not None and not any(key.layer == "occupancy" for key in upload_bundle.parts):
-        out.append(Problem("there is no grid in the upload to be called so", where="grid"))
+        out.append(Problem("the upload contains no grid; the grid name is ignored", where="grid"))
     return out
 
 
 def prepare_changes(database_url: str, blob_dir: str, base: Version, changes: Changes) -> Prepared:
-    """In a worker: what these changes would make of a version."""
+    """Prepare the version that these changes create on top of ``base`` (in a worker)."""
     return open_store(database_url, blob_dir).versions.prepare(base, changes)
 
 
 MAX_USUAL_METRES = 100_000.0
-"""From the datum. The local frame is exact to a millimetre in 10 km; what lies so far away is most often a mistake."""
+"""Distance from the datum above which a part is suspicious. The local frame is exact to 1 mm within 10 km."""
 _EARTH_RADIUS = 6_371_000.0
 
 
 def distance_warnings(upload_bundle: Bundle, datum: Datum | None) -> list[Problem]:
-    """Parts whose nearest corner is far from the datum: swapped coordinates, or the wrong environment."""
+    """Warn about parts whose nearest corner is far from the datum: swapped coordinates or the wrong environment."""
     out = []
     for key, part in sorted(upload_bundle.parts.items()):
         if not isinstance(part, Features) or not len(part):
@@ -147,8 +149,8 @@ def distance_warnings(upload_bundle: Bundle, datum: Datum | None) -> list[Proble
         if distances and min(distances) > MAX_USUAL_METRES:
             location = f"{key.layer} {key.level}/{key.name}"
             reason = (
-                f"lies about {min(distances) / 1000:.0f} km from the datum: is it the right environment, and are no "
-                "coordinates swapped?"
+                f"about {min(distances) / 1000:.0f} km from the datum; check the environment and the order of the "
+                "coordinates"
             )
             files, _ = upload_bundle.origin.get(key, ((), ""))
             out.append(Problem(reason, files[0] if files else None, where=location))
@@ -156,7 +158,7 @@ def distance_warnings(upload_bundle: Bundle, datum: Datum | None) -> list[Proble
 
 
 def _metres_to(box: NDArray[np.float64], datum: Datum) -> float:
-    """From a datum to the nearest point of a box in degrees [west, south, east, north], about, on a sphere."""
+    """Approximate the distance in metres from a datum to a box [west, south, east, north] in degrees, on a sphere."""
     west, south, east, north = box
     datum_latitude, lat = np.radians(datum.latitude), np.radians(np.clip(datum.latitude, south, north))
     turn = min(abs((datum.longitude - edge + 180.0) % 360.0 - 180.0) for edge in (west, east))
@@ -169,22 +171,22 @@ def _metres_to(box: NDArray[np.float64], datum: Datum) -> float:
 
 
 def datum_moved_warnings(base: Version, datum: Datum) -> list[Problem]:
-    """The warning that belongs to a new datum."""
+    """Build the warning about a moved datum."""
     if base.datum is None:
         return []
     return [
         Problem(
             f"the datum moves from {base.datum.latitude!r}, {base.datum.longitude!r} (heading {base.datum.heading:g}°) "
-            f"to {datum.latitude!r}, {datum.longitude!r} (heading {datum.heading:g}°): local items keep their metres, "
-            "items on earth keep their place, so the two move against each other"
+            f"to {datum.latitude!r}, {datum.longitude!r} (heading {datum.heading:g}°); features with local anchor keep "
+            "their metres, features with wgs84 anchor their degrees, so the two shift against each other"
         )
     ]
 
 
 def read_fence(store: Store, base: Version) -> shapely.Polygon | None:
-    """The fence of a version's location."""
+    """Read the fence of a version's location layer."""
     keys = [e.key for e in base.parts if e.key.layer == "location" and e.count]
-    with contextlib.suppress(Damaged):  # the upload may be the one that heals it
+    with contextlib.suppress(Damaged):  # this upload may repair it
         for part in store.content.load(base, keys).parts.values() if keys else ():
             if isinstance(part, Features) and len(part):
                 polygon: shapely.Polygon = part.geometry[0]
@@ -201,8 +203,10 @@ def operation_for(
     files: Mapping[str, bytes],
     renamed: dict[str, dict[str, str]],
 ) -> Replace | Put:
-    """What becomes of one part. renamed: by level, objects that took a stored one's id; what was drawn from them
-    follows."""
+    """Build the operation that stores one part.
+
+    renamed: by level, objects that took a stored object's id; features read from their drawing follow.
+    """
     part = upload_bundle.parts[key]
     names, origin = upload_bundle.origin[key]
     digest = hashlib.sha256()
@@ -217,7 +221,7 @@ def operation_for(
             part = _rename_drawn_from(part, renamed[key.level])
         if is_stored and key.layer in ("topology", "objects", "zones") and not own_ids:
             ids = part.ids
-            with contextlib.suppress(Damaged):  # then nothing is there to compare with, and the upload's ids stay
+            with contextlib.suppress(Damaged):  # nothing to compare with: keep the upload's ids
                 part = match_ids(store, base, key, part)
             if key.layer == "objects":
                 renamed.setdefault(key.level, {}).update((a, b) for a, b in zip(ids, part.ids, strict=True) if a != b)
@@ -233,7 +237,7 @@ def operation_for(
 
 
 def _rename_drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
-    """A network whose drawing has other ids now."""
+    """Update a network's references to drawn objects that got other ids."""
     properties = tuple(
         {**p, "drawn_from": renamed[p["drawn_from"]]} if p.get("drawn_from") in renamed else p for p in part.properties
     )
@@ -241,8 +245,11 @@ def _rename_drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
 
 
 def _merge_with_stored(store: Store, base: Version, key: PartKey, part: Features) -> Features:
-    """An upload to be merged, with a document that says what the stored part's and its own say: credits of both,
-    bounds around both, and the drawings of both with their styles, also where two have one name."""
+    """Merge the collection documents of the stored part and the upload into the upload's part.
+
+    The result has the credits of both, bounds around both, and the drawings of both with their styles, even if two
+    drawings have the same name.
+    """
     old = store.content.load(base, [key]).parts[key]
     assert isinstance(old, Features)
     for family, new_document in part.document.items():
@@ -263,7 +270,7 @@ def _merge_with_stored(store: Store, base: Version, key: PartKey, part: Features
 
 
 def _free_names(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
-    """Other names for the new drawings that are called like a stored one and are not the same."""
+    """Choose new names for drawings whose name belongs to a different stored drawing."""
     names: dict[str, str] = {}
     for name in sorted(new):
         if name in stored and stored[name] != new[name]:
@@ -298,14 +305,15 @@ def _attribution(part: Part) -> list[str]:
 
 
 def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyGrid:
-    """The new grid's known cells over the old grid's, on a canvas that holds both; unknown cells overwrite nothing.
+    """Merge two grids: known cells of the new grid overwrite the old ones, unknown cells overwrite nothing.
 
-    Both must have one resolution and yaw, and origins a whole number of cells apart (to a hundredth of a cell).
+    The result covers both. Both must have the same resolution and yaw, and origins a whole number of cells apart (to a
+    hundredth of a cell).
     """
     if abs(old.resolution - new.resolution) > 1e-9 or abs(old.origin[2] - new.origin[2]) > 1e-9:
         raise Invalid(
             f"grid {name}: merging needs the stored grid's resolution {old.resolution!r} and yaw {old.origin[2]!r}, "
-            f"the upload has {new.resolution!r} and {new.origin[2]!r}: use mode=replace, or bring them to one"
+            f"the upload has {new.resolution!r} and {new.origin[2]!r}: use mode=replace, or resample the upload"
         )
     yaw, res = old.origin[2], old.resolution
     c, s = np.cos(yaw), np.sin(yaw)

@@ -1,7 +1,7 @@
-"""Repair: damaged files and chunks replaced by the same bytes from elsewhere, which their hashes prove.
+"""Repair damaged blobs and chunks with the same bytes from another source, verified by hash.
 
-Wherever bytes come from (a folder, another server, an upload read again), they are stored only under their own hash. So
-a repair cannot change history, and a wrong source does no harm.
+Bytes from any source (a folder, another server, an upload read again) are stored only under their own hash. So a repair
+cannot change history, and a wrong source does no harm.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from app.store.verify import Finding
 from app.upload_reader import EnvironmentContext, UploadHints
 
 Run = Callable[..., Any]
-"""``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
+"""Runner of a module-level function: ``run(function, *args)`` returns its result (``Pool.run``)."""
 
 
 class Donor(Protocol):
-    """Something that may have what was lost. name: for people."""
+    """Source of bytes for a repair. name: shown to people."""
 
     name: str
 
     def blob(self, sha256: str) -> bytes | None:
-        """A file's content by its hash, if it is there."""
+        """Return a blob's content by its hash, or None."""
         ...
 
     def chunk(self, sha256: str) -> bytes | None:
-        """A chunk's canonical bytes by its hash, if they are there."""
+        """Return a chunk's canonical bytes by its hash, or None."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RecoveredData:
-    """What reading a version's uploads again gives: hash (hex) -> bytes."""
+    """Chunks and blobs recovered from a version's uploads: hash (hex) -> bytes."""
 
     chunks: Mapping[str, bytes]
     blobs: Mapping[str, bytes]
@@ -56,9 +56,9 @@ class RecoveredData:
 def repair(
     store: Store, findings: Iterable[Finding], donors: Sequence[Donor], run: Run, limits: Limits
 ) -> dict[tuple[str, str], str]:
-    """Heal what can be healed: (kind, name) of a finding -> where its bytes came from.
+    """Repair as many findings as possible. Returns the origin of the bytes by (kind, name) of the finding.
 
-    What was only reachable through a lost chunk is found by the next verification.
+    Data that is reachable only through a lost chunk is checked by the next verification.
     """
     blobs = {f.name: f for f in findings if f.kind == "blob"}
     chunks = {f.name: f for f in findings if f.kind == "chunk"}
@@ -86,7 +86,7 @@ def repair(
         try:
             rebuilt: RecoveredData = run(recover_from_uploads, *arguments)
         except FleetMapError:
-            continue  # its uploads cannot be read: the finding stays
+            continue  # the uploads are unreadable: keep the finding
         for data in rebuilt.blobs.values():
             healed["blob", store.blobs.put(data)] = origin
         store.chunks.heal(rebuilt.chunks)
@@ -103,10 +103,10 @@ def recover_from_uploads(
     lost_blobs: Collection[str],
     limits: Limits,
 ) -> RecoveredData:
-    """In a worker: the lost chunks and blobs that the uploaded files of a version give when they are read again.
+    """Recover lost chunks and blobs by reading a version's uploaded files again (in a worker).
 
-    How they were sent (as which layer, under which name) is not stored: the ways that the version's parts suggest are
-    tried until nothing is lost.
+    The upload hints (layer, name) are not stored: those that the version's parts suggest are tried until all data is
+    recovered.
     """
     store = open_store(database_url, blob_dir)
     version, base = store.versions.get_with_base(environment, number)
@@ -125,7 +125,7 @@ def recover_from_uploads(
 
 
 def _uploads(store: Store, version: Version, lost: Collection[str]) -> tuple[dict[str, bytes], dict[str, bytes]]:
-    """The version's uploaded files, unpacked; and the lost ones that its archives have."""
+    """Load the version's uploaded files, unpacked, and the lost blobs found in its archives."""
     files: dict[str, bytes] = {}
     contents: dict[str, bytes] = {}
     for source in version.sources:
@@ -142,7 +142,7 @@ def _uploads(store: Store, version: Version, lost: Collection[str]) -> tuple[dic
 
 
 def _members(data: bytes, sizes: Mapping[str, int]) -> dict[str, bytes]:
-    """The members of an archive that have one of these hashes (hash -> size)."""
+    """Find the members of an archive that have one of these hashes (hash -> size)."""
     out = {}
     unreadable = (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, OSError)
     with contextlib.suppress(*unreadable), zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -157,7 +157,7 @@ def _members(data: bytes, sizes: Mapping[str, int]) -> dict[str, bytes]:
 
 
 def _possible_hints(entries: Sequence[PartEntry]) -> Iterator[UploadHints]:
-    """How the files may have been sent."""
+    """Yield the upload hints that may have been sent with the files."""
     seen = [UploadHints()]
     for entry in entries:
         grid = entry.key.name if entry.key.layer == "occupancy" else None
@@ -176,7 +176,7 @@ def _possible_hints(entries: Sequence[PartEntry]) -> Iterator[UploadHints]:
 def _compose_parts(
     store: Store, version: Version, base: Version | None, files: Mapping[str, bytes], hints: UploadHints, limits: Limits
 ) -> Iterator[tuple[ChunkStage, Mapping[str, bytes]]]:
-    """The chunks and blobs of the parts that files are read as, replaced or merged."""
+    """Yield the chunks and blobs of the parts read from the files, as replaced or merged parts."""
     start = version if base is None else base
     upload_bundle = upload_reader.read(
         files, hints, EnvironmentContext(start.datum or version.datum, read_fence(store, start)), limits

@@ -1,4 +1,4 @@
-"""The service that takes changes in: uploads, edits, reverts, a new datum. One change = one version, or nothing."""
+"""Ingest service: uploads, edits, reverts, datum changes. Each change creates one version or fails as a whole."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from app.store.values import Idempotency, Source, Version
 from app.upload_reader import UploadHints
 
 Run = Callable[..., Any]
-"""``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
+"""Runner of a module-level function: ``run(function, *args)`` returns its result (``Pool.run``)."""
 
 UNCHANGED = "="
-"""Before the fingerprint of a request that changed nothing."""
+"""Prefix of the fingerprint of a request that changed nothing."""
 
 MAX_DEPTH = 128
-"""Of an edit's lists and objects: as deep as GeoJSON files may be, and well within what can be written again."""
+"""Maximum nesting depth of an edit's lists and objects: that of GeoJSON files, so that it can be written again."""
 
 MAX_COMMIT_ATTEMPTS = 50
-"""How often a change without ``If-Match`` is brought onto a head that has moved meanwhile."""
+"""Maximum number of attempts to commit a change without ``If-Match`` while the head moves."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpooledFile:
-    """An uploaded file on disk; ``name`` is the relative path that the client gave."""
+    """Uploaded file on disk; ``name`` is the client's relative path."""
 
     name: str
     path: Path
@@ -56,7 +56,7 @@ class SpooledFile:
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """What a client sent and said of it."""
+    """Uploaded files with the client's hints."""
 
     files: tuple[SpooledFile, ...]
     hints: UploadHints = field(default_factory=UploadHints)
@@ -66,7 +66,7 @@ class Upload:
 
 @dataclass(frozen=True, slots=True)
 class CommitResult:
-    """What became of a change. body: the version as JSON; ``version`` in it is null for a dry run."""
+    """Result of a change. body: the version as JSON; its ``version`` is null for a dry run."""
 
     status: Literal["created", "unchanged", "dry_run", "replayed"]
     version: Version | None
@@ -74,17 +74,17 @@ class CommitResult:
 
 
 class Ingest:
-    """All ways to make a version."""
+    """Operations that create versions."""
 
     def __init__(self, store: Store, run: Run, limits: Limits, provider: online.Provider | None = None) -> None:
         self._store, self._run, self._limits = store, run, limits
         self.provider = provider
 
     def upload(self, environment: str, upload: Upload, commit: CommitRequest) -> CommitResult:
-        """Files -> one version, all or nothing.
+        """Commit uploaded files as one version, or none of them.
 
         Raises BadUpload (nothing is stored), Invalid, StaleParent (``if_match`` names another version), Conflict (the
-        idempotency key was used for something else), Unavailable.
+        idempotency key was used for another request), Unavailable.
         """
         _check_upload(upload)
         key = commit.idempotency(_fingerprint(upload, commit.message))
@@ -105,10 +105,10 @@ class Ingest:
             sources = self._store_sources(upload, proposal)
             return self._commit(environment, base, proposal.prepared, commit, key, proposal.warnings, sources)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "this upload can be taken in")
+        return self._commit_on_head(environment, key, commit.if_match, once, "commit the upload")
 
     def edit(self, environment: str, changes: Sequence[Mapping[str, Any]], commit: CommitRequest) -> CommitResult:
-        """Edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
+        """Commit edits as one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
         if _exceeds_depth(MAX_DEPTH, changes):
             reason = f"nested deeper than {MAX_DEPTH} lists and objects"
             raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
@@ -118,8 +118,10 @@ class Ingest:
     def amend(
         self, environment: str, edits: Callable[[Version], Sequence[Mapping[str, Any]]], commit: CommitRequest
     ) -> CommitResult:
-        """Edits that follow from the version they are made on. Where the head moves meanwhile ``edits`` is asked again,
-        so that nothing of what others wrote is put back; where it finds none, nothing changes.
+        """Commit edits that are computed from the head.
+
+        If the head moves meanwhile, ``edits`` is called again, so that concurrent changes are kept. If it returns no
+        edits, nothing changes.
         """
         return self._edit(environment, edits, commit, None)
 
@@ -138,12 +140,12 @@ class Ingest:
             prepared: Prepared = self._run_in_worker(prepare_changes, base, change_set)
             return self._commit(environment, base, prepared, commit, key, warnings)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "this edit can be taken in")
+        return self._commit_on_head(environment, key, commit.if_match, once, "commit the edit")
 
     def derive(self, environment: str, request: DerivationRequest, commit: CommitRequest) -> CommitResult:
-        """A layer computed from others -> one version.
+        """Derive a layer from others and commit it as one version.
 
-        Raises NotFound, Invalid, CannotConvert, Conflict (a source has told that layer), StaleParent.
+        Raises NotFound, Invalid, CannotConvert, Conflict (the layer was uploaded or edited), StaleParent.
         """
         check_wish(request)
         fingerprint = ["derive", request.method, dict(request.values), request.replace, commit.message]
@@ -156,12 +158,12 @@ class Ingest:
             )
             return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "a layer can be derived")
+        return self._commit_on_head(environment, key, commit.if_match, once, "derive the layer")
 
     def generate(self, environment: str, order: GenerationRequest, commit: CommitRequest) -> CommitResult:
-        """A site made up from parameters and a seed -> one version.
+        """Generate a site from parameters and a seed, and commit it as one version.
 
-        Raises NotFound, Invalid, CannotGenerate, MissingLayer, Conflict (a source has told that part), StaleParent.
+        Raises NotFound, Invalid, CannotGenerate, MissingLayer, Conflict (the part was uploaded or edited), StaleParent.
         """
         generators.check(order.generator, order.seed, order.values)
         fingerprint = ["generate", order.generator, order.seed, dict(order.values), order.replace, commit.message]
@@ -170,23 +172,23 @@ class Ingest:
 
         def once(base: Version) -> CommitResult:
             prepared, warnings = self._run_in_worker(
-                prepare_generation, base, order, failure="the site could not be made"
+                prepare_generation, base, order, failure="the site could not be generated"
             )
             return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "a site can be made up")
+        return self._commit_on_head(environment, key, commit.if_match, once, "generate the site")
 
     def fetch_imagery(self, environment: str, request: DerivationRequest, commit: CommitRequest) -> CommitResult:
-        """A picture of the site from the configured provider -> one version.
+        """Fetch an image of the site from the configured provider and commit it as one version.
 
-        Raises CannotDerive (no provider, or what it sends is of no use), MissingLayer or MissingDatum, Invalid,
+        Raises CannotDerive (no provider, or its response is unusable), MissingLayer or MissingDatum, Invalid,
         Unavailable (the provider is down), Conflict, StaleParent.
         """
         provider = self.provider
         if provider is None:
             raise CannotDerive(
-                "no imagery provider is set up: the operator sets FLEETMAP_IMAGERY_URL, FLEETMAP_IMAGERY_KIND and, "
-                "where it needs one, FLEETMAP_IMAGERY_TOKEN",
+                "no imagery provider is configured: the operator must set FLEETMAP_IMAGERY_URL, FLEETMAP_IMAGERY_KIND "
+                "and, if the provider requires one, FLEETMAP_IMAGERY_TOKEN",
                 step=online.METHOD,
             )
         chosen = parameters.parse(online.Parameters, request.values, f"parameter of {online.METHOD}")
@@ -199,7 +201,7 @@ class Ingest:
             fences = sorted((e for e in base.parts if e.key.layer == "location" and e.count), key=lambda e: e.key)
             site = self._store.content.load(base, [e.key for e in fences])
             sheet = online.plan_mosaic(provider, online.site_box(site, chosen), chosen.resolution)
-            if not fetches or fetches[-1][0] != sheet:  # the same site again: what was fetched still holds
+            if not fetches or fetches[-1][0] != sheet:  # same site: reuse the images
                 fetches.append((sheet, tuple(online.Fetcher(provider).fetch(sheet.blocks))))
             step, lines = provider.provenance_step(chosen), tuple(map(input_line, fences))
             fetched = online.FetchedImagery(sheet, fetches[-1][1], chosen, step, provider.attribution, lines)
@@ -208,12 +210,13 @@ class Ingest:
             )
             return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "a picture can be fetched")
+        return self._commit_on_head(environment, key, commit.if_match, once, "commit the fetched picture")
 
     def align(self, environment: str, request: AlignmentRequest, commit: CommitRequest) -> CommitResult:
-        """A grid laid onto another map -> one version, or only what was found. body: {alignment, version, warnings}.
+        """Align a grid with another map and commit it as one version, unless it is a dry run.
 
-        Raises NotFound, Invalid, CannotConvert (nothing fits), StaleParent.
+        body of the result: {alignment, version, warnings}. Raises NotFound, Invalid, CannotConvert (nothing fits),
+        StaleParent.
         """
         key = commit.idempotency(_digest(["align", dataclasses.asdict(request), commit.message]))
         replayed = None if request.dry_run else self._previous_result(environment, key)
@@ -235,10 +238,10 @@ class Ingest:
                 outcome, body=_alignment_as_json(result.summary, outcome.version, result.warnings)
             )
 
-        return self._commit_on_head(environment, None, commit.if_match, once, "a grid can be aligned")
+        return self._commit_on_head(environment, None, commit.if_match, once, "align the grid")
 
     def revert(self, environment: str, to: int, commit: CommitRequest) -> CommitResult:
-        """A new version with an old one's content."""
+        """Commit a new version with the content of an old one."""
         key = commit.idempotency(_digest(["revert", to, commit.message]))
         text = commit.message or f"Revert to version {to}"
 
@@ -250,10 +253,10 @@ class Ingest:
             )
             return CommitResult("unchanged" if same else "created", version, version.as_dict())
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "it can be reverted")
+        return self._commit_on_head(environment, key, commit.if_match, once, "revert the environment")
 
     def set_datum(self, environment: str, datum: Datum, commit: CommitRequest) -> CommitResult:
-        """A version with another datum: local items keep their metres, wgs84 items their place on earth."""
+        """Commit a version with another datum: local features keep their metres, wgs84 features their degrees."""
 
         def once(base: Version) -> CommitResult:
             if base.datum == datum:
@@ -262,12 +265,12 @@ class Ingest:
             described = commit.with_default_message("Set the datum")
             return self._commit(environment, base, prepared, described, None, datum_moved_warnings(base, datum))
 
-        return self._commit_on_head(environment, None, commit.if_match, once, "its datum can be set")
+        return self._commit_on_head(environment, None, commit.if_match, once, "set the datum")
 
     def template(self, environment: str, update: TemplateUpdate, commit: CommitRequest) -> CommitResult:
-        """What formats ask for and no layer has, said anew -> one version: robots get other maps by it.
+        """Commit new template values as one version, since they change the robots' maps.
 
-        update: checked. Raises StaleParent, Conflict.
+        update: validated. Raises StaleParent, Conflict.
         """
         fingerprint = _digest(["template", update.as_dict(), commit.message])
         key = None if update.dry_run else commit.idempotency(fingerprint)
@@ -279,7 +282,7 @@ class Ingest:
                 return CommitResult("dry_run", None, self._preview(base, prepared, described))
             return self._commit(environment, base, prepared, described, key)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "its templates can be set")
+        return self._commit_on_head(environment, key, commit.if_match, once, "set the templates")
 
     def _commit_on_head(
         self,
@@ -289,9 +292,9 @@ class Ingest:
         once: Callable[[Version], CommitResult],
         task: str,
     ) -> CommitResult:
-        """A change brought onto the head; again where the head has moved meanwhile and no condition forbids it.
+        """Commit a change on the head, and retry if the head moves and no condition forbids it.
 
-        task: for the message, where the head moves each time. The answer that was given to ``key`` before is repeated.
+        task: what to do, for the error if all attempts fail. A repeated ``key`` returns the stored result.
         """
         replayed = self._previous_result(environment, key)
         if replayed is not None:
@@ -304,7 +307,9 @@ class Ingest:
             except StaleParent:
                 if last:
                     raise
-        raise StaleParent(f"{environment} changes faster than {task}: try again")
+        raise StaleParent(
+            f"could not {task}: {environment} changed during each of {MAX_COMMIT_ATTEMPTS} attempts; try again"
+        )
 
     def _commit(
         self,
@@ -317,7 +322,7 @@ class Ingest:
         sources: Sequence[Source] = (),
     ) -> CommitResult:
         if not prepared.changed:
-            # The key is remembered too: sent again after others have changed the map, this must not undo their work.
+            # Store the key too: if the request is repeated after other changes, it must not undo them.
             noted = None if key is None else Idempotency(key.key, UNCHANGED + key.fingerprint)
             same = base
             if noted is not None or sources or prepared.chunks:
@@ -342,7 +347,7 @@ class Ingest:
         return CommitResult("created", version, version.as_dict())
 
     def _previous_result(self, environment: str, key: Idempotency | None) -> CommitResult | None:
-        """The answer that was given to this key before; Conflict where it came with another request."""
+        """Return the stored result for this key. Raises Conflict if the key belongs to another request."""
         if key is None:
             return None
         record = self._store.versions.idempotent(environment, key.key)
@@ -350,13 +355,13 @@ class Ingest:
             return None
         fingerprint, number = record
         if fingerprint.removeprefix(UNCHANGED) != key.fingerprint:
-            raise Conflict(f"the Idempotency-Key {key.key!r} was used for another request: choose a new one")
+            raise Conflict(f"Idempotency-Key {key.key!r} was already used for another request: choose a new one")
         version = self._store.versions.get(environment, number)
         same = fingerprint.startswith(UNCHANGED)
         return CommitResult("unchanged" if same else "replayed", version, version.as_dict())
 
     def _store_sources(self, upload: Upload, proposal: PreparedUpload) -> list[Source]:
-        """Store the originals byte for byte, before the version that names them."""
+        """Store the uploaded files byte for byte, before the version that refers to them."""
         notes = {n.name: n for n in proposal.notes}
         names = [f.name for f in upload.files] + list(proposal.members)
         contents: list[bytes | Path] = [f.path for f in upload.files]
@@ -384,7 +389,7 @@ class Ingest:
         warnings: Sequence[Problem] = (),
         sources: Sequence[Source] = (),
     ) -> dict[str, Any]:
-        """The version that a change would make, without a number."""
+        """Describe the version that a change would create, without a number."""
         preview = Version(
             environment=base.environment,
             number=base.number,
@@ -412,14 +417,14 @@ def _alignment_as_json(
 
 
 def check_if_match(header: str | None, head: Version) -> None:
-    """StaleParent unless the header (``"3"``, ``"<root>"``, a list, or ``*``) names the head."""
+    """Check the If-Match header: ``"3"``, ``"<root>"``, a list, or ``*``. Raises StaleParent if it misses the head."""
     if header is None:
         return
     tags = [t.strip().removeprefix("W/").strip('"') for t in header.split(",")]
     if "*" not in tags and str(head.number) not in tags and head.root not in tags:
         raise StaleParent(
             f"the head of {head.environment} is version {head.number} (root {head.root}), not {header}: "
-            "fetch it, look at what changed, and send the change again on top of it"
+            "fetch it, check what changed, and repeat the change on top of it"
         )
 
 
@@ -431,43 +436,41 @@ def _check_upload(upload: Upload) -> None:
 
 
 def check_file_names(files: Sequence[SpooledFile]) -> None:
-    """Invalid for names that cannot be kept, and for one that is used twice."""
+    """Check names of uploaded files. Raises Invalid for unusable and duplicate names."""
     seen: set[str] = set()
     for file in files:
         problem = name_problem(file.name)
         if problem is None and file.name in seen:
-            problem = "this name is used twice"
+            problem = "duplicate name"
         if problem:
-            raise Invalid(
-                f"the file name {file.name[:200]!r} cannot be used: {problem}", [Problem(problem, file.name[:200])]
-            )
+            raise Invalid(f"invalid file name {file.name[:200]!r}: {problem}", [Problem(problem, file.name[:200])])
         seen.add(file.name)
 
 
 def check_grid_name(grid: str | None) -> None:
-    """Invalid unless a file can be called so: a grid ``keepout`` is served as ``keepout.yaml``."""
+    """Check that a grid name is usable in file names: ``keepout`` becomes ``keepout.yaml``. Raises Invalid."""
     if grid is None:
         return
     problem = name_problem(grid)
     if problem is None and "/" in grid:
-        problem = "it has a slash"
+        problem = "it must not contain a slash"
     if problem is None and grid.startswith("."):
-        problem = "it starts with a dot"
+        problem = "it must not start with a dot"
     if problem is None and len(grid) > 100:
-        problem = "it has more than 100 characters"
+        problem = "it must have at most 100 characters"
     if problem:
         raise Invalid(
-            f"the grid cannot be called {grid[:100]!r}: {problem}, and its files are called like it",
+            f"invalid grid name {grid[:100]!r}: {problem}, since file names contain it",
             [Problem(problem, where="grid")],
         )
 
 
 def name_problem(name: str) -> str | None:
-    """Why an uploaded file may not be called this, or None. Names are relative paths with forward slashes."""
+    """Return why a name of an uploaded file is invalid, or None. Names are relative paths with forward slashes."""
     if not name or len(name) > 1024:
         return "it must have 1 to 1024 characters"
     if not name.isprintable():
-        return "it has control characters"
+        return "it must not contain control characters"
     if "\\" in name or name.startswith("/") or (len(name) > 1 and name[1] == ":"):
         return "it must be a relative path with forward slashes"
     if any(part in ("", ".", "..") for part in name.split("/")):
@@ -476,7 +479,7 @@ def name_problem(name: str) -> str | None:
 
 
 def _tries(if_match: str | None) -> list[bool]:
-    """For each try, whether it is the last: with a condition there is only one."""
+    """Return for each attempt whether it is the last: with a condition there is only one."""
     count = 1 if if_match not in (None, "*") else MAX_COMMIT_ATTEMPTS
     return [k == count - 1 for k in range(count)]
 
@@ -489,7 +492,7 @@ def _fingerprint(upload: Upload, message: str) -> str:
 
 
 def _exceeds_depth(limit: int, value: Any) -> bool:
-    """Whether lists and mappings lie in one another more often than this."""
+    """Return whether lists and mappings are nested deeper than ``limit``."""
     front = [value]
     for _ in range(limit):
         front = [

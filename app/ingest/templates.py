@@ -1,4 +1,4 @@
-"""What an environment fills in where no layer tells it: checked, and joined with what it said before."""
+"""Template updates of an environment: validate them and merge them with its templates."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from app.model.templates import FormatTemplate, Templates
 
 @dataclass(frozen=True, slots=True)
 class TemplateUpdate:
-    """What is to be said from now on. set: the environment's; None: it stays. formats: what is said of these, instead
-    of all that was; an empty one takes it back. clear: also forget all that is not named here."""
+    """Update of an environment's templates.
+
+    set: template set of the environment; None keeps the current one. formats: new templates of these formats, replacing
+    all previous ones; an empty one resets the format. clear: also reset everything not named here.
+    """
 
     set: str | None = None
     formats: Mapping[str, FormatTemplate] = field(default_factory=dict)
@@ -21,9 +24,10 @@ class TemplateUpdate:
     dry_run: bool = False
 
     def validated(self, location: str = "body.formats.{}") -> TemplateUpdate:
-        """The same with typed values. NotFound for a format, Invalid for a set or values that there are none of.
+        """Return the update with typed values.
 
-        location: the place of a format's templates in the request.
+        location: the place of a format's templates in the request. Raises NotFound for an unknown format, Invalid for
+        an unknown set or unknown values.
         """
         if self.set is not None:
             templates.check_set(self.set, "body.set")
@@ -38,7 +42,7 @@ class TemplateUpdate:
         return TemplateUpdate(self.set, out, self.clear, self.dry_run)
 
     def apply_to(self, old: Templates) -> Templates:
-        """What holds then."""
+        """Return the templates after the update."""
         new = Templates() if self.clear else old
         new = Templates(self.set or new.set, new.formats)
         for name, format_template in self.formats.items():
@@ -46,15 +50,15 @@ class TemplateUpdate:
         return new
 
     def summary(self) -> str:
-        """In a few words, for the history."""
+        """Summarise the update as a version message."""
         parts = [] if self.set is None else [f"the set {self.set}"]
         parts += [
-            name if format_template.as_dict() else f"{name} taken back"
+            name if format_template.as_dict() else f"{name} reset"
             for name, format_template in sorted(self.formats.items())
         ]
-        return f"Templates: {', '.join(parts) or ('taken back' if self.clear else 'as before')}"
+        return f"Templates: {', '.join(parts) or ('reset' if self.clear else 'unchanged')}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For a fingerprint of the request."""
+        """Return the update as JSON, for a fingerprint of the request."""
         format_templates = {name: format_template.as_dict() for name, format_template in self.formats.items()}
         return {"set": self.set, "formats": format_templates, "clear": self.clear}

@@ -1,1 +1,1 @@
-"""How bytes are read and written, whatever they mean: JSON, YAML, XML, RON, images, archives, shell variables."""
+"""Readers and writers of file syntaxes: JSON, YAML, XML, RON, images, archives, shell variables."""

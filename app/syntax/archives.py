@@ -1,8 +1,8 @@
 """Safe ZIP reading and deterministic writing, for KMZ and for uploads of a zipped folder.
 
-Nothing is ever extracted by name: an archive becomes a mapping of names to bytes in memory. The central directory and
-every local header are read here rather than by ``zipfile``, because the two must agree and ``zipfile`` lets them
-differ. An archive inside an archive stays bytes. Layout: PKWARE APPNOTE 6.3.
+Nothing is extracted to disk: an archive becomes a mapping of names to bytes in memory. The central directory and every
+local header are parsed here instead of by ``zipfile``, because the two must agree and ``zipfile`` allows differences.
+Nested archives stay bytes. Layout: PKWARE APPNOTE 6.3.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ _TEXTS = (
     *(".yaml", ".yml", ".json", ".geojson", ".ron", ".lif", ".tmap2", ".tmap", ".csv"),
 )
 _TEXT_COST = 2
-"""What parsing a text costs beside keeping other content: it must compress by this factor less. Real ones reach 40."""
+"""Divisor of the allowed compression ratio for text, which costs more memory when parsed. Real text reaches 40."""
 _IMAGES = (".pgm", ".ppm", ".pnm", ".pbm", ".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 _ARRAY = re.compile(r"(?:.*/)?config/fleet_map/[0-9]+\.bin")
-"""The cells and voxels of an environment package: as large as images, and as uniform."""
+"""Names of the cells and voxels of an environment package, which are as large and uniform as images."""
 
 _LIMITS = Limits()
 _DENSE_RATIO = 40
-"""How far written content may be compressed beyond the free bytes: less than half of what ``unpack`` accepts."""
+"""Maximum compression ratio of written content beyond the free bytes: less than half of what ``unpack`` accepts."""
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """A member as the central directory tells it. start: of its local header."""
+    """Member as described by the central directory. start: offset of its local header."""
 
     name: str
     raw_name: bytes
@@ -75,15 +75,15 @@ class _Entry:
 
 
 def is_archive(data: bytes) -> bool:
-    """Whether the bytes look like a ZIP archive (also an empty one)."""
+    """Return whether the bytes look like a ZIP archive (also an empty one)."""
     return data[:4] in (b"PK\x03\x04", b"PK\x05\x06")
 
 
 def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
-    """The archive's files in the order of its central directory; folders are left out.
+    """Unpack an archive's files in the order of its central directory, without folders.
 
     Raises UnsafeArchive (links, devices, encryption, overlaps, colliding or escaping names, headers that disagree),
-    TooLarge (more files or bytes than ``limits`` allow; real output is counted) or
+    TooLarge (more files or bytes than ``limits`` allow; actual output is counted) or
     UnreadableFile (not a ZIP archive, damaged, an unknown compression).
     """
     entries, directory = _entries(data, limits)
@@ -102,9 +102,9 @@ def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
 
 
 def _check_sizes(entries: list[_Entry], packed: int, limits: Limits) -> None:
-    """Refuse what unfolds to too much for what it is: a text to be parsed, an image, or anything else.
+    """Check the declared sizes against the limits of text, images and other content. Raises TooLarge.
 
-    ``_inflate_pieces`` counts what really comes out and stops at the declared size.
+    ``_inflate_pieces`` counts the actual output and stops at the declared size.
     """
     images = [e for e in entries if _is_image(e.name)]
     for e in entries:
@@ -132,14 +132,14 @@ def _is_image(name: str) -> bool:
 def _too_large_error(size: int, bound: int, limit: str, location: str | None = None, noun: str = "") -> TooLarge:
     prefix = f"{location}: " if location else ""
     reason = f"declares {size} bytes{noun}; {limit} is {bound}"
-    return TooLarge(f"the archive unfolds to too much: {prefix}{reason}", [Problem(reason, where=location)])
+    return TooLarge(f"the uncompressed archive is too large: {prefix}{reason}", [Problem(reason, where=location)])
 
 
 def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
-    """A ZIP archive of the files: the entry ``first`` leads, the others follow by name; equal files, equal bytes.
+    """Create a ZIP archive: the entry ``first`` leads, the others follow by name; equal files give equal bytes.
 
-    Time stamps and permissions are constants; a file that deflating does not shrink is stored, and one that it
-    shrinks further than ``unpack`` accepts. Raises ValueError for a name that ``unpack`` would refuse.
+    Time stamps and permissions are constant. A file is stored uncompressed if deflate does not shrink it, or shrinks
+    it further than ``unpack`` accepts. Raises ValueError for a name that ``unpack`` would reject.
     """
     out = io.BytesIO()
     free = {True: _LIMITS.pixels // 2, False: UNPACKED_FREE_BYTES // 2}
@@ -147,7 +147,7 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
         for name in sorted(files, key=lambda n: (n != first, n)):
             reason = name_problem(name)
             if reason or name.endswith("/"):
-                raise ValueError(f"{name!r} cannot be a name in an archive: it {reason or 'names a folder'}")
+                raise ValueError(f"invalid name in an archive: {name!r} {reason or 'names a folder'}")
             info = zipfile.ZipInfo(name, _EPOCH)
             info.create_system = 3
             info.external_attr = (stat.S_IFREG | 0o644) << 16
@@ -164,7 +164,7 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
 
 def _unsafe_error(reason: str, location: str | None = None) -> UnsafeArchive:
     prefix = f"{location}: " if location else ""
-    detail = f"unsafe archive: {prefix}{reason}; pack it anew with plain files"
+    detail = f"unsafe archive: {prefix}{reason}; pack it again with plain files"
     return UnsafeArchive(detail, [Problem(reason, where=location)])
 
 
@@ -174,24 +174,24 @@ def _damaged_error(reason: str, location: str | None = None) -> UnreadableFile:
 
 
 def _read_end_record(data: bytes) -> tuple[int, int, int]:
-    """Number of entries, start of the central directory, and its end."""
+    """Return the number of entries, and the start and end of the central directory."""
     offset = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16))
     while offset >= 0:
         if offset + _END.size <= len(data) and offset + _END.size + _END.unpack_from(data, offset)[7] == len(data):
             break
         offset = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16), offset + 3) if offset else -1
     if offset < 0:
-        raise _damaged_error("it has no end of central directory (is it cut off?)")
+        raise _damaged_error("no end of central directory; the file may be truncated")
     _, disk, first_disk, disk_count, count, size, start, _ = _END.unpack_from(data, offset)
     stop = offset
     at64 = offset - _LOCATOR64.size
     if at64 >= 0 and data[at64 : at64 + 4] == b"PK\x06\x07":
         _, end_disk, end_at, disks = _LOCATOR64.unpack_from(data, at64)
         if end_disk or disks > 1 or end_at + _END64.size > at64 or data[end_at : end_at + 4] != b"PK\x06\x06":
-            raise _damaged_error("its ZIP64 end of central directory is not where it says")
+            raise _damaged_error("wrong position of its ZIP64 end of central directory")
         _, length, _, _, disk64, first64, here64, count64, size64, start64 = _END64.unpack_from(data, end_at)
         if end_at + 12 + length != at64:
-            raise _damaged_error("its ZIP64 end of central directory has another length than it says")
+            raise _damaged_error("wrong length of its ZIP64 end of central directory")
         for small, large, mask in (
             (disk, disk64, _MASK16),
             (first_disk, first64, _MASK16),
@@ -214,24 +214,24 @@ def _read_end_record(data: bytes) -> tuple[int, int, int]:
     if disk or first_disk or disk_count != count:
         raise _damaged_error("it is one part of a split archive: join the parts first")
     if start + size != stop:
-        raise _damaged_error("its central directory is not where it says")
+        raise _damaged_error("wrong position of its central directory")
     return count, start, stop
 
 
 def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
-    """The members in the directory's order, and where the directory starts."""
+    """Return the members in the directory's order, and the start of the directory."""
     if not is_archive(data):
-        raise _damaged_error("it does not start like one")
+        raise _damaged_error("missing signature at its start")
     count, start, stop = _read_end_record(data)
     if count > limits.files:
         raise TooLarge(
-            f"the archive has {count} members; the limit is {limits.files}",
+            f"too many members in the archive: {count}, the limit is {limits.files}",
             [Problem(f"{count} members; the limit is {limits.files}")],
         )
     out, offset = [], start
     for _ in range(count):
         if offset + _CENTRAL.size > stop:
-            raise _damaged_error("its central directory is shorter than it says")
+            raise _damaged_error("its central directory is shorter than declared")
         head = _CENTRAL.unpack_from(data, offset)
         (
             mark,
@@ -275,7 +275,7 @@ def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
 
 
 def _extra(block: bytes) -> dict[int, bytes]:
-    """The extra fields by number. What is left over at the end is ignored, as every reader does."""
+    """Parse the extra fields by number. Incomplete bytes at the end are ignored, as by other readers."""
     out: dict[int, bytes] = {}
     offset = 0
     while offset + 4 <= len(block):
@@ -288,13 +288,13 @@ def _extra(block: bytes) -> dict[int, bytes]:
 
 
 def _wide(extra: Mapping[int, bytes]) -> tuple[int, ...]:
-    """The 8-byte numbers of the ZIP64 field, in the order of the masked fields."""
+    """Return the 8-byte numbers of the ZIP64 field, in the order of the masked fields."""
     body = extra.get(_ZIP64, b"")
     return struct.unpack_from(f"<{len(body) // 8}Q", body)
 
 
 def _decode(raw: bytes, flags: int, system: int, extra: Mapping[int, bytes]) -> str:
-    """A member's name: UTF-8 where flagged or told in the Unicode path field, or where a Unix host packed it."""
+    """Decode a member's name: UTF-8 if flagged, in the Unicode path field, or packed on a Unix host."""
     path = extra.get(_UNICODE_PATH, b"")
     try:
         if flags & _UTF8:
@@ -308,11 +308,11 @@ def _decode(raw: bytes, flags: int, system: int, extra: Mapping[int, bytes]) -> 
                 pass
         return raw.decode("cp437")
     except UnicodeDecodeError:
-        raise _unsafe_error("has a name that is not the UTF-8 it says", repr(raw[:80])) from None
+        raise _unsafe_error("has a name that is declared as UTF-8 but is not", repr(raw[:80])) from None
 
 
 def _check_names(entries: list[_Entry]) -> None:
-    """Refuse whatever could escape, collide on some file system, or not be a plain file."""
+    """Reject names that escape the archive or collide on some file system, and members other than plain files."""
     seen: dict[str, _Entry] = {}
     for e in entries:
         reason = name_problem(e.name)
@@ -322,45 +322,45 @@ def _check_names(entries: list[_Entry]) -> None:
             raise _unsafe_error("is encrypted", e.name)
         kind = stat.S_IFMT(e.mode)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR) or (kind and (kind == stat.S_IFDIR) != e.is_folder):
-            raise _unsafe_error("is a link, a device or a folder in disguise", e.name)
+            raise _unsafe_error("is a link, a device or a disguised folder", e.name)
         if e.is_folder and e.size:
             raise _unsafe_error("is a folder with content", e.name)
         if e.method not in (_STORED, _DEFLATED):
             raise UnreadableFile(
-                f"{e.name} is packed by method {e.method}; only stored and deflated members are read: pack it anew",
-                [Problem(f"compression method {e.method} is not known", where=e.name)],
+                f"unsupported compression method {e.method} of {e.name}: pack the archive with deflate or uncompressed",
+                [Problem(f"unsupported compression method {e.method}", where=e.name)],
             )
         key = _fold(e.name)
         if key in seen:
-            raise _unsafe_error("has a name that another member has too (on some computers)", e.name)
+            raise _unsafe_error("has the same name as another member (on some file systems)", e.name)
         seen[key] = e
     files = {key for key, e in seen.items() if not e.is_folder}
     for key, e in seen.items():
         cut = key.find("/")
         while cut >= 0:
             if key[:cut] in files:
-                raise _unsafe_error("lies in a folder that is also a file", e.name)
+                raise _unsafe_error("is in a folder that is also a file", e.name)
             cut = key.find("/", cut + 1)
 
 
 def _fold(name: str) -> str:
-    """What two names have in common when a file system cannot hold both."""
+    """Fold a name so that names which collide on some file system become equal."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name.removesuffix("/")).casefold())
 
 
 def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
-    """Start of a member's data, and the end of all that is its own; its local header must agree."""
+    """Return the start of a member's data and the end of its bytes. Its local header must match the directory."""
     if e.start + _LOCAL.size > directory:
-        raise _damaged_error("it is not where the directory says", e.name)
+        raise _damaged_error("not found at its position in the directory", e.name)
     mark, _, flags, method, _, _, crc, packed, size, n_name, n_extra = _LOCAL.unpack_from(data, e.start)
     if mark != b"PK\x03\x04":
-        raise _damaged_error("it is not where the directory says", e.name)
+        raise _damaged_error("not found at its position in the directory", e.name)
     begin = e.start + _LOCAL.size
     extra = _extra(data[begin + n_name : begin + n_name + n_extra])
     start = begin + n_name + n_extra
     end = start + e.packed
     if end > directory:
-        raise _damaged_error("it ends beyond the archive's data", e.name)
+        raise _damaged_error("ends beyond the archive's data", e.name)
     later = bool(e.flags & _DESCRIPTOR)
     wide = _wide(extra)
     if size == _MASK32 and packed == _MASK32 and len(wide) >= 2:
@@ -388,7 +388,7 @@ def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
 
 
 def _inflate(data: bytes, e: _Entry, start: int) -> bytes:
-    """A member's content, never more than it declares."""
+    """Decompress a member, up to its declared size."""
     packed = memoryview(data)[start : start + e.packed]
     body = bytes(packed) if e.method == _STORED else _inflate_pieces(packed, e)
     if zlib.crc32(body) != e.crc:
@@ -397,7 +397,7 @@ def _inflate(data: bytes, e: _Entry, start: int) -> bytes:
 
 
 def _inflate_pieces(packed: memoryview, e: _Entry) -> bytes:
-    """Unpack in pieces, so that neither the input is copied again and again nor the output grows beyond its size."""
+    """Decompress in pieces, to avoid copies of the input and output beyond the declared size."""
     unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
     parts, total = [], 0
     for offset in range(0, len(packed), _CHUNK):
@@ -412,12 +412,12 @@ def _inflate_pieces(packed: memoryview, e: _Entry) -> bytes:
             total += len(part)
             parts.append(part)
             if total > e.size:
-                raise _unsafe_error(f"unfolds to more than the {e.size} bytes it declares", e.name)
+                raise _unsafe_error(f"decompresses to more than its declared {e.size} bytes", e.name)
             if not piece and len(part) < limit:
                 break
         if unpacker.eof:
             spare = len(unpacker.unused_data) + max(0, len(packed) - offset - _CHUNK)
             if total != e.size or spare:
-                raise _unsafe_error("has another size than it declares", e.name)
+                raise _unsafe_error("differs from its declared size", e.name)
             return b"".join(parts)
-    raise _damaged_error("its data is cut off", e.name)
+    raise _damaged_error("truncated data", e.name)

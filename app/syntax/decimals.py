@@ -1,4 +1,4 @@
-"""Numbers as text, the same on every machine: rounded to 1e-9 m or 1e-12 degrees before printing."""
+"""Format numbers reproducibly on every machine: rounded to 1e-9 m or 1e-12 degrees before printing."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 METRES = 9
 DEGREES = 12
-"""Decimals to round to: a nanometre, and a tenth of a micrometre on the ground."""
+"""Decimals to round metres and degrees to: 1 nm, and 0.1 µm on the ground."""
 
 _WHOLE = 2.0**53
-"""From here on a float has no decimals, and rounding would overflow on the way."""
+"""Smallest float without decimals: rounding larger ones would overflow."""
 
 
 def number(value: float, decimals: int = METRES) -> str:
-    """The shortest text that reads back as the rounded value; always with a point or an exponent, never ``-0.0``."""
+    """Format the shortest text of the rounded value; always with a point or an exponent, never ``-0.0``."""
     return repr(round(float(value), decimals) + 0.0)
 
 
 def numbers(values: NDArray[np.float64] | Iterable[float], decimals: int = METRES) -> list[str]:
-    """The same for many values at once."""
+    """Format many values like ``number``."""
     exact = np.asarray(values, np.float64)
     rounded = np.round(np.clip(exact, -_WHOLE, _WHOLE), decimals) + 0.0
     large = np.abs(exact) >= _WHOLE
@@ -32,9 +32,9 @@ def numbers(values: NDArray[np.float64] | Iterable[float], decimals: int = METRE
 
 
 def encode_pieces(pieces: list[str]) -> bytes:
-    """The pieces as UTF-8, one after the other. The list is emptied meanwhile, so that no text is held twice."""
+    """Encode the pieces as UTF-8 and join them. Empties the list, so that no text is in memory twice."""
     pieces.reverse()
-    out = BytesIO()  # whose content is taken out without a copy
+    out = BytesIO()  # getvalue returns its buffer without a copy
     while pieces:
         out.write(pieces.pop().encode())
     return out.getvalue()

@@ -1,7 +1,7 @@
-"""GeoTIFF read and written by GDAL, from and to memory: what the given bytes hold, and nothing else.
+"""Read and write GeoTIFF with GDAL, in memory only.
 
-Only the GTiff driver is let at an upload, by bytes in memory: no sidecar, no VRT, no address of it is ever opened.
-Size and memory are checked by the header, before a pixel is decoded.
+GDAL opens uploads only with the GTiff driver, from bytes in memory: never a sidecar file, VRT or URL. Size and memory
+are checked from the header before pixels are decoded.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from app.model.imagery import LOCAL, Affine, GeoImage
 NO_TRANSFORM: Affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 BLOCK = 512
-"""Pixels along each side of a written tile."""
+"""Side of a written tile, in pixels."""
 
 OWN_TAG = "FLEETMAP_CRS"
-"""Our own metadata item: ``local`` where the coordinates are metres of the local frame, which no CRS names."""
+"""Private metadata item: ``local`` if the coordinates are metres of the local frame, which has no CRS."""
 
 MAX_WKT = 2**16
-"""Characters. PROJ's largest definitions have a tenth of it."""
+"""Maximum length of a CRS definition, in characters: ten times PROJ's longest."""
 
 MEMORY_DIVISOR = 3
-"""Decoded pixels may fill this part of a worker's memory, since the rest is needed to keep and write them."""
+"""Divisor: decoded pixels may use 1/3 of a worker's memory, since storing and writing them needs the rest."""
 
 GEO_TAGS = frozenset({33550, 33922, 34264, 34735})
-"""ModelPixelScale, ModelTiepoint, ModelTransformation, GeoKeyDirectory (OGC 19-008r4)."""
+"""TIFF tags ModelPixelScale, ModelTiepoint, ModelTransformation, GeoKeyDirectory (OGC 19-008r4)."""
 GDAL_METADATA = 42112
 MAX_TAGS = 4096
 MAX_PAGES = 1000
-"""Overviews and masks are pages too: real files have up to about thirty."""
+"""Maximum number of pages. Overviews and masks are pages, too: real files have up to about thirty."""
 
 CRS_NAME = re.compile(r"(EPSG|ESRI|IAU_\d{4}):\d{1,7}|OGC:CRS84", re.IGNORECASE)
 
@@ -52,7 +52,7 @@ _MEMORY_NAME = re.compile(r"/vsimem/[0-9a-f-]+/[0-9a-f-]+\.tif(?:, band \d+)?:?\
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """A decoded TIFF. transform, crs: None where it has none; properties: as ``GeoImage`` has them, with its tags."""
+    """Decoded TIFF. transform, crs: None if it has none. properties: as in ``GeoImage``, with the file's tags."""
 
     pixels: NDArray[Any]
     transform: Affine | None
@@ -61,14 +61,14 @@ class Raster:
     doubts: tuple[str, ...] = ()
 
 
-# --- telling ------------------------------------------------------------------------------------------------------
+# --- detection ----------------------------------------------------------------------------------------------------
 def is_tiff(data: bytes) -> bool:
-    """By the first bytes: TIFF or BigTIFF, in either byte order."""
+    """Detect TIFF or BigTIFF, in either byte order, by the first bytes."""
     return data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 def is_georeferenced(data: bytes) -> bool:
-    """Whether the first page of a TIFF says where it lies, by its tags alone."""
+    """Return whether the first page of a TIFF has georeferencing tags."""
     tags = _tags(data)
     if GEO_TAGS & tags.keys():
         return True
@@ -77,14 +77,14 @@ def is_georeferenced(data: bytes) -> bool:
 
 
 MAX_BANDS = 1024
-"""Hyperspectral images have a few hundred; GDAL needs milliseconds for each, whatever its size."""
+"""Maximum number of bands: hyperspectral images have a few hundred, and GDAL needs milliseconds for each."""
 
 GEO_KEYS = 34735
 GEOGRAPHIC, PROJECTED, USER_DEFINED = 2048, 3072, 32767
 
 
 def read_epsg_code(data: bytes) -> int | None:
-    """The EPSG code that the first page of a TIFF says it lies in; None where it says none, or defines its own.
+    """Read the EPSG code of the first page of a TIFF; None if it has none or defines its own CRS.
 
     Source: OGC GeoTIFF 1.1, section 7.
     """
@@ -100,7 +100,7 @@ def read_epsg_code(data: bytes) -> int | None:
 
 
 def _tags(data: bytes) -> dict[int, tuple[int, int]]:
-    """The first page's tags: number -> (offset, count); none where the file is damaged."""
+    """Read the first page's tags: number -> (offset, count); empty if the file is damaged."""
     page = next(_pages(data), None)
     if page is None:
         return {}
@@ -115,8 +115,10 @@ def _tags(data: bytes) -> dict[int, tuple[int, int]]:
 
 
 def _pages(data: bytes) -> Iterator[tuple[str, bool, int, int]]:
-    """Each page of a TIFF as (byte order, whether it is a BigTIFF, where its tags start, how many), up to the first
-    damage; endless where they form a loop."""
+    """Yield each page of a TIFF as (byte order, whether it is a BigTIFF, offset of its tags, number of tags).
+
+    Stops at the first damage; endless if the pages form a loop.
+    """
     if not is_tiff(data):
         return
     order = "<" if data[:2] == b"II" else ">"
@@ -135,8 +137,10 @@ def _pages(data: bytes) -> Iterator[tuple[str, bool, int, int]]:
 
 # --- GDAL ---------------------------------------------------------------------------------------------------------
 def crs_name(crs: Any) -> str:
-    """A CRS of rasterio as pictures name it: ``EPSG:32630`` where that is exactly it, else WKT; ``local`` for one that
-    is not tied to the earth. Raises UnreadableFile for one that would make PROJ open files."""
+    """Name a CRS of rasterio: ``EPSG:32630`` if that is equal, else WKT; ``local`` for an engineering CRS.
+
+    Raises UnreadableFile for one that would make PROJ open files.
+    """
     authority = crs.to_authority(confidence_threshold=100)
     if authority:
         name = ":".join(authority)
@@ -148,37 +152,37 @@ def crs_name(crs: Any) -> str:
 
 
 def check_wkt(text: str) -> None:
-    """Refuse a definition that is too long, or that names files (grids of shifts) of this machine."""
+    """Check a CRS definition. Raises UnreadableFile if it is too long or refers to local files (grid shifts)."""
     if len(text) > MAX_WKT:
-        raise UnreadableFile(f"the definition of its CRS has {len(text)} characters; the limit is {MAX_WKT}")
+        raise UnreadableFile(f"its CRS definition is too long: {len(text)} characters, the limit is {MAX_WKT}")
     for grids in re.findall(r"grids\s*=\s*([^\s\"]*)", text, re.IGNORECASE):
         if grids != "@null":
-            raise UnreadableFile("the definition of its CRS names a grid file: state it as EPSG:<number>")
+            raise UnreadableFile("its CRS definition refers to a grid file: specify it as EPSG:<number>")
 
 
 def crs_from_wkt(text: str) -> str:
-    """The name of a CRS that is given as WKT (a .prj file). Raises UnreadableFile."""
+    """Name a CRS that is given as WKT (a .prj file). Raises UnreadableFile."""
     check_wkt(text)
     with gdal() as rasterio:
         try:
             return crs_name(rasterio.crs.CRS.from_wkt(text.strip()))
         except rasterio.errors.CRSError as error:
-            raise UnreadableFile(f"its CRS cannot be read: {_reason(error)}") from error
+            raise UnreadableFile(f"invalid CRS: {_reason(error)}") from error
 
 
 def position_problem(picture: GeoImage) -> str | None:
-    """Why a picture has no place, beyond the local frame or where PROJ knows none on earth; None where it has one."""
+    """Return why an image's position is invalid: outside the local frame, or outside its CRS; else None."""
     ends = picture.outline()
     if picture.crs == LOCAL:
         beyond = not (np.abs(ends) <= MAX_METRES).all()
-        return f"it reaches beyond ±{MAX_METRES:g} m of the local frame" if beyond else None
+        return f"it extends beyond ±{MAX_METRES:g} m of the local frame" if beyond else None
     if not np.isfinite(ends).all() or crs_bounds(picture.crs, ends) is None:
-        return f"{picture.crs if len(picture.crs) <= 40 else 'its CRS'} places it nowhere on earth"
+        return f"its coordinates are outside the area of {picture.crs if len(picture.crs) <= 40 else 'its CRS'}"
     return None
 
 
 def _reason(error: BaseException) -> str:
-    """What GDAL said first of all, without the names it has for memory."""
+    """Return GDAL's first error message, without its names of in-memory files."""
     message = str(error)
     while (deeper := error.__cause__ or error.__context__) is not None and str(deeper):
         error, message = deeper, str(deeper)
@@ -188,7 +192,7 @@ def _reason(error: BaseException) -> str:
 
 # --- reading ------------------------------------------------------------------------------------------------------
 def read_tiff(data: bytes, limits: Limits) -> Raster:
-    """A TIFF's first page, decoded. Raises UnreadableFile or TooLarge, before anything large is allocated."""
+    """Decode a TIFF's first page. Raises UnreadableFile or TooLarge before anything large is allocated."""
     from rasterio._err import CPLE_BaseError
     from rasterio.io import MemoryFile
 
@@ -203,10 +207,10 @@ def read_tiff(data: bytes, limits: Limits) -> Raster:
         except BadUpload:
             raise
         except errors as error:
-            raise UnreadableFile(f"the TIFF is damaged or of a kind that is not read: {_reason(error)}") from error
+            raise UnreadableFile(f"the TIFF is damaged or of an unsupported kind: {_reason(error)}") from error
     code = read_epsg_code(data)
-    if code is not None and raster.crs in (None, LOCAL):  # what GDAL makes of a code that it does not know
-        reason = f"its GeoTIFF keys name EPSG:{code}, and no CRS that is known comes of them: correct them"
+    if code is not None and raster.crs in (None, LOCAL):  # GDAL's result for an unknown code
+        reason = f"unknown CRS EPSG:{code} in its GeoTIFF keys: correct them"
         raise UnreadableFile(reason, [Problem(reason, where="crs")])
     return raster
 
@@ -215,16 +219,16 @@ def _check_size(dataset: Any, limits: Limits) -> None:
     width, height, count = dataset.width, dataset.height, dataset.count
     kinds = sorted(set(dataset.dtypes))
     if width < 1 or height < 1 or count < 1:
-        raise UnreadableFile(f"the TIFF says it has {width} × {height} pixels in {count} bands")
+        raise UnreadableFile(f"invalid size of the TIFF: {width} × {height} pixels in {count} bands")
     if width * height > limits.pixels:
         raise TooLarge(
-            f"the TIFF says it has {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
+            f"the TIFF declares {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
             "(FLEETMAP_MAX_PIXELS)"
         )
     if count > MAX_BANDS:
-        raise TooLarge(f"the TIFF says it has {count} bands; the limit is {MAX_BANDS}")
+        raise TooLarge(f"the TIFF declares {count} bands; the limit is {MAX_BANDS}")
     if len(kinds) != 1 or kinds[0] not in DATA_TYPES:
-        raise UnreadableFile(f"the TIFF's pixels are {', '.join(kinds)}; whole and floating numbers are read")
+        raise UnreadableFile(f"unsupported pixel type of the TIFF: {', '.join(kinds)}; use integers or floats")
     size = width * height * count * np.dtype(kinds[0]).itemsize
     limit = limits.memory_bytes // MEMORY_DIVISOR
     if size > limit:
@@ -235,7 +239,7 @@ def _decode(dataset: Any, rasterio: Any) -> Raster:
     doubts = []
     pages = len(dataset.subdatasets)
     if pages > 1:
-        doubts.append(f"it has {pages} pages: the first one is read, the others are kept in the source only")
+        doubts.append(f"it has {pages} pages; only the first one is read")
     flags = dataset.mask_flag_enums[0]
     masked = rasterio.enums.MaskFlags.per_dataset in flags and not {
         rasterio.enums.MaskFlags.alpha,
@@ -250,7 +254,7 @@ def _decode(dataset: Any, rasterio: Any) -> Raster:
 
 
 def _pixels(dataset: Any, rasterio: Any, masked: bool) -> NDArray[Any]:
-    """[bands, height, width]; a mask becomes one more band."""
+    """Read the pixels as [bands, height, width]; a mask becomes one more band."""
     count, height, width = dataset.count, dataset.height, dataset.width
     kind = np.dtype(dataset.dtypes[0])
     pixels = np.empty((count + masked, height, width), kind)
@@ -264,7 +268,7 @@ def _pixels(dataset: Any, rasterio: Any, masked: bool) -> NDArray[Any]:
 
 
 def _placement(dataset: Any, is_local: bool, doubts: list[str]) -> tuple[Affine | None, str | None]:
-    """Transform and CRS, from ground control points where the file has no transform. Raises UnreadableFile."""
+    """Return transform and CRS, from ground control points if the file has no transform. Raises UnreadableFile."""
     transform: Affine | None = tuple(float(v) for v in dataset.transform[:6])  # type: ignore[assignment]
     crs = crs_name(dataset.crs) if dataset.crs else LOCAL if is_local else None
     if transform != NO_TRANSFORM or is_local:
@@ -272,22 +276,22 @@ def _placement(dataset: Any, is_local: bool, doubts: list[str]) -> tuple[Affine 
     points, points_crs = dataset.gcps
     if not points:
         if dataset.rpcs:
-            raise UnreadableFile("it is placed by a sensor model (RPC) only: orthorectify it first (gdalwarp -rpc)")
+            raise UnreadableFile("georeferenced only by a sensor model (RPC): orthorectify it first (gdalwarp -rpc)")
         return None, crs
     plane = fit_affine([(p.col, p.row, p.x, p.y) for p in points])
     if plane is None:
-        raise UnreadableFile("its ground control points lie on one line: they do not say where it lies")
+        raise UnreadableFile("its ground control points are collinear: at least three must not be on one line")
     transform, off = plane
     if off > 0.5:
         doubts.append(
-            f"its {len(points)} ground control points are {off:.1f} pixels off the plane through them: warp it "
+            f"its {len(points)} ground control points deviate by up to {off:.1f} pixels from an affine fit; warp it "
             "(gdalwarp) for a closer fit"
         )
     return transform, crs_name(points_crs) if points_crs else crs
 
 
 def _properties(dataset: Any, tags: dict[str, str], masked: bool) -> dict[str, Any]:
-    """What the file says besides its pixels. tags: of the whole file; those that only say how it was made leave."""
+    """Collect the file's metadata. tags: of the whole file; removes those that only describe its production."""
     colours = [c.name for c in dataset.colorinterp]
     bands = [_band(dataset, k, colour) for k, colour in enumerate(colours)]
     if masked:
@@ -325,8 +329,10 @@ def _band(dataset: Any, k: int, colour: str) -> dict[str, Any]:
 
 
 def _windows(dataset: Any, rasterio: Any) -> Iterator[Any]:
-    """Parts of a picture that are read at a time: whole blocks, no more than the cache holds. (GDAL reads line by line,
-    and would decode each tile of a wide picture again for each line.)"""
+    """Yield windows of whole blocks that fit into the cache.
+
+    GDAL reads line by line, and would decode each tile of a wide image again for each line.
+    """
     high, wide = dataset.block_shapes[0]
     room = CACHE // 2 // (dataset.count * np.dtype(dataset.dtypes[0]).itemsize)
     columns = max(1, room // (high * wide)) * wide
@@ -337,12 +343,12 @@ def _windows(dataset: Any, rasterio: Any) -> Iterator[Any]:
 
 
 def _unless(value: float, default: float) -> float | None:
-    """A number that says something: finite, and not the usual one."""
+    """Return a finite number that differs from the default, else None."""
     return float(value) if math.isfinite(value) and value != default else None
 
 
 def _texts(tags: Mapping[str, str]) -> dict[str, str]:
-    """Tags whose names and values any answer can hold."""
+    """Select the tags whose names and values are safe in any response."""
     return {
         name: value
         for name, value in tags.items()
@@ -351,7 +357,7 @@ def _texts(tags: Mapping[str, str]) -> dict[str, str]:
 
 
 def fit_affine(points: Sequence[tuple[float, float, float, float]]) -> tuple[Affine, float] | None:
-    """The affine transform nearest to (column, row, x, y) points, and how far the worst of them is off, in pixels."""
+    """Fit an affine transform to (column, row, x, y) points. Returns it and the maximum error in pixels."""
     table = np.array(points, np.float64)
     if not np.isfinite(table).all():
         return None
@@ -368,10 +374,10 @@ def fit_affine(points: Sequence[tuple[float, float, float, float]]) -> tuple[Aff
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> bytes:
-    """A cloud optimized GeoTIFF: tiles of 512 pixels, overviews from there on, deflate with a predictor.
+    """Write a cloud optimized GeoTIFF: tiles of 512 pixels, overviews above that size, deflate with a predictor.
 
-    crs: what it is called, None for none. tags: of the whole file. The pixels are not copied: GDAL reads them where
-    they are. No clock and no version goes in, so equal pictures give equal bytes.
+    crs: its name, None for none. tags: of the whole file. The pixels are not copied: GDAL reads the array in place.
+    The file has no time stamp and no version, so equal images give equal bytes.
     """
     from rasterio import shutil
     from rasterio.io import MemoryFile
@@ -390,7 +396,7 @@ def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> by
         "NUM_THREADS": "1",
         "OVERVIEW_RESAMPLING": "NEAREST" if "palette" in colours or not _is_shade(picture) else "AVERAGE",
     }
-    # Room for two rows of the largest overview's tiles, which are written once only if they are there in full.
+    # Cache two rows of the largest overview's tiles: an incomplete tile would be written twice.
     cache = max(CACHE // 4, BLOCK * pixels.shape[1] * pixels.shape[2] * pixels.itemsize)
     with gdal(cache) as rasterio, MemoryFile() as out:
         with open_memory_dataset(rasterio, pixels, count, described=True) as dataset:
@@ -402,7 +408,7 @@ def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> by
 
 
 def _is_shade(picture: GeoImage) -> bool:
-    """Whether values between values mean something: shades and heights, not names (whole numbers of no colour)."""
+    """Return whether pixel values can be interpolated: shades and heights, not class numbers (integers, no colour)."""
     return picture.pixels.dtype.kind == "f" or picture.pixels.dtype == np.uint8
 
 
@@ -443,7 +449,7 @@ def _describe(
 
 
 def _can_represent(kind: np.dtype[Any], value: float) -> bool:
-    """Whether pixels of this type can have the value."""
+    """Return whether pixels of this type can have the value."""
     if kind.kind == "f":
         return True
     if not (math.isfinite(value) and float(value).is_integer()):
@@ -453,6 +459,6 @@ def _can_represent(kind: np.dtype[Any], value: float) -> bool:
 
 
 def crs_to_wkt(crs: str) -> str:
-    """A CRS as WKT 1 where that can say it (older tools read no other), else WKT 2."""
+    """Format a CRS as WKT 1 if possible, since older tools read no other, else WKT 2."""
     with gdal() as rasterio:
         return str(rasterio.crs.CRS.from_user_input(crs).to_wkt())

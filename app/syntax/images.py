@@ -1,7 +1,7 @@
-"""Pictures read safely and PNG written quickly: what grids, overlays and floor plans share.
+"""Safe image reading and fast PNG writing for grids, overlays and floor plans.
 
-A picture is known by its first bytes, never by its name; its size is checked before a pixel is decoded; a damaged one
-is refused, never half read. Read: PGM (P2, P5) and raw PBM and PPM (P4, P6), PNG, BMP, JPEG.
+The kind of an image is detected by its first bytes, never by its name. Its size is checked before pixels are decoded. A
+damaged image is rejected, never read in part. Supported: PGM (P2, P5) and raw PBM and PPM (P4, P6), PNG, BMP, JPEG.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 Bytes = NDArray[np.uint8]
 
-# Pillow's own bound would refuse pictures that the settings allow; every picture is checked in _check_size instead.
+# Pillow's own limit would reject images that the settings allow; _check_size checks every image instead.
 Image.MAX_IMAGE_PIXELS = None
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 STRIP = 2**18
-"""Pixels that are converted at a time: small enough for the processor's cache, so memory stays near the result's."""
+"""Number of pixels converted at a time: fits into the processor's cache and bounds memory."""
 
 MAX_JPEG_SCANS = 64
 DEFLATE_RATIO = 1032
-"""No deflate stream unfolds further than this (RFC 1951: 258 bytes for 2 bits)."""
+"""Maximum compression ratio of a deflate stream (RFC 1951: 258 bytes for 2 bits)."""
 
 RED, GREEN, BLUE = 298839, 586811, 114350
-"""Millionths: GraphicsMagick's weights of a grey value, as Nav2 sees a coloured picture with transparency."""
+"""GraphicsMagick's weights of a grey value, in millionths: Nav2 converts coloured images with transparency so."""
 
 _LONG_NUMBER = re.compile(rb"[0-9]{10}")
 
@@ -44,10 +44,10 @@ Strips = Iterator[tuple[int, Bytes, NDArray[np.bool_] | None]]
 
 @dataclass(frozen=True, slots=True)
 class Grey:
-    """A decoded picture as 8-bit grey.
+    """Decoded image in 8-bit grey.
 
-    strips: gives (first row, grey uint8 [rows, width], opaque bool [rows, width] or None where every pixel is), from
-    the top row down. A picture may only turn out damaged while its strips are read (UnreadableFile).
+    strips: yields (first row, grey uint8 [rows, width], opaque bool [rows, width] or None if every pixel is opaque),
+    from the top row down. Raises UnreadableFile while reading strips if the image turns out to be damaged.
     """
 
     width: int
@@ -55,7 +55,7 @@ class Grey:
     strips: Callable[[], Strips]
 
     def pixels(self) -> tuple[Bytes, NDArray[np.bool_] | None]:
-        """All of it: grey and opaque [height, width], top row first."""
+        """Read the complete image: grey and opaque [height, width], top row first."""
         grey = np.empty((self.height, self.width), np.uint8)
         opaque: NDArray[np.bool_] | None = None
         for y, block, clear in self.strips():
@@ -68,7 +68,7 @@ class Grey:
 
 
 def detect_kind(data: bytes) -> str | None:
-    """``pgm`` (all of PBM, PGM, PPM), ``png``, ``bmp`` or ``jpeg`` by the first bytes; None for anything else."""
+    """Detect ``pgm`` (all of PBM, PGM, PPM), ``png``, ``bmp`` or ``jpeg`` by the first bytes; else None."""
     if data[:8] == PNG_MAGIC:
         return "png"
     if data[:3] == b"\xff\xd8\xff":
@@ -81,7 +81,7 @@ def detect_kind(data: bytes) -> str | None:
 
 
 def read_grey(data: bytes, limits: Limits) -> Grey:
-    """A picture as grey, as GraphicsMagick and so Nav2 sees it. Raises UnreadableFile or TooLarge."""
+    """Read an image as grey, like GraphicsMagick and so Nav2. Raises UnreadableFile or TooLarge."""
     if detect_kind(data) == "pgm" and data[:2] in (b"P2", b"P5"):
         return _read_pgm(data, limits)
     image = read_image(data, limits)
@@ -89,15 +89,15 @@ def read_grey(data: bytes, limits: Limits) -> Grey:
 
 
 def read_image(data: bytes, limits: Limits) -> Image.Image:
-    """A picture, decoded, in the mode it is stored in. Raises UnreadableFile or TooLarge.
+    """Decode an image in its stored mode. Raises UnreadableFile or TooLarge.
 
-    16-bit greys have mode ``I;16``; transparency is in the alpha band or in ``info["transparency"]``.
+    16-bit grey has mode ``I;16``; transparency is in the alpha band or in ``info["transparency"]``.
     """
     kind = detect_kind(data)
     if kind is None:
-        raise UnreadableFile("its first bytes are not those of a PGM, PNG, BMP or JPEG picture")
+        raise UnreadableFile("unknown type of picture: use PGM, PNG, BMP or JPEG")
     if kind == "pgm" and data[:2] in (b"P1", b"P3"):
-        raise UnreadableFile("a PBM or PPM in plain text is not read: save it as PGM (P5) or PNG")
+        raise UnreadableFile("PBM and PPM in plain text are unsupported: save it as PGM (P5) or PNG")
     if kind == "pgm" and data[:2] in (b"P2", b"P5"):
         pixels, _ = _read_pgm(data, limits).pixels()
         return Image.fromarray(pixels)
@@ -106,7 +106,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
     elif kind == "jpeg":
         _check_jpeg(data)
     names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
-    # struct.error, SyntaxError and the like: what Pillow raises on input that is not what it says.
+    # Pillow raises struct.error, SyntaxError and others on malformed input.
     try:
         stream = io.BytesIO(data)
         image = Image.open(stream, formats=[names[kind]])
@@ -114,7 +114,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
         if kind == "bmp" and image.info.get("compression") == 0:
             _check_bmp(image, data)
         image.load()
-        stream.close()  # some pictures would hold on to their file's bytes
+        stream.close()  # some images would keep their file's bytes
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error) as error:
         reason = str(error) or type(error).__name__
         raise UnreadableFile(f"the {names[kind]} picture is damaged or cut short: {reason}") from error
@@ -122,22 +122,22 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
 
 
 def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = None, table: bytes | None = None) -> bytes:
-    """A PNG of uint8 [height, width] or [height, width, 1…4] (grey, grey + alpha, RGB, RGBA), the same every time.
+    """Encode uint8 [height, width] or [height, width, 1…4] (grey, grey + alpha, RGB, RGBA) as reproducible PNG.
 
-    flip: the first row is the bottom one. palette: RGBA [256, 4] that one-band pixels index. table: 256 bytes that
-    every byte is looked up in first.
+    flip: the first row is the bottom one. palette: RGBA [256, 4], indexed by one-band pixels. table: 256 bytes that
+    replace every byte first.
     """
     height, width = pixels.shape[:2]
     bands = 1 if pixels.ndim == 2 else pixels.shape[2]
     colour = 3 if palette is not None else {1: 0, 2: 4, 3: 2, 4: 6}[bands]
-    out = io.BytesIO()  # whose content is taken out without a copy
+    out = io.BytesIO()  # getvalue returns its buffer without a copy
     out.write(PNG_MAGIC)
     out.write(_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0)))
     if palette is not None:
         out.write(_chunk(b"PLTE", palette[:, :3].tobytes()))
         out.write(_chunk(b"tRNS", palette[:, 3].tobytes()))
-    # Grids are runs of few values: matching runs alone is as quick as the fastest general level, half the size, and
-    # keeps to filter 0.
+    # Grids are runs of few values: run-length matching is as fast as the fastest level, half the size, and needs only
+    # filter 0.
     packer = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_RLE if bands == 1 else zlib.Z_DEFAULT_STRATEGY)
     rows = max(1, STRIP // (width * bands))
     packed = _IdatWriter(out)
@@ -156,8 +156,10 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
 
 
 class _IdatWriter:
-    """The IDAT chunks of a PNG, of up to 2^30 bytes each, written as they come: the packed pixels may be as large as
-    the picture, and are in memory once."""
+    """Writer of IDAT chunks of a PNG, up to 2^30 bytes each.
+
+    It streams: the packed pixels may be as large as the image, and are in memory only once.
+    """
 
     MOST = 2**30
 
@@ -166,12 +168,12 @@ class _IdatWriter:
         self.reserve_length()
 
     def reserve_length(self) -> None:
-        """Leave room for the length of a chunk."""
+        """Reserve space for the length of a chunk."""
         self.size, self.sum = 0, zlib.crc32(b"IDAT")
         self.out.write(bytes(4) + b"IDAT")
 
     def write(self, packed: bytes) -> None:
-        """Append some of the packed pixels."""
+        """Append packed pixels."""
         remainder = memoryview(packed)
         while remainder:
             if self.size == self.MOST:
@@ -184,7 +186,7 @@ class _IdatWriter:
             remainder = remainder[len(part) :]
 
     def close(self) -> None:
-        """Finish the chunk: its checksum, and its length where it begins."""
+        """Finish the chunk: append its checksum and insert its length."""
         self.out.write(struct.pack(">I", self.sum))
         self.out.seek(-12 - self.size, io.SEEK_END)
         self.out.write(struct.pack(">I", self.size))
@@ -192,14 +194,14 @@ class _IdatWriter:
 
 
 def cells_to_png(cells: Bytes) -> bytes:
-    """A grey PNG of canonical cells (bottom row first): the value 0…100, 255 unknown; the top row of the map on top."""
+    """Encode canonical cells (bottom row first) as grey PNG: values 0…100, 255 unknown; the map's top row on top."""
     return encode_png(cells, flip=True)
 
 
 def overlay_png(grid: OccupancyGrid) -> bytes:
-    """A grid as a picture to lay over a map: occupied black, free white, in between grey, unknown transparent.
+    """Encode a grid as PNG overlay for a map: occupied black, free white, in between grey, unknown transparent.
 
-    Row 0 is the map's top row; a grid with a yaw is drawn unturned (its corners say how it lies).
+    Row 0 is the map's top row. A grid with a yaw is not rotated; its corners describe the rotation.
     """
     palette = np.zeros((256, 4), np.uint8)
     palette[: OCCUPIED + 1, :3] = np.round(255 * (1 - np.arange(OCCUPIED + 1) / OCCUPIED))[:, None].astype(np.uint8)
@@ -209,14 +211,14 @@ def overlay_png(grid: OccupancyGrid) -> bytes:
 
 
 def read_size(data: bytes, limits: Limits) -> tuple[int, int]:
-    """(width, height) by the header alone. Raises UnreadableFile or TooLarge."""
+    """Read (width, height) from the header only. Raises UnreadableFile or TooLarge."""
     kind = detect_kind(data)
     if kind == "pgm" and data[:2] in (b"P2", b"P5"):
         grey = _read_pgm(data, limits)
         return grey.width, grey.height
     names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
     if kind is None:
-        raise UnreadableFile("its first bytes are not those of a PGM, PNG, BMP or JPEG picture")
+        raise UnreadableFile("unknown type of picture: use PGM, PNG, BMP or JPEG")
     try:
         with Image.open(io.BytesIO(data), formats=[names[kind]]) as image:
             _check_size(image.width, image.height, limits)
@@ -226,23 +228,23 @@ def read_size(data: bytes, limits: Limits) -> tuple[int, int]:
 
 
 def apply_table(pixels: Bytes, table: bytes) -> Bytes:
-    """table[pixels]: bytes.translate takes a third of the time of numpy's indexing. The result is read-only."""
+    """Compute table[pixels] with bytes.translate, three times as fast as numpy's indexing. The result is read-only."""
     return np.frombuffer(pixels.tobytes().translate(table), np.uint8).reshape(pixels.shape)
 
 
 def _check_size(width: int, height: int, limits: Limits) -> None:
     if width < 1 or height < 1:
-        raise UnreadableFile(f"the picture says it has {width} × {height} pixels")
+        raise UnreadableFile(f"invalid picture size: {width} × {height} pixels")
     if width * height > limits.pixels:
         raise TooLarge(
-            f"the picture says it has {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
+            f"the picture declares {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
             "(FLEETMAP_MAX_PIXELS)"
         )
 
 
 # --- PGM ----------------------------------------------------------------------------------------------------------
 def _read_pgm(data: bytes, limits: Limits) -> Grey:
-    """P2 and P5 by netpbm's rules: white space and comments between the numbers, one white space before the pixels."""
+    """Read P2 and P5 by netpbm's rules: white space and comments between numbers, one white space before the pixels."""
     offset, numbers = 2, []
     for noun in ("width", "height", "highest value"):
         offset = _skip_white_space(data, offset)
@@ -282,14 +284,14 @@ def _read_pgm(data: bytes, limits: Limits) -> Grey:
             block = rows[y : y + step]
             top = maximum if maximum in (255, 65535) and data[:2] == b"P5" else int(block.max())
             if top > maximum:
-                raise UnreadableFile(f"the PGM has the value {top}, above the highest it declares ({maximum})")
+                raise UnreadableFile(f"the PGM has the value {top}, above its declared maximum {maximum}")
             yield y, (block.astype(np.uint8, copy=False) if table is None else table[block]), None
 
     return Grey(width, height, strips)
 
 
 def _skip_white_space(data: bytes, offset: int) -> int:
-    """The next byte that is neither white space nor in a comment."""
+    """Return the offset of the next byte that is neither white space nor in a comment."""
     while offset < len(data):
         if data[offset] == 0x23:
             ends = [end for end in (data.find(b"\n", offset), data.find(b"\r", offset)) if end >= 0]
@@ -304,7 +306,7 @@ def _skip_white_space(data: bytes, offset: int) -> int:
 
 
 def _parse_plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
-    """The first ``count`` numbers of a P2's pixels; comments may stand between them."""
+    """Parse the first ``count`` numbers of a P2's pixels; comments may be between them."""
     if len(text) < 2 * count - 1:
         raise UnreadableFile(f"the PGM is cut short: {count} pixels need more than {len(text)} characters")
     if b"#" in text:
@@ -312,10 +314,10 @@ def _parse_plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
     stray = text.translate(None, b"0123456789 \t\r\n\v\f")
     if stray:
         raise UnreadableFile(f"the PGM's pixels must be whole numbers; found {stray[:20].decode('latin1')!r}")
-    # Digits and blanks only, and none too long for 32 bit, so that fromstring reads to the end without a surprise.
+    # Only digits and white space, and no number beyond 32 bits: fromstring reads to the end.
     if _LONG_NUMBER.search(text):
         raise UnreadableFile("the PGM has a pixel of more than 9 digits")
-    # Without a count: given one that the text cannot fill, fromstring answers uninitialised memory.
+    # Without a count: fromstring returns uninitialised memory if the text has fewer numbers.
     values: NDArray[np.int32] = np.fromstring(text, np.int32, sep=" ") if text.strip() else np.empty(0, np.int32)
     if len(values) < count:
         raise UnreadableFile(f"the PGM is cut short: it has {len(values)} of {count} pixels")
@@ -323,12 +325,12 @@ def _parse_plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
 
 
 def _scaling(maximum: int) -> Bytes:
-    """0…most to 0…255 as GraphicsMagick does: to 16 bit, then to 8, each rounded."""
+    """Build the table from 0…maximum to 0…255 like GraphicsMagick: to 16 bits, then to 8, rounding twice."""
     value = np.minimum(np.arange(256 if maximum < 256 else 65536, dtype=np.int64), maximum)
     return (((65535 * value + maximum // 2) // maximum + 128) // 257).astype(np.uint8)
 
 
-# --- pictures that Pillow decodes ---------------------------------------------------------------------------------
+# --- images decoded by Pillow -------------------------------------------------------------------------------------
 def _image_strips(image: Image.Image) -> Strips:
     width, height = image.size
     step = max(1, STRIP // width)
@@ -357,11 +359,11 @@ def _grey_and_opaque(rgba: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
 
 
 def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
-    """uint8 [height, width, bands] of a PNG of 8-bit RGB, RGBA or grey + alpha; None for any other picture.
+    """Decode a PNG of 8-bit RGB, RGBA or grey + alpha to uint8 [height, width, bands]; None for any other image.
 
-    Pillow keeps such pixels in 4 bytes each, whatever their bands. Here it is given a strip of rows at a time, as a
-    picture of its own that begins with the row before it, so that no more than the result takes memory.
-    Raises UnreadableFile or TooLarge, as ``read_image``.
+    Pillow needs 4 bytes per pixel for any number of bands. To bound memory by the result, it gets one strip of rows at
+    a time, as a separate image that begins with the row before it. Raises UnreadableFile or TooLarge, as
+    ``read_image``.
     """
     if detect_kind(data) != "png":
         return None
@@ -381,7 +383,7 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
             end = min(height, y + rows)
             lines = packed.send((end - y) * line)
             if len(lines) < (end - y) * line:
-                raise UnreadableFile("the PNG picture is damaged or cut short: its pixels end before their end")
+                raise UnreadableFile("the PNG picture is damaged or cut short: it has too few pixels")
             head = struct.pack(">IIBBBBB", width, 1 + end - y, 8, colour, 0, 0, 0)
             body = zlib.compress(before + lines, 0)
             strip = b"".join([PNG_MAGIC, _chunk(b"IHDR", head), _chunk(b"IDAT", body), _chunk(b"IEND", b"")])
@@ -394,7 +396,7 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
 
 
 def _inflate(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
-    """The unfolded content of a zlib stream: send how many bytes are wanted next (fewer come at its end)."""
+    """Decompress a zlib stream: send the number of bytes to yield next (fewer at its end)."""
     unfold = zlib.decompressobj()
     pieces = (chunk[k : k + 2**14] for chunk in chunks for k in range(0, len(chunk), 2**14))
     remainder: bytes | memoryview = b""
@@ -402,7 +404,7 @@ def _inflate(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
     while True:
         out = []
         while budget > 0 and not unfold.eof:
-            # With nothing new there may still be something that did not fit before.
+            # Without new input, output that did not fit before may remain.
             part = unfold.decompress(remainder, budget)
             remainder = unfold.unconsumed_tail
             if not part and not remainder:
@@ -415,7 +417,7 @@ def _inflate(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
 
 
 def _check_png(data: bytes, limits: Limits) -> list[memoryview]:
-    """The PNG's signature and the chunks that make its pixels, each one's checksum verified (Pillow skips IDAT's)."""
+    """Check the PNG's signature and all checksums (Pillow skips IDAT's). Returns the chunks with pixels."""
     view = memoryview(data)
     offset, chunks, packed = 8, [view[:8]], 0
     width = height = depth = colour = 0
@@ -439,20 +441,20 @@ def _check_png(data: bytes, limits: Limits) -> list[memoryview]:
             chunks.append(view[offset:end])
             packed += size if kind == b"IDAT" else 0
         elif not kind[0] & 0x20:
-            raise UnreadableFile(f"the PNG picture needs the unknown chunk {kind!r}")
+            raise UnreadableFile(f"the PNG picture requires the unknown chunk {kind!r}")
         offset = end
         if kind == b"IEND":
             break
     if colour == 3 and not palette:
-        raise UnreadableFile("the PNG picture's pixels point into a palette, and it has none")
+        raise UnreadableFile("the PNG picture has no palette, which its pixels require")
     bits = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1) * depth
     if (width * bits // 8) * height > packed * DEFLATE_RATIO:
-        raise UnreadableFile(f"the PNG picture says {width} × {height} pixels, but {packed} bytes cannot hold them")
+        raise UnreadableFile(f"the PNG picture declares {width} × {height} pixels, too many for its {packed} bytes")
     return chunks
 
 
 def _check_jpeg(data: bytes) -> None:
-    """Few scans (each costs a pass over the whole picture), and an end: a cut one would come out half grey."""
+    """Check that a JPEG has few scans (each is a pass over the image) and an end (else it would be half grey)."""
     scans = data.count(b"\xff\xda")
     if scans > MAX_JPEG_SCANS:
         raise TooLarge(f"the JPEG picture has {scans} scans; the limit is {MAX_JPEG_SCANS}")
@@ -461,7 +463,7 @@ def _check_jpeg(data: bytes) -> None:
 
 
 def _check_bmp(image: Image.Image, data: bytes) -> None:
-    """An uncompressed BMP must hold the pixels it declares."""
+    """Check that an uncompressed BMP contains its declared pixels."""
     bits = int.from_bytes(data[28:30], "little") if int.from_bytes(data[14:18], "little") >= 40 else 1
     size = ((image.width * bits + 31) // 32) * 4 * image.height
     if len(data) < size:

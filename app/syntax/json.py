@@ -13,25 +13,25 @@ from app.errors import Problem, TooLarge, UnreadableFile
 from app.limits import Limits
 
 MAX_DEPTH = 128
-"""Nested arrays and objects. Real files have about ten; interpreters that recurse fail near a thousand."""
+"""Maximum nesting of arrays and objects. Real files have about ten; recursive parsers fail near a thousand."""
 
 
 def load(data: bytes, limits: Limits) -> Any:
-    """The value of a JSON text; integers beyond 64 bit become floats. Raises UnreadableFile with line, or TooLarge."""
+    """Parse JSON; integers beyond 64 bits become floats. Raises UnreadableFile with the line, or TooLarge."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes; the limit for a text is {limits.text_bytes}")
     try:
         top = orjson.loads(data)
     except orjson.JSONDecodeError as error:
-        reason = f"not JSON: {error.msg}"
+        reason = f"invalid JSON: {error.msg}"
         raise UnreadableFile(reason, [Problem(reason, line=error.lineno)]) from error
     _check_depth(data)
     return top
 
 
 def _check_depth(data: bytes) -> None:
-    """Refuse deep nesting of (well-formed) JSON, counting brackets outside of texts."""
+    """Reject deep nesting of well-formed JSON, by counting brackets outside of strings."""
     plain = re.sub(rb"(?s)\\.", b"  ", data) if b"\\" in data else data
     characters = np.frombuffer(plain, np.uint8)
     in_text = np.bitwise_xor.accumulate((characters == ord('"')).view(np.uint8))
@@ -42,19 +42,19 @@ def _check_depth(data: bytes) -> None:
     steps[in_text != 0] = 0
     steps = steps[steps != 0]
     if len(steps) and int(np.cumsum(steps, dtype=np.int64).max()) > MAX_DEPTH:
-        reason = f"nested deeper than {MAX_DEPTH}"
+        reason = f"nested deeper than {MAX_DEPTH} levels"
         raise UnreadableFile(reason, [Problem(reason)])
 
 
 def rank_keys(keys: str) -> dict[str, int]:
-    """The words of a text with their places, for ``sort_keys``."""
+    """Map the words of a text to their positions, for ``sort_keys``."""
     return {key: rank for rank, key in enumerate(keys.split())}
 
 
 def sort_keys(value: Any, key_ranks: Mapping[str, int]) -> Any:
-    """The value with the keys of all its objects in order: these words by their rank, then others by alphabet.
+    """Sort the keys of all objects: ranked keys by their rank, then the others alphabetically.
 
-    So that equal values give equal bytes, however they were put together.
+    Equal values then give equal bytes, in whatever order they were built.
     """
     if isinstance(value, dict):
         last = len(key_ranks)

@@ -1,10 +1,10 @@
-"""LZF, the compression of ``binary_compressed`` PCD files.
+"""LZF compression, used by ``binary_compressed`` PCD files.
 
-A byte below 32 is followed by that many bytes and one more, as they are. Any other is a reference: its upper three bits
-are the length less 2 (7: the next byte is added), its lower five and the next byte how far back less 1. Source:
-liblzf's lzf_d.c and lzf_c.c, as in PCL.
+A byte n below 32 is followed by n + 1 literal bytes. Any other byte is a back reference: its upper three bits are the
+length - 2 (7: the next byte is added), its lower five bits and the next byte are the distance - 1. Source: liblzf's
+lzf_d.c and lzf_c.c, as in PCL.
 
-The loops are written once: plain Python for little data, native code by Numba for more (its compiler takes a second).
+The same loops run in plain Python for little data and as native code by Numba for more (compiling takes a second).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_INTERPRETED_BYTES = 2**22
-"""Bytes up to which compiling would take longer than it saves."""
+"""Size in bytes up to which compiling takes longer than it saves."""
 
 MAX_MATCH_BYTES = 264
 MAX_OFFSET_BYTES = 8192
@@ -27,9 +27,9 @@ Bytes = NDArray[np.uint8]
 
 
 def expand(data: bytes, size: int) -> bytes:
-    """The bytes of a stream that unfolds to this size. ValueError where it does not; nothing is allocated beyond."""
-    if size > len(data) * MAX_MATCH_BYTES:  # no reference of two or three bytes gives more
-        raise ValueError(f"{len(data)} compressed bytes cannot unfold to {size}")
+    """Decompress a stream to exactly ``size`` bytes; allocates no more. Raises ValueError if the size differs."""
+    if size > len(data) * MAX_MATCH_BYTES:  # a reference of two or three bytes yields at most that
+        raise ValueError(f"{len(data)} compressed bytes cannot decompress to {size} bytes")
     if size <= MAX_INTERPRETED_BYTES and len(data) <= MAX_INTERPRETED_BYTES:
         little = bytearray(size)
         end = _expand(data, little)
@@ -39,16 +39,14 @@ def expand(data: bytes, size: int) -> bytes:
         end = _compile(_expand)(np.frombuffer(data, np.uint8), large)
         out = large.tobytes()
     if end < 0:
-        raise ValueError(
-            "the compressed data is damaged: it refers to what is not there, or does not end where it must"
-        )
+        raise ValueError("the compressed data is damaged: invalid back reference or wrong length")
     if end != size:
-        raise ValueError(f"the compressed data unfolds to {end} bytes, the file says {size}")
+        raise ValueError(f"the compressed data decompresses to {end} bytes, the file declares {size}")
     return out
 
 
 def squeeze(data: bytes) -> bytes:
-    """A stream that unfolds to the data; the same on every machine."""
+    """Compress data; the result is the same on every machine."""
     room = len(data) + len(data) // 32 + 16
     if len(data) <= MAX_INTERPRETED_BYTES // 16:
         little = bytearray(room)
@@ -68,7 +66,7 @@ def _compile(function: Callable[..., int]) -> Callable[..., int]:
 
 
 def _expand(data: Any, out: Any) -> int:
-    """Bytes written, or -1 for a stream that cannot be."""
+    """Return the number of bytes written, or -1 for an invalid stream."""
     i, o, n, room = 0, 0, len(data), len(out)
     while i < n:
         control = int(data[i])
@@ -103,7 +101,7 @@ def _expand(data: Any, out: Any) -> int:
 
 
 def _squeeze(data: Any, out: Any, table: Any) -> int:
-    """Bytes written. table: where three bytes of this hash stood last, -1 at first."""
+    """Return the number of bytes written. table: last position of three bytes by their hash, initially -1."""
     i, o, n, literal = 0, 0, len(data), 0
     while i < n:
         length = 0

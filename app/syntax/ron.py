@@ -1,11 +1,11 @@
-"""RON (Rusty Object Notation) as the values that JSON would have, and back.
+"""Read RON (Rusty Object Notation) as JSON values, and write it.
 
-Reading: structs and maps become mappings (their keys texts), sequences and tuples lists, ``Some(v)`` is v, ``None`` and
-``()`` are None, a unit variant is its name as a text, ``Variant(v)`` is ``{"Variant": v}``, and so are structs with a
-name; one value in brackets without a comma (a newtype) is the value itself. So a site saved as RON reads as its JSON.
+Reading: structs and maps become mappings with string keys, sequences and tuples lists, ``Some(v)`` v, ``None`` and
+``()`` None, a unit variant its name, ``Variant(v)`` and named structs ``{"Variant": v}``; one value in parentheses
+without a comma (a newtype) becomes the value itself. So a site saved as RON reads as its JSON.
 
-Writing asks a ``Shape`` what JSON does not tell: which lists are tuples, which texts are variants. The file begins with
-the extensions that let options and newtypes stand without ``Some`` and brackets.
+Writing needs a ``Shape`` for information that JSON lacks: which lists are tuples, which strings are variants. The file
+begins with the extensions that allow options and newtypes without ``Some`` and parentheses.
 
 Source: ron-rs/ron, docs/grammar.md and docs/extensions.md.
 """
@@ -22,7 +22,7 @@ from app.errors import Problem, TooLarge, UnreadableFile
 from app.limits import Limits
 
 MAX_DEPTH = 96
-"""Nested values; sites have about fifteen."""
+"""Maximum nesting of values; sites have about fifteen levels."""
 
 EXTENSIONS = "#![enable(implicit_some, unwrap_newtypes)]"
 
@@ -53,14 +53,14 @@ _WORDS: Mapping[str, Any] = {"true": True, "false": False, "None": None}
 
 
 def load(data: bytes, limits: Limits) -> Any:
-    """The value of a RON text. Raises UnreadableFile with line, or TooLarge."""
+    """Parse RON. Raises UnreadableFile with the line, or TooLarge."""
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes; the limit for a text is {limits.text_bytes}")
     return _Parser(data.removeprefix(b"\xef\xbb\xbf").decode("utf-8"), limits).document()
 
 
 class _Parser:
-    """One text being read, a token ahead."""
+    """Recursive descent parser with one token of lookahead."""
 
     def __init__(self, text: str, limits: Limits) -> None:
         self._text, self._limits = text, limits
@@ -68,7 +68,7 @@ class _Parser:
         self._kind, self._value, self._start = "", "", 0
 
     def document(self) -> Any:
-        """The only value of the text."""
+        """Parse the only value of the text."""
         self._space()
         while match := _ATTRIBUTE.match(self._text, self._at):
             self._at = match.end()
@@ -76,16 +76,16 @@ class _Parser:
         self._next()
         out = self._parse_value(0)
         if self._kind != "end":
-            self._fail("something stands behind the value")
+            self._fail("unexpected content after the value")
         return out
 
     def _fail(self, reason: str) -> NoReturn:
         line = self._text.count("\n", 0, self._start) + 1
-        problem = f"not RON: {reason}"
+        problem = f"invalid RON: {reason}"
         raise UnreadableFile(f"line {line}: {problem}", [Problem(problem, line=line)])
 
     def _space(self) -> None:
-        """Skip blanks and comments; those between ``/*`` and ``*/`` may be nested."""
+        """Skip white space and comments; block comments may be nested."""
         while (match := _TOKEN.match(self._text, self._at)) and match.lastgroup in ("space", "comment"):
             self._at = match.end()
             if match.lastgroup == "comment":
@@ -96,7 +96,7 @@ class _Parser:
                         self._at = mark.end()
                         break
                 else:
-                    self._fail("a comment does not end")
+                    self._fail("unterminated comment")
 
     def _next(self) -> None:
         self._space()
@@ -106,13 +106,13 @@ class _Parser:
             return
         match = _TOKEN.match(self._text, self._at)
         if match is None:
-            self._fail(f"{self._text[self._at : self._at + 20]!r} is no part of a value")
+            self._fail(f"unexpected {self._text[self._at : self._at + 20]!r}")
         self._kind, self._value, self._at = str(match.lastgroup), match.group(), match.end()
         if match["raw"] is not None:
             closing = '"' + match["hashes"]
             end = self._text.find(closing, self._at)
             if end < 0:
-                self._fail("a raw text does not end")
+                self._fail("unterminated raw string")
             self._kind, self._value, self._at = "raw", self._text[self._at : end], end + len(closing)
 
     def _is(self, mark: str) -> bool:
@@ -120,14 +120,14 @@ class _Parser:
 
     def _expect(self, mark: str) -> None:
         if not self._is(mark):
-            self._fail(f"{mark!r} is missing before {self._value[:20]!r}" if self._value else f"{mark!r} is missing")
+            self._fail(f"missing {mark!r} before {self._value[:20]!r}" if self._value else f"missing {mark!r}")
         self._next()
 
     def _parse_value(self, depth: int) -> Any:
-        """One value."""
+        """Parse one value."""
         self._left -= 1
         if depth > MAX_DEPTH:
-            self._fail(f"nested deeper than {MAX_DEPTH}")
+            self._fail(f"nested deeper than {MAX_DEPTH} levels")
         if self._left < 0:
             raise TooLarge(f"the file has more than {self._limits.yaml_nodes} values")
         if self._kind == "mark" and self._value in _CLOSING:
@@ -144,7 +144,7 @@ class _Parser:
         elif kind == "number":
             out = self._number(value)
         else:
-            self._fail("a value is missing" if kind == "end" else f"a value is missing before {value[:20]!r}")
+            self._fail("missing value" if kind == "end" else f"missing value before {value[:20]!r}")
         self._next()
         return out
 
@@ -157,7 +157,7 @@ class _Parser:
             try:
                 out = int(bare, 10)
             except ValueError:
-                self._fail(f"{literal[:40]!r} is no number")
+                self._fail(f"invalid number {literal[:40]!r}")
         if not math.isfinite(out):
             self._fail(f"the number {literal[:40]!r} is not finite")
         return float(out) if isinstance(out, int) and not -(2**63) <= out < 2**63 else out
@@ -172,7 +172,7 @@ class _Parser:
             if code is not None:
                 point = int(code, 16)
                 if point > 0x10FFFF or 0xD800 <= point <= 0xDFFF:
-                    self._fail(f"{match.group()!r} is no character")
+                    self._fail(f"invalid character {match.group()!r}")
                 return chr(point)
             if match[3] is not None:
                 return ""
@@ -183,7 +183,7 @@ class _Parser:
         return _ESCAPE.sub(one, literal)
 
     def _parse_word(self, depth: int) -> Any:
-        """A word of the language, or a variant or struct with what belongs to it."""
+        """Parse a keyword, or a variant or named struct with its content."""
         name = self._value.removeprefix("r#")
         if name in ("inf", "NaN", "inff32", "inff64"):
             self._fail(f"the number {name!r} is not finite")
@@ -194,7 +194,7 @@ class _Parser:
         return content if name == "Some" else {name: content}
 
     def _brackets(self, depth: int) -> Any:
-        """A struct, a tuple, a newtype or nothing."""
+        """Parse a struct, a tuple, a newtype or a unit."""
         self._expect("(")
         if self._is(")"):
             self._next()
@@ -233,7 +233,7 @@ class _Parser:
             key = self._key()
             if key in out:
                 self._start = start
-                self._fail(f"{key[:60]!r} stands twice")
+                self._fail(f"duplicate key {key[:60]!r}")
             self._expect(":")
             out[key] = self._parse_value(depth + 1)
             if not self._is(closing):
@@ -255,11 +255,11 @@ class _Parser:
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What a schema says of values beyond JSON.
+    """Type information of a schema that JSON values lack.
 
-    tuples: names of members whose lists have a fixed length. variants: names of enum variants that hold a value.
-    units: member -> its texts that are variants, also in lists. maps: members whose mapping has variants as keys.
-    free: members so many mappings below which all is plain JSON.
+    tuples: names of members whose lists have a fixed length. variants: names of enum variants with a value. units:
+    member -> its strings that are variants, also in lists. maps: members whose mapping has variants as keys. free:
+    member -> number of mappings below which all is plain JSON.
     """
 
     tuples: frozenset[str]
@@ -270,12 +270,12 @@ class Shape:
 
 
 def dump(value: Any, shape: Shape) -> bytes:
-    """The value as RON, two blanks for each level; what ``load`` reads as the same value."""
+    """Format a value as RON that ``load`` reads as the same value, indented by two spaces."""
     return (f"{EXTENSIONS}\n" + "".join(_written(value, "", shape, 0, None)) + "\n").encode()
 
 
 def _written(value: Any, member: str, shape: Shape, depth: int, left: int | None) -> Iterator[str]:
-    """The pieces of one value. member: the name it stands under; left: mappings until all is plain JSON, if at all."""
+    """Yield the pieces of one value. member: its name. left: mappings until all is plain JSON; None: never."""
     in_shape = left != 0
     if isinstance(value, dict):
         yield from _mapping(value, member, shape, depth, shape.free.get(member) if left is None else left)

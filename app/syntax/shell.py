@@ -1,9 +1,9 @@
-"""Variables of environment.sh and properties.sh, read and never run.
+"""Read variables of environment.sh and properties.sh without running them.
 
-Robots source these files, so what they say is taken as text: only assignments of a literal (``export NAME='value'``,
-``"value"`` or a bare word) that the shell would come to on every run are read. Whatever needs a shell to be known is
-left out with a warning: expansions, substitutions, conditions, functions, chained commands. Names that change which
-programs run are left out too, since the variables are handed on to robots.
+Robots source these files. Only assignments of a literal (``export NAME='value'``, ``"value"`` or a bare word) that the
+shell executes on every run are read. Everything that only a shell can evaluate is skipped with a warning: expansions,
+substitutions, conditions, functions, chained commands. Names that change which programs run are skipped, too, since
+robots get the variables.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ OF_FILES = frozenset(
         "NOGO_COSTMAP_YAML_FILE",
     }
 )
-"""The template's variables that say where its files are. Source: environment_template and environment_common."""
+"""Variables of the template with paths of its files. Source: environment_template and environment_common."""
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}(?![A-Za-z0-9_])")
 _EXPORT = re.compile(r"export(?=[ \t])")
@@ -65,7 +65,7 @@ _PIECE = re.compile(
 _OPENS = frozenset({"if", "case", "for", "while", "until", "select", "{"})
 _CLOSES = frozenset({"fi", "esac", "done", "}"})
 _LEADS = frozenset({"then", "do", "else", "elif", "!", "time"})
-"""Words after which another command begins."""
+"""Words before another command."""
 
 _DANGEROUS = re.compile(
     r"PATH|ENV|IFS|SHELL|SHELLOPTS|CDPATH|HOME|USER|LOGNAME|TMPDIR|EDITOR|VISUAL|PAGER|BROWSER|PS[0-4]|PROMPT_COMMAND"
@@ -73,16 +73,16 @@ _DANGEROUS = re.compile(
     r"|(JAVA|JDK|JAVA_TOOL)_(OPTIONS|OPTS|HOME)|BASHOPTS|_JAVA_OPTIONS|CLASSPATH|MALLOC_\w+|GLIBC_\w+|\w*LIBRARY_PATH|\w*PLUGIN_PATH|\w*PREFIX_PATH"
     r"|RMW_IMPLEMENTATION|LOCPATH|NLSPATH|\w*_PRELOAD|\w*_PROXY|\w*_proxy"
 )
-"""Names by which whoever sets them decides what a program loads, starts or talks to."""
+"""Names of variables that control what a program loads, starts or connects to."""
 
 
 def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
-    """The variables that hold a literal whenever the file is sourced, and what was left out, in words.
+    """Return the variables that always have a literal value when the file is sourced, and warnings about the others.
 
-    Raises TooLarge beyond 1 MiB, UnreadableFile where the file is no UTF-8.
+    Raises TooLarge beyond 1 MiB, UnreadableFile if the file is not UTF-8.
     """
     if len(data) > MAX_BYTES:
-        raise TooLarge(f"a file of shell variables may have {MAX_BYTES} bytes, this one has {len(data)}")
+        raise TooLarge(f"the file of shell variables has {len(data)} bytes; the limit is {MAX_BYTES}")
     try:
         text = data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -102,7 +102,7 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
                 reason = _unfit_reason(name, value, variables)
                 if reason:
                     variables.pop(name, None)
-                    warnings.append(f"line {line}: {name} is left out: {reason}")
+                    warnings.append(f"line {line}: {name} is skipped: {reason}")
                 else:
                     variables[name] = value
         else:
@@ -110,25 +110,25 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
             for name in touched:
                 variables.pop(name, None)
                 if name not in names_with_warning:
-                    warnings.append(f"line {line}: {name} is left out: only a shell could say what it is")
+                    warnings.append(f"line {line}: {name} is skipped: only a shell can evaluate it")
                 names_with_warning.add(name)
             if not touched:
                 other_lines.append(line)
             if leaves and end < len(text):
-                warnings.append(f"line {line}: the file ends here, what follows is never reached")
+                warnings.append(f"line {line}: the script exits here; the lines after it are skipped")
                 break
         line += text.count("\n", at, end)
         at = end
     if other_lines:
         many = f"{len(other_lines)} commands are" if len(other_lines) > 1 else "a command is"
-        warnings.append(f"line {other_lines[0]}: {many} not an assignment of a literal and left out")
+        warnings.append(f"line {other_lines[0]}: {many} not an assignment of a literal and skipped")
     if len(warnings) > MAX_WARNINGS:
         warnings = [*warnings[:MAX_WARNINGS], f"and {len(warnings) - MAX_WARNINGS} more like these"]
     return variables, warnings
 
 
 def exported_variables(variables: object) -> tuple[dict[str, str], list[str], list[str]]:
-    """Stored variables that robots may source; the names that say where files are; why others are left out."""
+    """Split stored variables: those that robots may source, names of file paths, reasons why others are skipped."""
     items = variables.items() if isinstance(variables, Mapping) else ()
     out: dict[str, str] = {}
     of_files, reasons = [], []
@@ -148,10 +148,10 @@ def exported_variables(variables: object) -> tuple[dict[str, str], list[str], li
 
 
 def exports(values: Mapping[str, str]) -> bytes:
-    """Lines that a shell sources to exactly these values. ValueError for a name or value that must not be handed on."""
+    """Format variables as lines for a shell. Raises ValueError for a name or value that must not be exported."""
     lines = []
     for name, value in values.items():
-        reason = "it is not a variable's name" if not _NAME.fullmatch(name) else _unfit_reason(name, value, {})
+        reason = "invalid variable name" if not _NAME.fullmatch(name) else _unfit_reason(name, value, {})
         if reason:
             raise ValueError(f"{name[:80]!r} cannot be exported: {reason}")
         quoted = value.replace("'", "'\\''")
@@ -160,9 +160,9 @@ def exports(values: Mapping[str, str]) -> bytes:
 
 
 def _unfit_reason(name: str, value: str, variables: Mapping[str, str]) -> str:
-    """Why this variable is not handed on, or an empty text."""
+    """Return why a variable must not be exported, or an empty text."""
     if _DANGEROUS.fullmatch(name):
-        return "the variable decides how programs run"
+        return "the variable controls how programs run"
     if not is_writable(value):
         return "its value has control characters"
     if len(value) > MAX_VALUE:
@@ -173,7 +173,7 @@ def _unfit_reason(name: str, value: str, variables: Mapping[str, str]) -> str:
 
 
 def _literals(text: str, at: int) -> tuple[dict[str, str], int] | None:
-    """The assignments of a line that holds nothing else, and where the next begins; None for any other line."""
+    """Parse the assignments of a line that contains nothing else, and the next line's offset; None for other lines."""
     if nothing := _NOTHING.match(text, at):
         return {}, nothing.end()
     at = _past(_BLANK, text, at)
@@ -185,7 +185,7 @@ def _literals(text: str, at: int) -> tuple[dict[str, str], int] | None:
         at = name.end()
         if text[at : at + 1] == "=":
             values[name.group()], at = _value(text, at + 1)
-        elif not exported:  # export of a name alone is of a variable that stands elsewhere
+        elif not exported:  # `export NAME` exports a variable assigned elsewhere
             return None
         if end := _END.match(text, at):
             return values, end.end()
@@ -197,7 +197,7 @@ def _literals(text: str, at: int) -> tuple[dict[str, str], int] | None:
 
 
 def _value(text: str, at: int) -> tuple[str, int]:
-    """Quoted and bare pieces that stand together; ends where something else begins."""
+    """Parse adjacent quoted and bare pieces. Returns their text and its end."""
     parts = []
     while at < len(text):
         if piece := _SINGLE.match(text, at):
@@ -215,7 +215,7 @@ def _value(text: str, at: int) -> tuple[str, int]:
 
 
 def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], bool]:
-    """Pass over a logical line: its end, the depth of blocks behind it, the variables it may set, whether it leaves."""
+    """Skip a logical line. Returns its end, the block depth after it, variables it may set, whether it exits."""
     touched: dict[str, None] = {}
     heres: list[str] = []
     begins, leaves, first = True, False, ""

@@ -15,15 +15,15 @@ from app.model.xml_prolog import check_prolog
 __all__ = ["MAX_ATTRIBUTES", "attributes", "check_bounds", "check_prolog", "parse"]
 
 MAX_ATTRIBUTES = 256
-"""Of one element. Real ones have about ten; lxml takes quadratic time to list them."""
+"""Maximum number of attributes of an element. Real ones have about ten; lxml lists them in quadratic time."""
 
 
 def parse(
     data: bytes, limits: Limits, *, keep_comments: bool = False, remove_blank_text: bool = False
 ) -> etree._Element:
-    """The root element. Raises TooLarge, UnreadableFile with the line, or XMLSyntaxError.
+    """Parse XML and return the root element. Raises TooLarge, UnreadableFile with the line, or XMLSyntaxError.
 
-    remove_blank_text: leave out the white space that only indents (a third of the time and memory of such files).
+    remove_blank_text: drop white space used for indentation (saves a third of time and memory for such files).
     """
     if len(data) > limits.text_bytes:
         reason = f"{len(data)} bytes of XML; the limit for a text is {limits.text_bytes}"
@@ -57,9 +57,9 @@ _ACTIVE_WORDS = (b"<?", b"/2001/xinclude", b"/xsl/transform", b"script")
 
 
 def report_active_content(data: bytes, warn: Callable[..., None], *, has_scripts: bool = False) -> None:
-    """Report what some viewer of an XML file may run or fetch, and this server does not: each kind by name, once.
+    """Report active content that this server ignores but a viewer may run or fetch: each kind once, by name.
 
-    has_scripts: the format's own elements are called so (SDFormat's materials).
+    has_scripts: the format has its own elements of that name (SDFormat's materials).
     """
     low = data.lower()
     if b"\0" in low[:4]:  # UTF-16 or UTF-32: the words are ASCII
@@ -73,7 +73,7 @@ def report_active_content(data: bytes, warn: Callable[..., None], *, has_scripts
             name = "" if shown is None else f" {shown.group()[:60].decode('latin-1').strip()!r}"
             often = f" ({len(positions)} times)" if len(positions) > 1 else ""
             line = low.count(b"\n", 0, positions[0]) + 1
-            warn(f"{noun}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
+            warn(f"{noun}{name}{often} is ignored; a viewer may run or fetch it", line=line)
 
 
 def report_unknown_elements(
@@ -85,14 +85,14 @@ def report_unknown_elements(
     free: Set[str],
     namespace: str = "",
 ) -> None:
-    """Report elements that a format does not know by name, with how often, in one warning.
+    """Report elements that a format does not define, with their counts, in one warning.
 
     Args:
         data: the text of ``root``.
         format_names: names of the format's elements, without a namespace.
-        free: names of elements in which anything may stand.
-        namespace: what the format's own namespaces have in common; elements of others are extensions. Empty: the
-            format has none.
+        free: names of elements that may contain anything.
+        namespace: common part of the format's own namespaces; elements of others are extensions. Empty: the format
+            has none.
     """
     plain = data.replace(b"\0", b"") if b"\0" in data[:4] else data  # UTF-16 or UTF-32
     names = {name.decode("utf-8", "replace").rpartition(":")[2] for name in set(_TAG.findall(plain))}
@@ -111,17 +111,17 @@ def report_unknown_elements(
         for name, elements in list(elements_by_name.items())[:_SHOWN]
     ]
     texts += [f"and {len(elements_by_name) - _SHOWN} more"] if len(elements_by_name) > _SHOWN else []
-    warn(f"unknown elements, kept without effect: {', '.join(texts)}", line=first.sourceline)
+    warn(f"unknown elements: {', '.join(texts)}; they are stored without effect", line=first.sourceline)
 
 
 _TAG = re.compile(rb"<([^\s<>/!?=\"']+)")
 _NAME = re.compile(r"[^\W\d][\w.-]*")
 _SHOWN = 10
-"""Unknown elements that a warning names."""
+"""Maximum number of unknown elements that a warning names."""
 
 
 def attributes(element: etree._Element) -> dict[str, str]:
-    """An element's attributes. Raises UnreadableFile where there are more than any real file has."""
+    """Return an element's attributes. Raises UnreadableFile if there are more than ``MAX_ATTRIBUTES``."""
     count = len(element.attrib)
     if count > MAX_ATTRIBUTES:
         reason = f"<{element.tag}> has {count} attributes; the limit is {MAX_ATTRIBUTES}"
@@ -130,10 +130,9 @@ def attributes(element: etree._Element) -> dict[str, str]:
 
 
 def check_bounds(root: etree._Element, limits: Limits, data: bytes | None = None) -> None:
-    """Refuse attributes longer than a real map's; libxml2 itself stops at depth 256 and texts of 10 MB.
+    """Reject attributes longer than those of real maps; libxml2 itself stops at depth 256 and texts of 10 MB.
 
-    data: the bytes that the tree was read from, where they are at hand: without a long quoted run in them there is no
-    long attribute to look for.
+    data: the source bytes, if available: without a long quoted run in them the tree has no long attribute.
     """
     if data is not None and not _long_quote(data, limits.xml_attribute_bytes):
         return
@@ -143,9 +142,9 @@ def check_bounds(root: etree._Element, limits: Limits, data: bytes | None = None
 
 
 def _long_quote(data: bytes, limit: int) -> bool:
-    """Whether an attribute value of more than this many bytes may stand in it (``=``, a quote, no such quote for long).
+    """Return whether an attribute value may be longer than ``limit`` bytes (``=``, a quote, then no such quote).
 
-    An entity or a longer encoding makes the bytes more than the characters, never fewer.
+    With entities or longer encodings an attribute has more bytes than characters, never fewer.
     """
     if len(data) <= limit:
         return False

@@ -1,7 +1,7 @@
-"""A bundle of files -> layers: which file is which map, what a folder says, and which of two files is believed.
+"""Read a bundle of uploaded files into layers: detect formats, apply folder conventions, resolve conflicts.
 
-Only files that tell the same thing compete: ``X`` wins over ``X_autogen``, and of two
-files that tell one network, the richer format wins; the others stay sources. Nothing read is thrown away.
+Only files with the same content compete: ``X`` wins over ``X_autogen``, and of two files with the same network the
+richer format wins; the others are stored as sources. No content read is discarded.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from app.upload_reader.conflicts import resolve_conflicts
 from app.upload_reader.drawings import assign_layer
 
 TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
-"""The folders of an environment_template's ``config``; the folder says what a drawing is meant for."""
+"""Folders of an environment_template's ``config``, which determine the layer of a drawing."""
 
 _FOLDER_LAYER: Mapping[str, Layer] = {"location": "location", "topological": "topology", "world": "objects"}
 
 PACKAGE = "environment"
-"""The format of a folder with maps of other formats (environment_template)."""
+"""Format of a folder with maps of other formats (environment_template)."""
 
 VARIABLES_FILES = ("properties.sh", "environment.sh")
 
-_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(shell.OF_FILES))}) is left out: only a shell")
+_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(shell.OF_FILES))}) is skipped: only a shell")
 
 DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
 
@@ -56,7 +56,7 @@ _XML_ENDS = (".xml", ".osm", ".kml", ".sdf", ".world", ".gpx")
 
 
 def parse_drawn_layer(name: str | None) -> Layer | None:
-    """Check the layer that a drawing is meant for. Raises Invalid with the layers that it may be."""
+    """Check the layer requested for a drawing. Raises Invalid with the allowed layers."""
     for layer in DRAWN_LAYERS:
         if layer == name:
             return layer
@@ -67,7 +67,7 @@ def parse_drawn_layer(name: str | None) -> Layer | None:
 
 
 def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
-    """The files, each ``.zip`` among them replaced by its members (a KMZ is a format, not a folder)."""
+    """Replace each ``.zip`` among the files by its members (a KMZ is a format, not a folder)."""
     out: dict[str, bytes] = {}
     left = limits.unpacked_bytes
     for name, data in files.items():
@@ -79,18 +79,18 @@ def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
         for member, content in members.items():
             if member in out:
                 raise BadUpload(
-                    f"two files of the upload are called {member}: give them different names or folders",
-                    [Problem("this name is used twice", member)],
+                    f"duplicate file name {member} in the upload: use different names or folders",
+                    [Problem("duplicate name", member)],
                 )
             out[member] = content
     if len(out) > limits.files:
-        raise BadUpload(f"the upload has {len(out)} files; the limit is {limits.files}")
+        raise BadUpload(f"too many files in the upload: {len(out)}, the limit is {limits.files}")
     return out
 
 
 @contextlib.contextmanager
 def _errors_in_file(name: str) -> Iterator[None]:
-    """Errors within are told as this file's."""
+    """Add the file name to errors raised within the block."""
     try:
         yield
     except BadUpload as error:
@@ -101,9 +101,9 @@ def _errors_in_file(name: str) -> Iterator[None]:
 def read(
     files: Files, hints: UploadHints, context: EnvironmentContext, limits: Limits, *, inner: bool = False
 ) -> Bundle:
-    """All files of an upload (already unpacked) -> what they say together. inner: they are from one file of it.
+    """Read all files of an upload (already unpacked). inner: they are from one file of it.
 
-    Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
+    Raises BadUpload with the location of every problem, Invalid for unusable hints.
     """
     parse_drawn_layer(hints.layer)
     if not files:
@@ -114,7 +114,7 @@ def read(
             return bundle
         files = {name: data for name, data in files.items() if name not in exact_content.content_files(files, content)}
     if hints.format is not None and formats.get_format(hints.format).traits.is_container:
-        # A folder of other formats' maps is what any upload may be: each file is found out by its content.
+        # Any upload may be a folder of other formats' maps: detect each file's format by its content.
         template_files = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
         if template_files:
             hints = dataclasses.replace(hints, format=None)
@@ -141,7 +141,7 @@ def read(
     if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
         lacks = {name: text for name in sorted(files) if (text := _missing_metadata(name, files[name]))}
         known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
-        detail = f"none of the files is a map that is known here; name the format, one of: {known_formats}"
+        detail = f"no file has a recognised map format: set format to one of {known_formats}"
         detail += "".join(f"; {name}: {text}" for name, text in list(lacks.items())[:1])
         problems = [
             Problem(lacks[n], n) if n in lacks else _unread_file_warnings(n, files[n], limits) for n in sorted(files)
@@ -154,26 +154,26 @@ def read(
 
 
 def _report_unread_files(files: Files, bundle: Bundle) -> None:
-    """Take the credits of files that no format reads, and warn of those that may have been meant as maps."""
+    """Collect the credits of files that no format reads, and warn about those that may be intended as maps."""
     bundle.notices = {name: text for name, data in files.items() if (text := _notice(name, data))}
     for name, data in files.items():
         if data and not _UNREPORTED_FILES.search(PurePosixPath(name).name):
             lacking = _missing_metadata(name, data)
-            reason = "no format reads this file: it is kept as a source" + (f" ({lacking})" if lacking else "")
-            bundle.warnings.append(Problem(reason, name))
+            reason = "no format can read this file; it is stored as a source only"
+            bundle.warnings.append(Problem(reason + (f" ({lacking})" if lacking else ""), name))
 
 
 def _unread_files(files: Files) -> set[str]:
-    """The names of files that are neither a map nor belong to one."""
+    """List the names of files that are neither a map nor belong to one."""
     others = {n: d for n, d in files.items() if d and PurePosixPath(n).name not in VARIABLES_FILES}
     empty = {n for n, d in files.items() if not d}
     return empty | set(formats.group(others)[1] if others else ())
 
 
 def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Limits, bundle: Bundle) -> bool:
-    """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
+    """Read the exact layers that a package contains. Returns False, with a warning, if its maps are used instead."""
     if dataclasses.replace(hints, format=None) != UploadHints() or hints.format not in (None, PACKAGE):
-        content: exact_content.Content | str = "the upload says how its maps are to be read"
+        content: exact_content.Content | str = "the upload specifies how to read its maps"
     else:
         try:
             with _errors_in_file(main):
@@ -182,14 +182,14 @@ def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Lim
             raise
         except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
             reason = (
-                f"what is stored beside the maps is damaged: {formats.describe_parse_error(error)[1]}; remove its "
-                "folder"
+                f"the exact content beside the maps is damaged: {formats.describe_parse_error(error)[1]}; remove its "
+                "folder to read the maps instead"
             )
             raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
     if isinstance(content, str):
         for name in exact_content.content_files(files, main):
             bundle.files[name] = FileUse(PACKAGE, used=False)
-        bundle.warnings.append(Problem(f"not used, the maps of the package count: {content}", main))
+        bundle.warnings.append(Problem(f"exact content ignored; the maps of the package are used: {content}", main))
         return False
     bundle.files |= {name: FileUse(PACKAGE, used=True) for name in files if name not in content.added}
     _report_unread_files({name: files[name] for name in sorted(content.added)}, bundle)
@@ -200,7 +200,7 @@ def _read_exact_content(files: Files, main: str, hints: UploadHints, limits: Lim
 
 
 def _unread_file_warnings(name: str, data: bytes, limits: Limits) -> Problem:
-    """Why nobody knows a file: where its name or first bytes tell a syntax in which it does not parse, the line."""
+    """Explain why no format reads a file: with the line of the syntax error in a broken JSON, YAML or XML file."""
     end = PurePosixPath(name).suffix.lower()
     first = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
     try:
@@ -215,12 +215,12 @@ def _unread_file_warnings(name: str, data: bytes, limits: Limits) -> Problem:
         return dataclasses.replace(problem, file=name)
     except formats.BAD_INPUT as error:
         line, reason = formats.describe_parse_error(error)
-        return Problem(f"it cannot be parsed: {reason}", name, line)
-    return Problem("no known map format", name)
+        return Problem(f"syntax error: {reason}", name, line)
+    return Problem("no recognised map format", name)
 
 
 def template_folder(name: str) -> tuple[str, ...] | None:
-    """The path below ``config`` of an environment_template (``("metric", "map", "map.yaml")``), else None."""
+    """Return the path below ``config`` of an environment_template (``("metric", "map", "map.yaml")``), else None."""
     parts = PurePosixPath(name).parts
     for start, part in enumerate(parts[:-2]):
         if part == "config" and parts[start + 1] in TEMPLATE_FOLDERS:
@@ -229,7 +229,7 @@ def template_folder(name: str) -> tuple[str, ...] | None:
 
 
 def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
-    """The south-west corner of what stands on earth: of ``<bounds>`` where a file has them, else of the data."""
+    """Return the south-west corner of the WGS 84 parts: of ``<bounds>`` if a file has them, else of the data."""
     stated = [b for p in parts.values() if isinstance(p, Features) and (b := p.document.get("bounds"))]
     if stated:
         boxes = np.array(stated, float)
@@ -242,13 +242,13 @@ def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
         if not len(boxes):
             return None
     west, south, east = boxes[:, 0].min(), boxes[:, 1].min(), boxes[:, 2].max()
-    if east - west > 180.0:  # the data lies on both sides of the antimeridian: west is the smallest eastern longitude
+    if east - west > 180.0:  # the data crosses the antimeridian: west is the smallest eastern longitude
         west = boxes[boxes[:, 0] > 0.0, 0].min()
     return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
 def _notice(name: str, data: bytes) -> str | None:
-    """What a LICENSE, NOTICE or COPYING file says in a line: its title and who holds the copyright. None for others."""
+    """Summarise a LICENSE, NOTICE or COPYING file in one line: title and copyright holder. None for other files."""
     if not _LICENCE.fullmatch(PurePosixPath(name).name) or not data:
         return None
     text = data[:_NOTICE_BYTES].decode("utf-8", "replace")
@@ -278,16 +278,16 @@ def _group(files: Files, hints: UploadHints) -> tuple[list[FileGroup], list[str]
 def _complete_group(
     fmt: Format, groups: list[FileGroup], rest: list[str], files: Files, main_name: str | None
 ) -> FileGroup | None:
-    """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
+    """Find the file that is a map only together with the upload's options: an image with its position."""
     lone = {g.main for g in groups if g.format is fmt and fmt.claims.missing_metadata(g.main, g.files[g.main])}
     names = sorted(n for n in {*rest, *lone} if fmt.claims.missing_metadata(n, files[n]))
     if main_name is not None:
         names = [n for n in names if n == main_name or n.rpartition("/")[2] == main_name]
         if not names:
-            raise Invalid(f"no file of the upload is called {main_name!r}", [Problem("no such file", where="file")])
+            raise Invalid(f"the upload has no file {main_name!r}", [Problem("no such file", where="file")])
     if len(names) > 1:
         reason = (
-            f"the options say where one picture lies, and there are several, name it with file=…: {', '.join(names)}"
+            f"the options describe one picture, but the upload has several: select one with file=…: {', '.join(names)}"
         )
         raise Invalid(reason, [Problem(reason, where="file")])
     if not names:
@@ -298,14 +298,14 @@ def _complete_group(
 
 
 def _missing_metadata(name: str, data: bytes) -> str:
-    """What a file would need to be a map, where a format knows it."""
+    """Return the metadata that a file lacks to be a map, if a format recognises it; else an empty text."""
     if not data:
         return ""
     return next((text for f in formats.all_formats().values() if (text := f.claims.missing_metadata(name, data))), "")
 
 
 def _read_variables(files: Files, bundle: Bundle) -> set[str]:
-    """Literal assignments of ``properties.sh`` and ``environment.sh``; they are read and never run."""
+    """Read literal assignments of ``properties.sh`` and ``environment.sh``, without running them."""
     variables: dict[str, str] = {}
     names = sorted(n for n in files if PurePosixPath(n).name in VARIABLES_FILES and files[n])
     for name in names:
@@ -313,7 +313,7 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
             assigned, doubts = shell.assignments(files[name])
         variables.update({n: v for n, v in assigned.items() if v or n not in shell.OF_FILES})
         bundle.files[name] = FileUse(PACKAGE, used=True)
-        # Where the package's files lie is told anew whenever it is served: no loss worth a word.
+        # The export writes the paths of the package's files again: nothing is lost.
         bundle.warnings += [Problem(doubt, name) for doubt in doubts if not _OF_FILES.search(doubt)]
     if names:
         key = PartKey("objects", GROUND, PACKAGE)
@@ -323,8 +323,11 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
 
 
 def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]:
-    """Leave out what another file tells better, without reading it: ``X_autogen`` beside ``X``, a drawn network beside
-    a real one in ``topological/``, a drawn fence beside a datum in ``location/``."""
+    """Skip files that another file supersedes, without reading them.
+
+    These are ``X_autogen`` beside ``X``, a drawn network beside a real one in ``topological/``, and a drawn fence
+    beside a datum in ``location/``.
+    """
     mains = {g.main: g for g in groups}
     leaders = _leaders(groups)
     out = []
@@ -334,7 +337,7 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
         folder = (template_folder(name) or ("",))[0]
         sibling = name.replace("_autogen", "", 1) if "_autogen" in PurePosixPath(name).name else None
         if sibling in mains and mains[sibling].format is group.format:
-            reason = f"{sibling} is used instead of what was generated"
+            reason = f"{sibling} takes precedence over the generated file"
         elif (
             (group.format.traits.is_drawing or group.format.claims.gives_way)
             and folder == "topological"
@@ -354,12 +357,12 @@ def _skip_superseded(groups: list[FileGroup], bundle: Bundle) -> list[FileGroup]
             continue
         for file in group.files:
             bundle.files[file] = FileUse(group.format.name, used=False)
-        bundle.warnings.append(Problem(f"not used, kept as a source: {reason}", name))
+        bundle.warnings.append(Problem(f"ignored, stored as a source only: {reason}", name))
     return out
 
 
 def _leaders(groups: list[FileGroup]) -> dict[str, str]:
-    """Of each folder of an environment_template the format whose file is believed there, where one has such a file."""
+    """Return by folder of an environment_template the format that takes precedence there, if such a file exists."""
     out: dict[str, str] = {}
     for group in sorted(groups, key=lambda g: -g.format.claims.priority):
         folder = (template_folder(group.main) or ("",))[0]
@@ -374,7 +377,7 @@ def _applicable_options(group: FileGroup, hints: UploadHints) -> dict[str, str]:
 
 
 def _check_options(groups: list[FileGroup], hints: UploadHints) -> None:
-    """An option that no format of the upload knows is refused, not ignored."""
+    """Raise Invalid for an option that no format of the upload has."""
     option_names = {f.name for g in groups for f in dataclasses.fields(g.format.read_options)}
     for name in hints.options:
         if name not in option_names:
@@ -424,7 +427,7 @@ def _read_group(
         if bundle.datum is None:
             bundle.datum = layers.datum
         elif bundle.datum != layers.datum:
-            bundle.warnings.append(Problem("its datum differs from the one that is used", group.main))
+            bundle.warnings.append(Problem("its datum differs from that of another file; it is ignored", group.main))
     bundle.levels = join_levels(bundle.levels, [lv for lv in layers.levels if lv != Level()])
     return [ParsedPart(key, part, group) for key, part in parts.items() if not is_empty(part)]
 
@@ -432,7 +435,7 @@ def _read_group(
 def _folder_reader(
     hints: UploadHints, context: EnvironmentContext, limits: Limits, bundle: Bundle
 ) -> Callable[[Files], Layers] | None:
-    """What reads a folder inside one file of the upload (an archive that is no ``.zip``); one deep."""
+    """Return a reader for a folder inside one file of the upload (an archive other than ``.zip``), one level deep."""
     if bundle.inner:
         return None
 
@@ -451,13 +454,13 @@ def _choose_datum(bundle: Bundle, context: EnvironmentContext) -> None:
     if chosen is not None:
         bundle.datum = chosen
         reason = (
-            f"the environment has no datum: the south-west corner, latitude {chosen.latitude!r}, longitude "
-            f"{chosen.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
+            f"the environment has no datum; the south-west corner of the data (latitude {chosen.latitude!r}, longitude "
+            f"{chosen.longitude!r}) is used. Upload a datum.yaml or PATCH the environment to set another"
         )
         bundle.warnings.append(Problem(reason))
         if abs(chosen.latitude) == MAX_DATUM_LATITUDE:
             reason = (
-                f"the data begins at or beyond {chosen.latitude:g} degrees of latitude, and no datum lies nearer to a "
-                "pole: metres far from the datum are not exact; use local metres there"
+                f"the data extends beyond the datum limit of {chosen.latitude:g} degrees latitude; metres far from the "
+                "datum are inexact. Use local metres near the poles"
             )
             bundle.warnings.append(Problem(reason))

@@ -1,4 +1,4 @@
-"""What is known of an upload: hints of its sender, the environment's context, and what its files say together."""
+"""Data of an upload: hints of its sender, context of the environment, and the content of its files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.model.layers import Layer, Layers, Part, PartKey, join_levels
 
 @dataclass(frozen=True, slots=True)
 class UploadHints:
-    """What the sender said of the files; everything else is found out from their content."""
+    """Hints of the sender about the files; everything else is detected from their content."""
 
     format: str | None = None
     layer: Layer | None = None
@@ -28,7 +28,7 @@ class UploadHints:
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentContext:
-    """What the environment knows already, and what will be used of the files (see ``ReadContext``)."""
+    """Context of the environment, and the content that will be used (see ``ReadContext``)."""
 
     datum: Datum | None = None
     fence: shapely.Polygon | None = None
@@ -39,7 +39,7 @@ class EnvironmentContext:
 
 @dataclass(frozen=True, slots=True)
 class ParsedPart:
-    """One part as one file told it."""
+    """One part read from one file."""
 
     key: PartKey
     part: Part
@@ -48,7 +48,7 @@ class ParsedPart:
 
 @dataclass(slots=True)
 class FileUse:
-    """What became of a file."""
+    """Use of a file: its format and whether it is used."""
 
     format: str | None = None
     used: bool = False
@@ -56,7 +56,7 @@ class FileUse:
 
 @dataclass(slots=True)
 class Bundle:
-    """What the files say together: parts by key, each with the files and format it came from."""
+    """Combined content of the files: parts by key, each with its files and format."""
 
     parts: dict[PartKey, Part] = field(default_factory=dict)
     origin: dict[PartKey, tuple[tuple[str, ...], str]] = field(default_factory=dict)
@@ -70,7 +70,7 @@ class Bundle:
     inner: bool = False
 
     def credit(self, key: PartKey) -> tuple[str, ...]:
-        """Licences and credits of a part: what its files say themselves, and the licence files of their folders."""
+        """Collect the licences and credits of a part, from its files and the licence files in their folders."""
         part = self.parts[key]
         attribution = part.document.get("attribution", ()) if isinstance(part, Features) else ()
         attribution = part.attribution if isinstance(part, GeoImage) else attribution
@@ -84,5 +84,5 @@ class Bundle:
         return tuple(dict.fromkeys(texts))
 
     def layers(self, datum: Datum | None) -> Layers:
-        """The parts under a datum (the bundle's own wins)."""
+        """Return the parts as layers with a datum; the bundle's own takes precedence."""
         return Layers(dict(self.parts), self.datum or datum, join_levels((Level(),), self.levels))

@@ -1,4 +1,4 @@
-"""Parts of several files under one key: what belongs together is joined, of rivals one is believed."""
+"""Resolve parts of several files with the same key: join parts that belong together, else choose one."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _SINGLE_SOURCE_LAYERS: Mapping[str, str] = {
     "voxels": "voxel map {name}",
     "imagery": "picture {name}",
 }
-"""Layers of which one file's word is enough, as a user calls them."""
+"""Names shown to users of the layers that come from one file only."""
 
 
 def resolve_conflicts(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
-    """Join what belongs together; where two files tell the same network, site or grid, believe one of them."""
+    """Join parts that belong together; of several files with the same network, site or grid, use one."""
     by_key: dict[PartKey, list[ParsedPart]] = {}
     for one in parsed_parts:
         by_key.setdefault(one.key, []).append(one)
     useful: set[str] = set()
     renamed: dict[str, dict[str, str]] = {}
-    for key, rivals in sorted(by_key.items()):  # objects come before the topology that was drawn from them
+    for key, rivals in sorted(by_key.items()):  # objects come before the topology read from the same drawing
         winners = rivals
         if key.layer in _SINGLE_SOURCE_LAYERS and len(rivals) > 1:
             rivals.sort(key=_priority)
@@ -40,7 +40,7 @@ def resolve_conflicts(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
                     useful.add(loser.group.main)
                     continue
                 noun = _SINGLE_SOURCE_LAYERS[key.layer].format(name=key.name)
-                reason = f"its {noun} is not used: {winners[0].group.main} tells it"
+                reason = f"its {noun} is ignored: {winners[0].group.main} takes precedence"
                 bundle.warnings.append(Problem(reason, loser.group.main))
         useful.update(w.group.main for w in winners)
         bundle.parts[key] = _join(winners, renamed)
@@ -53,7 +53,7 @@ def resolve_conflicts(parsed_parts: list[ParsedPart], bundle: Bundle) -> None:
 
 
 def _merge_fence_style(winners: list[ParsedPart], loser: ParsedPart) -> bool:
-    """A drawn fence in the same place as the believed one: its name and style go along, and nothing is lost."""
+    """Merge name and style of a drawn fence into an equal one that takes precedence. Returns whether they are equal."""
     site, drawn = winners[0].part, loser.part
     if not (isinstance(site, Features) and isinstance(drawn, Features) and len(site) == len(drawn) == 1):
         return False
@@ -73,7 +73,7 @@ def _priority(one: ParsedPart) -> tuple[object, ...]:
 
 
 def _join(candidates: list[ParsedPart], renamed: dict[str, dict[str, str]]) -> Part:
-    """Several files' parts of one key as one; ids that repeat are made distinct, and ``renamed`` remembers how."""
+    """Join several files' parts of one key. Duplicate ids get a suffix, recorded in ``renamed``."""
     if len(candidates) == 1:
         part = candidates[0].part
         new = renamed.get(candidates[0].group.main, {})

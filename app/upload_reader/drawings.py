@@ -1,4 +1,4 @@
-"""A drawing's lines and polygons as the layer that they were drawn for."""
+"""Assign a drawing's lines and polygons to the layer that they are drawn for."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
 
 
 SAME_PLACE_DEGREES = 1e-7
-"""About a centimetre: two fences whose corners are nearer are one."""
+"""Tolerance of equal fences, in degrees: about a centimetre."""
 
 
 def assign_layer(
@@ -32,7 +32,7 @@ def assign_layer(
     file: str,
     bundle: Bundle,
 ) -> dict[PartKey, Part]:
-    """A drawing's lines and polygons as the layer they were drawn for."""
+    """Move a drawing's lines and polygons to the layer that they are drawn for."""
     out = dict(parts)
     for key, part in parts.items():
         if key.layer != "objects" or not isinstance(part, Features) or not len(part):
@@ -44,7 +44,7 @@ def assign_layer(
             frame = local_frame(datum or context.datum) if datum or context.datum else None
             drawn = part if lines.any() else part.select(areas)
             if not lines.any() and not areas.any():
-                bundle.warnings.append(Problem("it has no lines or polygons to make a network of", file))
+                bundle.warnings.append(Problem("it has no lines or polygons; no network is created", file))
                 continue
             drawn_network = network.from_drawing(drawn, frame=frame, outlines=not lines.any())
             out[PartKey("topology", level, NETWORK)] = drawn_network
@@ -59,7 +59,7 @@ def assign_layer(
 def _move(
     parts: dict[PartKey, Part], key: PartKey, part: Features, mask: NDArray[np.bool_], to: PartKey, kind: str
 ) -> None:
-    """Take these features out of the objects and into another layer; the drawing's document goes along."""
+    """Move features from the objects to another layer, with the drawing's collection document."""
     if not mask.any():
         return
     moved = part.select(mask)
@@ -72,7 +72,7 @@ def _move(
 def _is_own_fence(
     part: Features, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
 ) -> NDArray[np.bool_]:
-    """Which of the polygons is the environment's own fence: a mask with at most one True."""
+    """Find the environment's fence among the polygons: a mask with at most one True."""
     indices = np.flatnonzero(areas & ~part.local)
     chosen = np.zeros(len(part), bool)
     fence = bundle.fence or context.fence
@@ -85,6 +85,6 @@ def _is_own_fence(
         chosen[indices if len(indices) == 1 else named] = True
     elif len(indices):
         bundle.warnings.append(
-            Problem("none of its polygons is called fence, so all are kept as regions and no GNSS fence is set", file)
+            Problem("no polygon is named fence; all polygons become regions and no GNSS fence is set", file)
         )
     return chosen

@@ -57,7 +57,7 @@ def test_alignment_with_another_grid_keeps_cells(api: Api, env: str) -> None:
     assert alignment["before"] == [4.0, -1.0, 0.3]
     assert origin(api, env, "other") == pytest.approx([-3.0, 2.0, 0.0], abs=0.05)
     assert api.get(f"environments/{env}/versions/latest/maps/occupancy_grid/other.pgm").content == before
-    assert any("keep their place" in w["problem"] for w in result["warnings"])
+    assert any("only the grid moves" in w["problem"] for w in result["warnings"])
     layers = api.get(f"environments/{env}/versions/latest/layers").json()
     assert next(row for row in layers if row["name"] == "other")["information"] == "raw"
     report = api.get(f"environments/{env}/versions/latest/reports/occupancy_grid?grid=other").json()

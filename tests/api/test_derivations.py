@@ -84,7 +84,7 @@ def test_derivation_with_equal_result_clears_stale(api: Api, env: str) -> None:
     assert (version["version"], version["root"], version["stale"]) == (5, stale["root"], [])
     assert version["changes"] == {"renewed": [{"layer": "topology", "level": "ground", "name": "network"}]}
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
-    assert not any("derive it anew" in w["problem"] for w in report["warnings"])
+    assert not any("Derive it again" in w["problem"] for w in report["warnings"])
     assert api.get(f"environments/{env}/diff?from=4&to=5").json()["layers"] == {}
     assert derive(api, env, expect=200, parameters={"join": 0.5})["version"] == 5, "now nothing changes"
     assert api.get(f"environments/{env}/versions/4").json()["stale"] == stale["stale"], "old versions do not change"
@@ -99,7 +99,7 @@ def test_derivation_keeps_edited_layers(api: Api, env: str) -> None:
     api.upload(env, lanes("0.002,0.002"))
     assert b"node: dock" in api.get(f"/maps/{env}/tmap2").content
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
-    assert any("derive it anew" in w["problem"] for w in report["warnings"])
+    assert any("Derive it again" in w["problem"] for w in report["warnings"])
     refused = derive(api, env, expect=409)
     assert "replace=true" in refused["detail"]
     assert b"node: dock" not in api.get(f"/maps/{env}/tmap2").content or derive(api, env, replace=True)

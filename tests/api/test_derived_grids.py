@@ -153,7 +153,7 @@ def test_fallback_derivation_adds_a_warning(api: Api) -> None:
     for report in (fetch_report(api, "lane"), direct.offline(files, "occupancy_grid").report.as_dict()):
         line = next(line for line in report["layers"] if line["layer"] == "occupancy")
         assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
-        (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]
+        (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].endswith("another derivation was used")]
         assert "objects_to_occupancy failed" in warning
         assert "walls.stl is missing" in warning
 

@@ -63,7 +63,7 @@ def test_edited_fence_sets_the_datum(api: Api, farm: str) -> None:
     fence["properties"]["datum"]["latitude"] += 0.001
     body = edit(api, farm, put("location", fence))
     assert set(body["changes"]) == {"datum"}
-    assert "local items keep their metres" in body["warnings"][0]["problem"]
+    assert "features with local anchor keep their metres" in body["warnings"][0]["problem"]
     assert api.get(f"environments/{farm}").json()["datum"]["latitude"] == pytest.approx(samples.LATITUDE + 0.001)
     (after,) = features(api, farm, "location").values()
     assert after["geometry"] == fence["geometry"]

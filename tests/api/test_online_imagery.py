@@ -266,8 +266,8 @@ def test_url_templates_support_tms_rows_and_wmts_names() -> None:
     ("behaviour", "error", "message"),
     [
         ("forbidden", CannotDerive, r"refuses \(403\)"),
-        ("broken", Unavailable, "answers 503"),
-        ("failing", Unavailable, "answers 500"),
+        ("broken", Unavailable, "returns 503"),
+        ("failing", Unavailable, "returns 500"),
         ("html", CannotDerive, "sends 'text/html'"),
         ("disguised", CannotDerive, "neither PNG nor JPEG"),
         ("huge", CannotDerive, "FLEETMAP_IMAGERY_MAX_BYTES"),
@@ -424,7 +424,7 @@ def test_site_gets_its_image(provider: Misbehaving, tmp_path: Path) -> None:
         assert (stale["layer"], stale["changed"]) == ("imagery", ["location ground/site"])
         assert api.get("/maps/farm/satellite").status_code == 200
         report = api.get("environments/farm/versions/latest/reports/satellite").json()
-        assert any("derive it anew" in w["problem"] for w in report["warnings"])
+        assert any("Derive it again" in w["problem"] for w in report["warnings"])
         assert api.post(path, request).json()["stale"] == []
         # The datum moves, too; the new image is the same, and no longer stale.
         place = {"latitude": 53.2682, "longitude": -0.5251, "altitude": 20.0}

@@ -1,4 +1,4 @@
-"""Measure and print: conversions to floors, first GET to the bare conversion, GETs to a peer; large maps; events."""
+"""Measure conversions against floors, first GET against conversion, GETs against a peer, large maps, events."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HERE = Datum(53.268642038, -0.524509505881)
 
 
 def best(work: Callable[[], Any], tries: int) -> float:
-    """Milliseconds of the fastest of several tries, after one that does not count."""
+    """Measure the fastest of several tries in milliseconds, after a warm-up."""
     work()
     times = []
     for _ in range(tries):
@@ -41,7 +41,7 @@ def best(work: Callable[[], Any], tries: int) -> float:
 
 
 def conversions(tries: int) -> list[dict[str, Any]]:
-    """Our conversion against its floor, taken in turns."""
+    """Measure our conversions and their floors alternately."""
 
     def data(name: str) -> bytes:
         return (DATA / name).read_bytes()
@@ -107,7 +107,7 @@ def conversions(tries: int) -> list[dict[str, Any]]:
 
 
 def serving(tries: int) -> list[dict[str, Any]]:
-    """A running server: the first GET against the bare conversion, repeated GETs against a bare Starlette route."""
+    """Measure a server: first GET against the bare conversion, repeated GETs against a bare Starlette route."""
     rows: list[dict[str, Any]] = []
     port, peer = http.free_port(), http.free_port()
     token = "bench-" + "0" * 40
@@ -139,7 +139,7 @@ def _first_gets(client: httpx.Client, tries: int) -> list[dict[str, Any]]:
             if more:
                 body["datum"] = {"latitude": HERE.latitude + k * 1e-6, "longitude": HERE.longitude}
             client.post("/api/v1/environments", json=body).raise_for_status()
-            # Each try is another content, so that nothing is in the cache: a node is moved by a micrometre-sized edit.
+            # Each try edits a node by a micrometre, so that nothing is in the cache.
             answer = client.post(f"/api/v1/environments/{env}/versions", files=[("files", (name, data))])
             answer.raise_for_status()
             if not more and k:
@@ -185,7 +185,7 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
         ("repeated GET, 304", one, "/1k", {"If-None-Match": tag}, {"If-None-Match": '"tag"'}, 0.6),
     ):
         ours, theirs = [], []
-        for _ in range(3):  # in turns, so that a noisy machine is noisy to both
+        for _ in range(3):  # alternately, so that noise affects both
             theirs.append(http.rate(peer, peer_path, peer_more))
             ours.append(http.rate(port, ours_path, {**auth, **more}))
         ours_best, bare = max(ours), max(theirs)
@@ -204,7 +204,7 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
 
 
 def farm_grid() -> OccupancyGrid:
-    """The real map of 4000 × 4000 cells."""
+    """Read the real map of 4000 × 4000 cells."""
     files = {name: (DATA / FARM / "metric/map" / name).read_bytes() for name in ("map.yaml", "map.png")}
     upload_bundle = upload_reader.read(
         files, UploadHints(), upload_reader.EnvironmentContext(None, None, None, True, False), Limits()
@@ -214,7 +214,7 @@ def farm_grid() -> OccupancyGrid:
 
 
 def memory() -> list[dict[str, Any]]:
-    """Time and peak memory of large maps, each in a process of its own."""
+    """Measure time and peak memory of large maps, each in a separate process."""
     rows = []
     for name in large.CASES:
         with tempfile.TemporaryDirectory() as folder:
@@ -223,7 +223,7 @@ def memory() -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Print the tables (or JSON); exit status 1 where a bound does not hold."""
+    """Print the tables (or JSON). Returns 1 if a bound is exceeded."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--tries", type=int, default=7, help="counted runs of each conversion (default 7)")
     parser.add_argument("--json", action="store_true", help="machine-readable output")

@@ -1,4 +1,4 @@
-"""Small changes to a real site, and what a robot takes in for them: all bodies that its agent receives in one sync."""
+"""Bytes that a robot's agent receives in one sync after a small change to a real site."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from app.agent.agent import Agent, AgentOptions
 FARM = "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config"
 
 Upload = Callable[[str, dict[str, bytes]], Any]
-"""(environment, files): makes a version; of an environment that is new, the environment too."""
+"""Function (environment, files) that creates a version, and the environment if it does not exist."""
 
 
 def moved_node(shared: Path, upload: Upload, server: str, token: str) -> int:
-    """One node of the strawberry polytunnels' network is moved by 25 cm: bytes."""
+    """Move one node of the strawberry polytunnels' network by 25 cm. Returns bytes."""
     network = (shared / FARM / "topological/network.tmap2.yaml").read_bytes()
     matches = list(re.finditer(rb"\n      position:\n        x: (\S+)", network))
     x = matches[len(matches) // 2]
@@ -31,7 +31,7 @@ def moved_node(shared: Path, upload: Upload, server: str, token: str) -> int:
 
 
 def changed_block(shared: Path, upload: Upload, server: str, token: str) -> tuple[int, int]:
-    """A solid block of 400 × 400 cells in the polytunnels' grid of 4000 × 4000: bytes, and those of its new PNG."""
+    """Fill a block of 400 × 400 cells in the polytunnels' grid of 4000 × 4000. Returns bytes and the new PNG's size."""
     folder = shared / FARM / "metric/map"
     described, picture = (folder / "map.yaml").read_bytes(), (folder / "map.png").read_bytes()
     cells = np.array(Image.open(io.BytesIO(picture)).convert("L"))

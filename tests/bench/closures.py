@@ -1,4 +1,4 @@
-"""Closures: from an editor's acceptance to 100 agents that hold files with it.
+"""Closures: time from an editor's acceptance until 100 agents run files with it.
 
 ``python -m tests.bench.closures fleet …`` is one of the processes that ``rows`` starts.
 """
@@ -21,7 +21,7 @@ from app.agent.agent import Agent
 from app.agent.options import AgentOptions
 from app.events import messages
 from tests.bench import http
-from tests.bench.events import ENVIRONMENT, TOKEN, served
+from tests.bench.events import ENVIRONMENT, TOKEN, serve_network
 
 ROBOTS = 100
 PROCESSES = 10
@@ -31,14 +31,14 @@ CHANNEL = "production"
 
 
 def rows() -> list[dict[str, Any]]:
-    """Half of all agents, 99 of 100, and the slowest; every closure is accepted and ended again."""
+    """Measure the median, the 99th of 100 and the slowest agent; every closure is accepted and ended again."""
     port, zenoh_port = http.free_port(), http.free_port()
-    # 100 robots have 100 disks: here their folders are in memory, if that is available.
+    # 100 robots have 100 disks: put their folders into memory if possible.
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with (
         tempfile.TemporaryDirectory() as folder,
         tempfile.TemporaryDirectory(dir=memory) as disks,
-        served(Path(folder), port, zenoh_port) as client,
+        serve_network(Path(folder), port, zenoh_port) as client,
     ):
         base = f"/api/v1/environments/{ENVIRONMENT}"
         client.put(f"{base}/channels/{CHANNEL}", json={"version": 1}).raise_for_status()
@@ -74,13 +74,13 @@ def rows() -> list[dict[str, Any]]:
 
 
 def _digest(client: httpx.Client) -> str:
-    """Digest of the closures in force."""
+    """Return the digest of the closures in force."""
     answer = client.get(f"/api/v1/environments/{ENVIRONMENT}/versions/{CHANNEL}/manifest?formats=tmap2")
     return str(answer.raise_for_status().json()["overlays_digest"])
 
 
 class _Fleet:
-    """The fleet's processes, and when each agent switched to files with which closures."""
+    """Processes of the fleet, with the times at which each agent switched to files with which closures."""
 
     def __init__(self, server: str, zenoh_port: int, folder: Path) -> None:
         self._switched: dict[str, dict[str, float]] = {}
@@ -106,7 +106,7 @@ class _Fleet:
                 self._switched.setdefault(line["digest"], {}).setdefault(line["robot"], line["at"])
 
     def wait_for(self, digest: str, seconds: float) -> list[float]:
-        """When each agent held files with these closures."""
+        """Wait until all agents run files with these closures. Returns the time of each."""
         deadline = time.monotonic() + seconds
         while True:
             with self._lock:
@@ -118,7 +118,7 @@ class _Fleet:
             time.sleep(0.01)
 
     def forget(self) -> None:
-        """Forget what was held so far: no closures are in force again after each closure."""
+        """Clear the recorded times, since after each closure none is in force again."""
         with self._lock:
             self._switched.clear()
 
@@ -130,7 +130,7 @@ class _Fleet:
 
 
 def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> None:
-    """So many agents in this process: a line whenever one has switched, until it is killed."""
+    """Run ``count`` agents in this process until it is killed; print a line whenever one has switched."""
     lock = threading.Lock()
 
     def report_as(robot: str, current: Path) -> Any:

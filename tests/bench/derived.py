@@ -1,7 +1,7 @@
-"""Derivations of grids of 20 000 × 14 000 cells (2.8·10⁸): how long they take, and the process's peak memory.
+"""Time and peak memory of derivations of grids with 20 000 × 14 000 cells (2.8·10⁸).
 
-Each runs in a process of its own, which has derived the same of a small site before, so that native code is compiled.
-The peak is the kernel's (VmHWM) of the whole process: Python, libraries, what is derived from, and the result.
+Each runs in a separate process after the same derivation of a small site, so that native code is compiled. The peak is
+the kernel's (VmHWM) of the complete process: Python, libraries, inputs and result.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from tests.bench.memory import peak, reset
 WIDTH, HEIGHT = 20_000, 14_000
 RESOLUTION = 0.05
 MOST = 3e9
-"""Bytes."""
+"""Limit of peak memory, in bytes."""
 
 ROOM = 200
-"""Cells along a room's side: ten metres."""
+"""Side of a room in cells: ten metres."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One derivation. make(scale) gives the layers, scale being of the sides."""
+    """One derivation. make(scale) builds the layers; scale is of the sides."""
 
     name: str
     make: Callable[[float], Layers]
@@ -44,7 +44,7 @@ class Case:
 
 
 def rooms(scale: float) -> Layers:
-    """Rooms of ten metres with doors of one metre to their neighbours, furniture, and unknown cells at the edge."""
+    """Build rooms of ten metres with doors of one metre to their neighbours, furniture, and an unknown border."""
     height, width = round(HEIGHT * scale), round(WIDTH * scale)
     cells = np.full((height, width), FREE, np.uint8)
     for y in range(0, height, ROOM):
@@ -62,7 +62,7 @@ def rooms(scale: float) -> Layers:
 
 
 def yard(scale: float) -> Layers:
-    """One open yard with a few posts: no cell is far from free, and no obstacle near to most."""
+    """Build one open yard with a few posts: most cells are free and far from obstacles."""
     height, width = round(HEIGHT * scale), round(WIDTH * scale)
     cells = np.full((height, width), FREE, np.uint8)
     for y in range(ROOM, height - ROOM, 9 * ROOM):
@@ -73,7 +73,7 @@ def yard(scale: float) -> Layers:
 
 
 def walls(scale: float) -> Layers:
-    """The walls of as many rooms, as lines; the last ones in the corners make the grid as large as is told."""
+    """Build the walls of as many rooms, as lines; the last ones in the corners give the grid its full size."""
     side, width, height = ROOM * RESOLUTION, WIDTH * scale * RESOLUTION, HEIGHT * scale * RESOLUTION
     rows: list[tuple[str, Any, dict[str, Any]]] = []
     for x in np.arange(1.0, width - 2.0, side).tolist():
@@ -86,7 +86,7 @@ def walls(scale: float) -> Layers:
 
 
 def aisles(scale: float) -> Layers:
-    """A network of ways two metres wide, ten metres apart."""
+    """Build a network of paths two metres wide, ten metres apart."""
     side, width, height = ROOM * RESOLUTION, WIDTH * scale * RESOLUTION, HEIGHT * scale * RESOLUTION
     xs = [*np.arange(2.0, width - 2.0, side).tolist(), width - 2.1]
     ys = [*np.arange(2.0, height - 2.0, side).tolist(), height - 2.1]
@@ -122,7 +122,7 @@ SMALL = 0.05
 
 
 def measure(name: str) -> dict[str, Any]:
-    """One case in a process of its own."""
+    """Measure one case in a separate process."""
     command = [sys.executable, "-m", "tests.bench.derived", name]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -132,7 +132,7 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def run(case: Case, scale: float) -> Layers:
-    """Derive it once."""
+    """Run the derivation once."""
     derivation = derive.all_derivations()[case.step]
     return derivation.function(case.make(scale), derivation.parameters(**case.parameters), DerivationNotes())
 

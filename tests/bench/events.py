@@ -1,4 +1,4 @@
-"""Events: from a commit to 100 sessions against a bare put to them; 500 robots that come back after a router's restart.
+"""Events: latency from a commit to 100 sessions against a bare put; 500 robots after a router's restart.
 
 ``python -m tests.bench.events put …`` and ``… fleet …`` are the processes that ``latency`` and ``convergence`` start.
 """
@@ -37,7 +37,7 @@ SESSIONS = 100
 COMMITS = 30
 ROBOTS = 500
 PROCESSES = 20
-"""So many robots in one process wait for one another more than for the server: 25 do not."""
+"""Number of processes, for 25 robots each: more robots in a process wait more for each other than for the server."""
 ALLOWED_MS = 20.0
 CONVERGED_SECONDS = 10.0
 TOKEN = "bench-" + "0" * 40
@@ -46,7 +46,7 @@ SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
 def network(moved: float = 0.0, count: int = 100) -> bytes:
-    """A network; one of its nodes can be moved."""
+    """Build a network; one of its nodes can be moved."""
     lines = ["name: field", "metric_map: field", "pointset: field", "nodes:"]
     for k in range(count):
         x = k + (moved if k == count // 2 else 0.0)
@@ -66,10 +66,10 @@ def network(moved: float = 0.0, count: int = 100) -> bytes:
 
 
 @contextlib.contextmanager
-def served(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
-    """A server with an environment of one network, and a client of it."""
+def serve_network(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
+    """Run a server with an environment of one network, and yield a client."""
     compiled = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
-    native.fill(compiled)  # what a server compiles in its first minute ever is no part of this
+    native.fill(compiled)  # compile before the measurement
     env = {
         "NUMBA_CACHE_DIR": str(compiled),
         "FLEETMAP_DATA_DIR": str(folder),
@@ -95,7 +95,7 @@ def served(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[ht
 
 
 def commit(client: httpx.Client, moved: float) -> int:
-    """Another version: its number."""
+    """Commit another version; return its number."""
     files = [("files", ("n.tmap2.yaml", network(moved)))]
     answer = client.post(f"/api/v1/environments/{ENVIRONMENT}/versions", files=files)
     answer.raise_for_status()
@@ -103,7 +103,7 @@ def commit(client: httpx.Client, moved: float) -> int:
 
 
 def open_session(port: int) -> zenoh.Session:
-    """A robot's session."""
+    """Open a robot's session."""
     config = zenoh.Config()
     for key, value in (
         ("mode", "client"),
@@ -115,18 +115,17 @@ def open_session(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
-# --- from a commit to its event --------------------------------------------------------------------------------------
+# --- latency from commit to event ------------------------------------------------------------------------------------
 
 
 def latency() -> list[dict[str, Any]]:
-    """Half of all deliveries of an event at 100 sessions, from its commit, against the same bytes put by a bare session
-    to plain subscribers of the same sessions.
+    """Measure the median delivery time of an event at 100 sessions after its commit.
 
-    The commit is seen by the number that the store changes right after it (``app.store.commit_counter``): the last
-    change before the event came first.
+    The reference is a bare session that puts the same bytes to plain subscribers of the same sessions. The time of the
+    commit is the last change of the store's commit counter (``app.store.commit_counter``) before the first delivery.
     """
     port, zenoh_port = http.free_port(), http.free_port()
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
+    with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:
         sessions = [open_session(zenoh_port) for _ in range(SESSIONS)]
         arrived: list[tuple[float, bytes]] = []
         bare: list[tuple[float, bytes]] = []
@@ -191,7 +190,7 @@ def latency() -> list[dict[str, Any]]:
 
 
 def put(port: int, count: int, size: int) -> None:
-    """Bare puts of so many bytes, each with the time at which it was handed over."""
+    """Put ``size`` bytes ``count`` times, each with its send time."""
     session = open_session(port)
     publisher = session.declare_publisher("bare/events", express=True)
     time.sleep(2.0)
@@ -208,7 +207,7 @@ def put(port: int, count: int, size: int) -> None:
 
 
 class Light(Agent):
-    """An agent that notes the sequences that it hears."""
+    """Agent that records the sequences that it receives."""
 
     def __init__(self, options: AgentOptions, say: Any) -> None:
         self.heard: list[int] = []
@@ -220,7 +219,7 @@ class Light(Agent):
 
 
 def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> None:
-    """So many agents in this process: a line for each thing that matters, until standard input ends."""
+    """Run ``count`` agents in this process until standard input ends; print a line for each relevant event."""
     lock = threading.Lock()
 
     def tell_as(robot: str) -> Any:
@@ -265,7 +264,7 @@ def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> 
 
 
 class _Robots:
-    """The fleet's processes, and what their agents said."""
+    """Processes of the fleet, with the lines that their agents printed."""
 
     def __init__(self, server: str, zenoh_port: int, folder: Path) -> None:
         each = ROBOTS // PROCESSES
@@ -291,7 +290,7 @@ class _Robots:
             self.lines.append(json.loads(line))
 
     def times(self, event: str, version: int | None = None, after: float = 0.0) -> dict[str, float]:
-        """Robot -> when it first said so."""
+        """Return the first time of an event, by robot."""
         out: dict[str, float] = {}
         for line in list(self.lines):
             fits = line["event"] == event and (version is None or line.get("version") == version)
@@ -300,7 +299,7 @@ class _Robots:
         return out
 
     def end(self) -> dict[str, list[int]]:
-        """Stop all: robot -> the sequences that it heard."""
+        """Stop all agents; return the received sequences by robot."""
         for process in self._processes:
             assert process.stdin is not None
             process.stdin.close()
@@ -311,20 +310,20 @@ class _Robots:
 
 
 def convergence() -> list[dict[str, Any]]:
-    """The router is killed, a change is committed, the router comes back: until all 500 agents drive on the change."""
+    """Measure the time from a router's restart until all 500 agents run a change committed meanwhile."""
     port, zenoh_port = http.free_port(), http.free_port()
     endpoint = f"tcp/127.0.0.1:{zenoh_port}"
     options = router_configuration(BusOptions(listen=endpoint))
     router = Router(options)
-    # 500 robots have 500 disks: here their folders are in memory, where that is to be had.
+    # 500 robots have 500 disks: put their folders into memory if possible.
     shared = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     disk = Path(tempfile.mkdtemp(dir=shared))
     more = {"FLEETMAP_ZENOH_MODE": "client", "FLEETMAP_ZENOH_CONNECT": endpoint, "FLEETMAP_ZENOH_ADVERTISE": endpoint}
     try:
-        with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port, **more) as client:
+        with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port, **more) as client:
             robots = _Robots(f"http://127.0.0.1:{port}", zenoh_port, disk)
             _until(lambda: len(robots.times("active", 1)) == ROBOTS and len(robots.times("connected")) == ROBOTS, 300)
-            # All hear of a change at once: one conversion.
+            # All receive a change at once: one conversion.
             count_before, at = conversions(client), time.monotonic()
             second = commit(client, 1.0)
             _until(lambda: len(robots.times("active", second)) == ROBOTS, 120)
@@ -377,18 +376,18 @@ def convergence() -> list[dict[str, Any]]:
 
 
 def conversions(client: httpx.Client) -> int:
-    """Maps that the server has made."""
+    """Count the maps that the server has converted."""
     match = re.search(r'fleetmap_conversions_total\{format="tmap2",result="made"\} (\S+)', client.get("/metrics").text)
     return int(float(match[1])) if match else 0
 
 
-# --- what a change costs a robot --------------------------------------------------------------------------------------
+# --- bytes per change -------------------------------------------------------------------------------------
 
 
 def costs() -> list[dict[str, Any]]:
-    """Bytes for small changes of a real site."""
+    """Measure the bytes for small changes of a real site."""
     port, zenoh_port = http.free_port(), http.free_port()
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
+    with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:
 
         def upload(env: str, files: dict[str, bytes]) -> None:
             client.post("/api/v1/environments", json={"name": env})
@@ -421,7 +420,7 @@ def costs() -> list[dict[str, Any]]:
 
 
 def rows() -> list[dict[str, Any]]:
-    """All of it."""
+    """Run all measurements."""
     return [*costs(), *latency(), *convergence()]
 
 

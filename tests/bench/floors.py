@@ -1,7 +1,7 @@
-"""The floors: the same work by the fastest parser and a string writer, without checks, options or layers.
+"""Floors: the same conversions by the fastest parser and a string writer, without checks, options or layers.
 
-Each function takes the input's bytes and returns the output's text, as somebody would write it who knows the file in
-hand. They are what our conversions are measured against, not a second implementation.
+Each function takes the input's bytes and returns the output's text, specialised for one given file. They are the
+reference for our benchmarks, not a second implementation.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _local(lonlat: np.ndarray) -> np.ndarray:
 
 
 def osm_to_tmap2(data: bytes) -> str:
-    """Highway nodes and segments of an OSM file."""
+    """Convert highway nodes and segments of an OSM file."""
     root = etree.fromstring(data)
     place = {n.get("id"): (float(n.get("lon")), float(n.get("lat"))) for n in root.iterfind("node")}
     links: dict[str, list[str]] = defaultdict(list)
@@ -65,7 +65,7 @@ def osm_to_tmap2(data: bytes) -> str:
 
 
 def kml_to_tmap2(data: bytes) -> str:
-    """Lines (or rings) of a drawing as a network: each vertex a node, each segment two edges."""
+    """Convert lines (or rings) of a drawing to a network: each vertex a node, each segment two edges."""
     root = etree.fromstring(data)
     names: list[str] = []
     places: list[str] = []
@@ -88,7 +88,7 @@ def kml_to_tmap2(data: bytes) -> str:
 
 
 def tmap2_to_kml(data: bytes) -> str:
-    """Nodes as points and edges as lines, with all their attributes as data."""
+    """Convert nodes to points and edges to lines, with all their attributes as data."""
     tree = ryml.parse_in_arena(data)
     tree.resolve()
     nodes = orjson.loads(ryml.emit_json(tree))["nodes"]
@@ -116,7 +116,7 @@ def tmap2_to_kml(data: bytes) -> str:
 
 
 def datum_to_kml(data: bytes) -> str:
-    """The fence as a polygon."""
+    """Convert the fence to a polygon."""
     document = yaml.load(data, yaml.CSafeLoader)
     ring = " ".join(f"{lon!r},{lat!r}" for lat, lon in document["gnss_fence"]["gnss_fence_coords"])
     return (
@@ -127,7 +127,7 @@ def datum_to_kml(data: bytes) -> str:
 
 
 def grid_to_kml(described: bytes, picture: bytes) -> str:
-    """The grid as a ground overlay: its corners, not its cells."""
+    """Convert the grid to a ground overlay: its corners, not its cells."""
     map_yaml = dict(re.findall(r"(\w+):\s*(.+)", described.decode()))
     width, height = Image.open(io.BytesIO(picture)).size
     x, y, _ = (float(v) for v in map_yaml["origin"].strip("[] ").split(","))

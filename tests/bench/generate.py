@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 def seconds(work: Callable[[], Any], tries: int = 5) -> float:
-    """Process time of the fastest of several tries, after one that does not count."""
+    """Measure the process time of the fastest of several tries, after a warm-up."""
     work()
     times = []
     for _ in range(tries):
@@ -40,14 +40,14 @@ def seconds(work: Callable[[], Any], tries: int = 5) -> float:
 
 
 def pairs(cells: NDArray[np.uint8]) -> Array:
-    """Shares of the pairs of neighbours, along x and along y."""
+    """Compute the shares of the pairs of neighbours, along x and along y."""
     full = (cells == OCCUPIED).astype(int)
     both = (2 * full[:, :-1] + full[:, 1:], 2 * full[:-1] + full[1:])
     return np.array([float((p == k).mean()) for p in both for k in range(4)])
 
 
 def collapse() -> list[dict[str, Any]]:
-    """The warehouse of 5 m × 5 m → 200 × 200 and 300 × 300 tiles."""
+    """Measure the warehouse of 5 m × 5 m → 200 × 200 and 300 × 300 tiles."""
     _kernels_wfc.compile_all()
     sample = SAMPLES["warehouse"].cells(0.05)
     rows = []
@@ -107,7 +107,7 @@ def collapse() -> list[dict[str, Any]]:
 
 
 def passes() -> list[dict[str, Any]]:
-    """One step of an automaton, and one octave of noise, on SIDE × SIDE cells."""
+    """Measure one step of an automaton and one octave of noise on SIDE × SIDE cells."""
     alive = np.random.default_rng(5).random((SIDE, SIDE)) < 0.5
     padded = np.pad(alive.astype(np.uint8), 1)
 
@@ -147,7 +147,7 @@ def passes() -> list[dict[str, Any]]:
 
 
 def perlin(x: Array, y: Array, table: NDArray[np.uint8]) -> Array:
-    """Perlin noise as NumPy passes over the array."""
+    """Compute Perlin noise as NumPy passes over the array."""
     i, j = np.floor(x).astype(int), np.floor(y).astype(int)
     u, v = (x - i)[None], (y - j)[:, None]
     turn = np.arange(8) * math.pi / 4
@@ -163,7 +163,7 @@ def perlin(x: Array, y: Array, table: NDArray[np.uint8]) -> Array:
 
 
 def _row(label: str, peer: float, ours: float) -> dict[str, Any]:
-    """One against a pass of NumPy: nanoseconds a cell."""
+    """Build the row of a comparison with a NumPy pass: nanoseconds per cell."""
     peer, ours = (1e9 * t / SIDE**2 for t in (peer, ours))
     return {
         "what": label,
@@ -177,5 +177,5 @@ def _row(label: str, peer: float, ours: float) -> dict[str, Any]:
 
 
 def rows() -> list[dict[str, Any]]:
-    """All of it."""
+    """Run all measurements."""
     return [*collapse(), *passes()]

@@ -30,7 +30,7 @@ uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="error", acc
 
 
 def free_port() -> int:
-    """A loopback port that nobody listens on."""
+    """Return an unused loopback port."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return int(s.getsockname()[1])
@@ -38,7 +38,7 @@ def free_port() -> int:
 
 @contextmanager
 def serving(command: list[str], port: int, env: dict[str, str] | None = None) -> Iterator[None]:
-    """A server process on a loopback port, ended afterwards."""
+    """Run a server process on a loopback port."""
     process = subprocess.Popen(command, env={**os.environ, **(env or {})}, stdout=subprocess.DEVNULL)
     try:
         for _ in range(2400):
@@ -57,12 +57,12 @@ def serving(command: list[str], port: int, env: dict[str, str] | None = None) ->
 
 
 def bare(port: int) -> list[str]:
-    """The peer: a Starlette route that returns bytes it holds."""
+    """Return the command of the peer: a Starlette route that returns bytes from memory."""
     return [sys.executable, "-c", BARE, str(port)]
 
 
 def rate(port: int, path: str, headers: dict[str, str], *, seconds: float = 2.0, connections: int = 16) -> float:
-    """Requests per second over keep-alive connections, each answered whole; raises if any answer is an error."""
+    """Measure requests per second over keep-alive connections, with complete responses; raises if one is an error."""
     lines = [f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", *(f"{k}: {v}" for k, v in headers.items())]
     request = ("\r\n".join(lines) + "\r\n\r\n").encode()
     sockets = [socket.create_connection(("127.0.0.1", port)) for _ in range(connections)]

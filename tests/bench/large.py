@@ -1,6 +1,6 @@
-"""Large maps, made up from a seed: how long a conversion takes, and how much memory above the idle process.
+"""Synthetic large maps: time of a conversion, and memory above that of the idle process.
 
-Each is measured in a process of its own, which has converted a small map of the same kind before, so that libraries are
+Each is measured in a separate process after the conversion of a small map of the same kind, so that libraries are
 loaded. The peak is the kernel's (VmHWM), so it counts what any library allocates, and the input itself.
 """
 
@@ -29,13 +29,13 @@ from tests.bench.memory import peak, reset, resident
 SEED = 2026
 TEXT_TIMES, RASTER_TIMES = 10.0, 3.0
 TEXT = 20_000_000
-"""Bytes from which the bound for texts holds."""
+"""Minimum size in bytes of text files that the memory bound applies to."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One conversion. make(scale) gives the files; small is the scale of the one before. decoded: bytes of a raster's
-    pixels, which its bound is told in; None for a text. bounded: whether the bound is meant for so large a map."""
+    """One conversion. make(scale) builds the files; small: scale of the conversion before. decoded: bytes of a raster's
+    pixels, the unit of its bound; None for text. bounded: whether the bound applies to a map of this size."""
 
     name: str
     make: Callable[[float], dict[str, bytes]]
@@ -46,9 +46,9 @@ class Case:
     datum: Datum | None = None
 
 
-# --- made-up maps -------------------------------------------------------------------------------------------------
+# --- synthetic maps -----------------------------------------------------------------------------------------------
 def octree(kind: str) -> Callable[[float], dict[str, bytes]]:
-    """A hilly terrain of 3.5 million leaves: the ground, and free space above it."""
+    """Build a hilly terrain of 3.5 million leaves: the ground, and free space above it."""
 
     def make(scale: float) -> dict[str, bytes]:
         dice = np.random.default_rng(SEED)
@@ -70,7 +70,7 @@ def octree(kind: str) -> Callable[[float], dict[str, bytes]]:
 
 
 def osm(nodes: int) -> Callable[[float], dict[str, bytes]]:
-    """A town as exports are: a fifth of the nodes in streets, the others houses' corners, all with their history."""
+    """Build a town like an OSM export: a fifth of the nodes in streets, the others corners of houses, with history."""
 
     def make(scale: float) -> dict[str, bytes]:
         dice = np.random.default_rng(SEED)
@@ -111,7 +111,7 @@ def osm(nodes: int) -> Callable[[float], dict[str, bytes]]:
 
 
 def building(vertices: int) -> Callable[[float], dict[str, bytes]]:
-    """A hall of aisles: named vertices, lanes both ways, walls."""
+    """Build a hall of aisles: named vertices, lanes in both directions, walls."""
 
     def make(scale: float) -> dict[str, bytes]:
         dice = np.random.default_rng(SEED)
@@ -136,7 +136,7 @@ def building(vertices: int) -> Callable[[float], dict[str, bytes]]:
 
 
 def graph(vertices: int) -> Callable[[float], dict[str, bytes]]:
-    """A navigation graph as ``building_map_generator nav`` writes one: a hall of aisles, some places named."""
+    """Build a navigation graph like ``building_map_generator nav``: a hall of aisles, some vertices named."""
 
     def make(scale: float) -> dict[str, bytes]:
         dice = np.random.default_rng(SEED)
@@ -156,7 +156,7 @@ def graph(vertices: int) -> Callable[[float], dict[str, bytes]]:
 
 
 def lanes(count: int) -> Callable[[float], dict[str, bytes]]:
-    """Streets of lanelets, five points on each bound, as Autoware's editors write them: degrees, metres, elevation."""
+    """Build streets of lanelets, five points on each bound, like Autoware's editors: degrees, metres, elevation."""
 
     def make(scale: float) -> dict[str, bytes]:
         dice = np.random.default_rng(SEED)
@@ -198,7 +198,7 @@ def lanes(count: int) -> Callable[[float], dict[str, bytes]]:
 
 
 def photo(end: str, noise: float) -> Callable[[float], dict[str, bytes]]:
-    """An aerial picture of 8000 × 8000 pixels, red, green and blue: fields, and noise of this width on every pixel."""
+    """Build an aerial RGB image of 8000 × 8000 pixels: fields, and noise of this width on every pixel."""
 
     def make(scale: float) -> dict[str, bytes]:
         from app.model.imagery import GeoImage
@@ -220,7 +220,7 @@ def photo(end: str, noise: float) -> Callable[[float], dict[str, bytes]]:
 
 
 def grid(end: str) -> Callable[[float], dict[str, bytes]]:
-    """A grid of 5714 × 3197 cells: rooms, noise, the unknown around them."""
+    """Build a grid of 5714 × 3197 cells: rooms, noise, unknown cells around them."""
 
     def make(scale: float) -> dict[str, bytes]:
         from PIL import Image
@@ -245,7 +245,7 @@ def grid(end: str) -> Callable[[float], dict[str, bytes]]:
 
 
 def cloud(scale: float) -> dict[str, bytes]:
-    """Points as text."""
+    """Build a point cloud as text."""
     dice = np.random.default_rng(SEED)
     n = round(TEXT / 27 * scale) + 1000
     rows = "\n".join(map("%.6f %.6f %.6f".__mod__, map(tuple, dice.uniform(-50, 50, (n, 3)).tolist())))
@@ -257,7 +257,7 @@ CELLS = 5714 * 3197
 PIXELS = 8000 * 8000
 FIELD = Datum(53.27, -0.52)
 TURNED = 4 * 8256 * 8256
-"""Bytes of the picture of so many pixels in a local frame's axes, which has a band more: where there is a picture."""
+"""Bytes of the image resampled to the axes of the local frame, which has another band for its mask."""
 CASES = {
     case.name: case
     for case in (
@@ -272,7 +272,7 @@ CASES = {
         Case("OSM of 20 MB → tmap2", osm(80_000), "tmap2", bounded=True),
         Case("building of 20 MB → openrmf", building(55_000), "openrmf", bounded=True),
         Case("building of 20 MB → rmf_nav_graph", building(55_000), "rmf_nav_graph", bounded=True),
-        # Not bounded: 59 bytes of text stand for each feature, and a feature takes ten times as much by itself.
+        # Not bounded: a feature has 59 bytes of text, and takes ten times as much in memory.
         Case("navigation graph of 20 MB → rmf_nav_graph", graph(85_000), "rmf_nav_graph"),
         Case("Lanelet2 of 30 MB → lanelet2", lanes(14_500), "lanelet2", bounded=True),
         Case("Lanelet2 of 30 MB → tmap2", lanes(14_500), "tmap2", bounded=True, datum=Datum(35.2, 138.8)),
@@ -293,7 +293,7 @@ SMALL = 0.002
 
 # --- measuring ----------------------------------------------------------------------------------------------------
 def measure(name: str, folder: Path) -> dict[str, Any]:
-    """One case in a process of its own."""
+    """Measure one case in a separate process."""
     files = CASES[name].make(1.0)
     for file, data in files.items():
         (folder / file).write_bytes(data)

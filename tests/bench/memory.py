@@ -1,4 +1,4 @@
-"""A process's memory, as the kernel counts it (proc(5)): also what libraries allocate, and the input itself."""
+"""Memory of a process as counted by the kernel (proc(5)), including libraries and the input."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from pathlib import Path
 
 
 def resident() -> int:
-    """Bytes now."""
+    """Return the current memory in bytes."""
     return _of("VmRSS")
 
 
 def peak() -> int:
-    """The most bytes there were since ``reset``."""
+    """Return the peak memory since ``reset``, in bytes."""
     return _of("VmHWM")
 
 
 def reset() -> None:
-    """The peak counts from here."""
+    """Reset the peak."""
     Path("/proc/self/clear_refs").write_text("5")
 
 

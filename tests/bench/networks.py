@@ -1,4 +1,4 @@
-"""Grid -> network against what one would write with the libraries: skeletonize and skan, a roadmap with networkx."""
+"""Grid -> network, compared with plain library code: skeletonize and skan, a roadmap with networkx."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ MAX_EDGE = 5.0
 
 
 def library_skeleton(mask: Any) -> int:
-    """scikit-image's thinning and skan's graph; how many pieces that graph has."""
+    """Run scikit-image's thinning and skan's graph; return the number of its components."""
     graph = Skeleton(skeletonize(mask), keep_images=False)
     return int(connected_components(graph.graph, directed=False)[0])
 
 
 def our_skeleton(grid: OccupancyGrid) -> int:
-    """From the grid's cells to the simplified graph, erosion included; how many pieces that graph has."""
+    """Convert the grid's cells to the simplified graph, with erosion; return the number of its components."""
     free_cells = _skeleton.free_cells(grid, unknown=False)
     assert free_cells is not None
     free_space = _skeleton.space(*free_cells, RADIUS / grid.resolution)
@@ -39,7 +39,7 @@ def our_skeleton(grid: OccupancyGrid) -> int:
 
 
 def plain_roadmap(grid: OccupancyGrid) -> nx.Graph:
-    """A roadmap as a textbook has it: a distance transform, a k-d tree, and a check along each line."""
+    """Build a textbook roadmap: a distance transform, a k-d tree, and a check along each line."""
     clearance = distance_transform_edt(grid.cells == FREE) * grid.resolution
     free = np.argwhere(clearance > RADIUS)
     nodes = free[np.random.default_rng(0).choice(len(free), SAMPLES, replace=False)]
@@ -59,7 +59,7 @@ def plain_roadmap(grid: OccupancyGrid) -> nx.Graph:
 
 
 def our_roadmap(grid: OccupancyGrid) -> tuple[Any, Any]:
-    """The same from the grid's cells on: the graph and the clearance of its edges, joined where free space is."""
+    """Build our roadmap from the grid's cells: the connected graph and the clearance of its edges."""
     free_cells = _skeleton.free_cells(grid, unknown=False)
     assert free_cells is not None
     free_space = _skeleton.space(*free_cells, RADIUS / grid.resolution)
@@ -72,7 +72,7 @@ def our_roadmap(grid: OccupancyGrid) -> tuple[Any, Any]:
 
 
 def rows(grid: OccupancyGrid, tries: int) -> list[dict[str, Any]]:
-    """Ours and theirs in turns on the same grid."""
+    """Measure both alternately on the same grid."""
     mask = distance_transform_edt(grid.cells == FREE) * grid.resolution > RADIUS * (1 + 1e-9)
     same = library_skeleton(mask) == our_skeleton(grid)
     out = []
@@ -97,7 +97,7 @@ def rows(grid: OccupancyGrid, tries: int) -> list[dict[str, Any]]:
 
 
 def in_turns(theirs: Callable[[], Any], ours: Callable[[], Any], tries: int) -> tuple[float, float]:
-    """Milliseconds of the fastest tries of both, each after one that does not count."""
+    """Measure the fastest tries of both in milliseconds, each after a warm-up."""
     best = [np.inf, np.inf]
     for k in range(tries + 1):
         for index, work in enumerate((theirs, ours)):

@@ -1,4 +1,4 @@
-"""The benchmark's large maps are maps: each converts, as a small one, and is the same from the same seed."""
+"""The benchmark's synthetic maps convert, in a small size, and are reproducible from their seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.bench.large import CASES, SMALL
 
 
 @pytest.mark.parametrize("name", sorted(CASES))
-def test_a_made_up_map_converts(name: str) -> None:
+def test_synthetic_map_converts(name: str) -> None:
     case = CASES[name]
     files = case.make(SMALL)
     assert files == case.make(SMALL)
@@ -22,7 +22,7 @@ def test_a_made_up_map_converts(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(derived.CASES))
-def test_a_made_up_site_derives(name: str) -> None:
+def test_synthetic_site_derives(name: str) -> None:
     derived_layers = derived.run(derived.CASES[name], derived.SMALL)
     (part,) = derived_layers.parts.values()
     if isinstance(part, OccupancyGrid):

@@ -1,7 +1,7 @@
-"""kill -9 of server, router and database at random moments, in the middle of commits, of the relay and of downloads.
+"""kill -9 of server, router and database at random moments, during commits, the event relay and downloads.
 
-Each is killed FLEETMAP_CHAOS times (10, ``make chaos``: 50), shared out to two worlds: PostgreSQL with the server's own
-router, and SQLite with a separate router. FLEETMAP_CHAOS_SEED names another order of moments.
+Each is killed FLEETMAP_CHAOS times (10, ``make chaos``: 50), split between two setups: PostgreSQL with the server's own
+router, and SQLite with a separate router. FLEETMAP_CHAOS_SEED selects another order of moments.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ pytestmark = pytest.mark.timeout(240 + 3 * KILLS * SECONDS_A_KILL)
 
 
 @pytest.mark.postgres
-def test_postgresql_and_the_servers_own_router(tmp_path: Path, postgres_cluster: Cluster) -> None:
+def test_postgresql_with_own_router_survives_kills(tmp_path: Path, postgres_cluster: Cluster) -> None:
     each = {"server": KILLS - KILLS // 2, "router": KILLS - KILLS // 2, "database": KILLS}
     with fleet_of(tmp_path, postgres_cluster, own_router=True, seed=SEED) as fleet:
-        havoc(fleet, each)
+        kill_repeatedly(fleet, each)
         check(fleet)
 
 
-def test_sqlite_and_a_separate_router(tmp_path: Path) -> None:
+def test_sqlite_with_separate_router_survives_kills(tmp_path: Path) -> None:
     each = {"server": KILLS // 2, "router": KILLS // 2}
     with fleet_of(tmp_path, None, own_router=False, seed=SEED + 100) as fleet:
-        havoc(fleet, each)
+        kill_repeatedly(fleet, each)
         check(fleet)
 
 
-def havoc(fleet: Fleet, each: dict[str, int]) -> list[float]:
-    """Kill each so many times, in a random order, aimed at each phase in turn: seconds until /healthz after each."""
+def kill_repeatedly(fleet: Fleet, each: dict[str, int]) -> list[float]:
+    """Kill each process ``each`` times in random order, in each phase in turn. Returns seconds until /healthz."""
     world, dice = fleet.world, random.Random(SEED)
     order = [target for target, count in each.items() for _ in range(count)]
     dice.shuffle(order)
@@ -60,9 +60,9 @@ def havoc(fleet: Fleet, each: dict[str, int]) -> list[float]:
         time.sleep(dice.choice((0.0, 0.0, 0.1, 0.5)))
         healthy.append(world.revive(target))
         before = fleet.made()
-        if dice.random() < 0.7:  # else the next one comes while it is still coming up
+        if dice.random() < 0.7:  # otherwise the next kill hits it during its start
             eventually(lambda n=before: fleet.made() > n, 60)
-        if dice.random() < 0.3:  # some quiet, so that robots get on
+        if dice.random() < 0.3:  # a pause, so that robots make progress
             lines = [len(robot.lines) for robot in fleet.robots]
             eventually(lambda at=lines: any(r.saw("switched", n) for r, n in zip(fleet.robots, at, strict=True)), 60)
     print(f"killed {dict(Counter(order))}; under way then: { {f'{t} {p}': n for (t, p), n in sorted(met.items())} }")
@@ -72,7 +72,7 @@ def havoc(fleet: Fleet, each: dict[str, int]) -> list[float]:
 
 
 def check(fleet: Fleet) -> None:
-    """What must hold after it all."""
+    """Check the invariants after all kills."""
     world = fleet.world
     head = fleet.settle()
     fleet.watcher.stop()
@@ -81,7 +81,7 @@ def check(fleet: Fleet) -> None:
     last = events[-1]["sequence"]
     assert [event["sequence"] for event in events] == list(range(1, last + 1)), "the log has a gap"
     created = [event["version"] for event in events if event["type"] == "version.created"]
-    assert created == list(range(1, head["version"] + 1)), "an event is missing, or told twice"
+    assert created == list(range(1, head["version"] + 1)), "an event is missing or duplicate"
     expected = list(range(1, last + 1))
     eventually(lambda: fleet.reader.sequences[-1:] == [last], 30)
     assert fleet.reader.sequences == expected, "server-sent events: a gap or a repeat"
@@ -91,7 +91,7 @@ def check(fleet: Fleet) -> None:
 
 
 def check_versions(fleet: Fleet, head: int) -> None:
-    """One line of versions; what was acknowledged is in it under the number that was told, and only once."""
+    """Check that versions have no gap, and contain each acknowledged one once, under its number."""
     versions = []
     cursor = head + 1
     while cursor > 0:
@@ -104,11 +104,11 @@ def check_versions(fleet: Fleet, head: int) -> None:
     assert all(writer.made for writer in (*fleet.first, *fleet.writers))
     assert lost_versions(fleet, messages) == []
     counts = Counter(messages.values())
-    assert all(counts[message] == 1 for writer in fleet.writers for message in writer.made), "a commit was made twice"
+    assert all(counts[message] == 1 for writer in fleet.writers for message in writer.made), "a commit was repeated"
 
 
 def lost_versions(fleet: Fleet, messages: dict[int, str]) -> list[int]:
-    """The acknowledged versions that are absent or another commit, by the messages that the server lists."""
+    """List acknowledged versions that are missing or another commit, by the messages that the server lists."""
     commits = [item for writer in (*fleet.first, *fleet.writers) for item in writer.made.items()]
     return [number for message, number in commits if messages.get(number) != message]
 
@@ -118,7 +118,7 @@ def _after(versions: list[dict[str, object]]) -> str:
 
 
 def _events(world: World) -> list[dict[str, object]]:
-    """The whole log of the environment, as a client reads it that was never there before."""
+    """Read the complete event log of the environment, like a new client."""
     out: list[dict[str, object]] = []
     answer = world.http.get("events", params={"environment": ENVIRONMENT, "since": 0, "follow": False})
     assert answer.status_code == 200
@@ -129,7 +129,7 @@ def _events(world: World) -> list[dict[str, object]]:
 
 
 def check_robots(fleet: Fleet, head: dict[str, object]) -> None:
-    """All on the head's root, whole, and what they processed never went back and was never done twice."""
+    """Check that all robots run the head's root, intact, and processed sequences without repetition or step back."""
     for robot in fleet.robots:
         name = robot.into.name
         assert robot.standing["root"] == head["root"]
@@ -149,7 +149,7 @@ def check_robots(fleet: Fleet, head: dict[str, object]) -> None:
 
 
 def _agreed(fleet: Fleet) -> dict[str, int] | None:
-    """How many robots hold their channel's root, once all do by what the server says."""
+    """Return the number of robots that run their channel's root once all do, according to the server; else None."""
     channels = fleet.world.get(f"environments/{ENVIRONMENT}/channels")
     if any(c["robots"]["holding"] != c["robots"]["total"] for c in channels):
         return None

@@ -1,4 +1,4 @@
-"""A server, its router and its database in processes of their own, robots that follow, writers that never give up."""
+"""Server, router and database in separate processes, with robots that follow and writers that retry forever."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.postgres import Cluster
 ENVIRONMENT = "farm"
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}
 SIDE = 300
-"""Cells along a side of the noisy grid: 90 kB that no delta makes small."""
+"""Side of the noisy grid in cells: 90 kB that no delta can shrink."""
 
 SHADES = bytes((0, 205, 254)[k % 3] for k in range(256))
 
@@ -39,7 +39,7 @@ COMMIT, RELAY, DOWNLOAD, ANY = "commit", "relay", "download", "any"
 
 
 class World:
-    """All of it. own_router: the server's own one, else a separate one that the server is a client of."""
+    """Server, router and database. own_router: the server's own one; else a separate one."""
 
     def __init__(self, folder: Path, cluster: Cluster | None, *, own_router: bool) -> None:
         self.folder, self.cluster, self.own_router = folder, cluster, own_router
@@ -67,16 +67,16 @@ class World:
         self.serve()
         self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=HEADERS, timeout=20)
 
-    # --- what is killed, and comes back ---
+    # --- processes that are killed and restarted ---
 
     def serve(self) -> None:
-        """Start the server; until it answers."""
+        """Start the server and wait until it responds."""
         arguments = ("--port", str(self.port), "--data-dir", str(self.folder / "data"))
         self.server = ServerProcess(*arguments, environment=self.variables, folder=ROOT)
         self.server.ready()
 
     def revive(self, target: str) -> float:
-        """Bring back what was killed; the seconds until /healthz answers."""
+        """Restart the killed process; return the seconds until /healthz responds."""
         start = time.monotonic()
         with ThreadPoolExecutor(1) as pool:
             healthy = pool.submit(seconds_until_healthy, f"http://127.0.0.1:{self.port}", start)
@@ -94,7 +94,7 @@ class World:
         self.serve()
 
     def kill_router(self) -> None:
-        """The server's own one, which it starts again itself, or the separate one."""
+        """Kill the server's own router, which it restarts itself, or the separate one."""
         if self.router is not None:
             self.router._process.kill()
             return
@@ -137,10 +137,10 @@ class World:
         if self.router is not None:
             self.router.close()
 
-    # --- what is asked ---
+    # --- requests ---
 
     def get(self, path: str, seconds: float = 60.0) -> Any:
-        """JSON of the server, also where it is just coming back."""
+        """Get JSON from the server; retry while it is restarting."""
         deadline = time.monotonic() + seconds
         while True:
             with contextlib.suppress(httpx.TransportError):
@@ -153,7 +153,7 @@ class World:
 
 
 class Writer:
-    """Commits one change after the other, each with a key and again until the server has said that it has it."""
+    """Writer that commits changes one by one, each with an idempotency key and repeated until acknowledged."""
 
     def __init__(self, world: World, name: str, seed: int) -> None:
         self._world, self._dice = world, random.Random(seed)
@@ -216,14 +216,14 @@ class Writer:
 
 
 class Surveyor(Writer):
-    """Moves a node of the network."""
+    """Writer that moves a node of the network."""
 
     def _files(self) -> dict[str, bytes]:
         return {"n.tmap2.yaml": network(round(self._dice.uniform(0.001, 5), 6), 100)}
 
 
 class Mapper(Writer):
-    """Maps the place again: another noisy grid."""
+    """Writer that replaces the noisy grid."""
 
     def _files(self) -> dict[str, bytes]:
         pixels = self._dice.randbytes(SIDE * SIDE).translate(SHADES)
@@ -233,7 +233,7 @@ class Mapper(Writer):
 
 
 class Promoter(Writer):
-    """Moves the channel production forth, and now and then back."""
+    """Writer that moves the channel production forward, and sometimes back."""
 
     def _commit(self, client: httpx.Client, message: str) -> None:
         del message
@@ -252,7 +252,7 @@ class Promoter(Writer):
 
 
 class Reader:
-    """A reader of server-sent events that resumes with ``Last-Event-ID``: ``sequences`` is what it processed."""
+    """Reader of server-sent events that resumes with ``Last-Event-ID``. sequences: those that it processed."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -291,7 +291,7 @@ class Reader:
 
 
 class Watcher:
-    """Looks at what stands on the robots' disks all the time: never half a map, never back."""
+    """Watcher that polls the robots' disks: maps are always complete and never go back."""
 
     def __init__(self, robots: list[Robot]) -> None:
         self._robots = robots
@@ -306,7 +306,7 @@ class Watcher:
         try:
             while not self.stopping.wait(0.05):
                 for robot in self._robots:
-                    sequence = look(robot.into)
+                    sequence = check_current_map(robot.into)
                     if sequence is not None:
                         self.looks += 1
                         name = robot.into.name
@@ -322,8 +322,8 @@ class Watcher:
             raise self.problem
 
 
-def look(into: Path) -> int | None:
-    """The sequence of what stands, all of whose files are as its manifest says; None where nothing stands yet."""
+def check_current_map(into: Path) -> int | None:
+    """Return the sequence of the current map after verifying its files; None if there is no map yet."""
     for _ in range(20):
         try:
             version = (into / "current").resolve(strict=True)
@@ -337,13 +337,13 @@ def look(into: Path) -> int | None:
                 assert (len(data), hashlib.sha256(data).hexdigest()) == expected, f"{into.name}: half a map: {file}"
             return int(manifest["sequence"])
         except FileNotFoundError:
-            # Three switches have come since: the old version was tidied away. What stands now must be whole.
-            assert (into / "current").resolve() != version, f"{into.name}: a file is missing in what stands"
-    raise AssertionError(f"{into.name} switches faster than anybody can look")
+            # After three more switches the old version was removed. The current one must be complete.
+            assert (into / "current").resolve() != version, f"{into.name}: the current map lacks a file"
+    raise AssertionError(f"{into.name} switches faster than its map can be read")
 
 
 class Fleet:
-    """Robots, the two readers of events, and the writers of one world."""
+    """Robots, the two event readers and the writers of one world."""
 
     def __init__(self, world: World, seed: int) -> None:
         self.world = world
@@ -358,7 +358,7 @@ class Fleet:
         self.robots: list[Robot] = []
         server = f"http://127.0.0.1:{world.port}"
         for name, *more in (
-            ("hearing", "--poll", "3600", "--channel", "latest"),  # nothing but events, and the router's return
+            ("hearing", "--poll", "3600", "--channel", "latest"),  # only events, and the router's return
             ("polling", "--poll", "1", "--channel", "latest"),
             ("promoted", "--poll", "3600", "--channel", "production"),
         ):
@@ -386,11 +386,11 @@ class Fleet:
             writer.start()
 
     def made(self) -> int:
-        """How many commits were acknowledged."""
+        """Number of acknowledged commits."""
         return sum(len(writer.made) for writer in self.writers)
 
     def wait_for(self, phase: str) -> None:
-        """Until a moment in the middle of a phase."""
+        """Wait until a phase is in progress."""
         if phase == COMMIT:
             self._until(lambda: any(writer.busy.is_set() for writer in self.writers))
             time.sleep(self.dice.uniform(0, 0.08))
@@ -406,7 +406,7 @@ class Fleet:
             time.sleep(self.dice.uniform(0, 0.5))
 
     def under_way(self) -> set[str]:
-        """The phases that something is in at this moment."""
+        """Return the phases in progress."""
         stages = set()
         if any(writer.busy.is_set() for writer in self.writers):
             stages.add(COMMIT)
@@ -430,7 +430,7 @@ class Fleet:
             time.sleep(0.001)
 
     def settle(self, seconds: float = 90.0) -> dict[str, Any]:
-        """End the writers, promote the head, and wait until everybody has all of it: the head."""
+        """Stop the writers, promote the head, and wait until all robots and readers have it. Returns the head."""
         for writer in (*self.writers, self.promoter):
             writer.stop()
         head: dict[str, Any] = self.world.get(f"environments/{ENVIRONMENT}/versions/latest")
@@ -455,7 +455,7 @@ class Fleet:
 
 @contextlib.contextmanager
 def fleet_of(folder: Path, cluster: Cluster | None, *, own_router: bool, seed: int) -> Iterator[Fleet]:
-    """A world with a fleet in it, at work."""
+    """Run a world with a working fleet."""
     world = World(folder, cluster, own_router=own_router)
     try:
         fleet = Fleet(world, seed)

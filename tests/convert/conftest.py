@@ -1,4 +1,4 @@
-"""The server that tests of the API share serves here too."""
+"""Fixtures of the API tests, shared with these tests."""
 
 from tests.api.conftest import api, fresh
 

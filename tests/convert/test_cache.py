@@ -1,4 +1,4 @@
-"""Made maps on disk: whole or absent, made once for many askers, bounded."""
+"""Cached maps on disk: complete or absent, converted once for concurrent callers, limited in size."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def product(data: bytes = b"hello", archive: bytes | None = None) -> ConvertedMa
     return ConvertedMap({"map.kml": (data, "text/xml")}, ("kml.zip", archive) if archive else None, Report("kml"))
 
 
-def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) -> None:
+def test_cached_map_returns_bytes_hash_and_report(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
     assert cache.get(key("a")) is None
     cached_map = cache.get_or_make(key("a"), product)
@@ -41,14 +41,14 @@ def test_a_made_map_comes_back_with_its_bytes_hash_and_report(tmp_path: Path) ->
     assert again == cached_map
 
 
-def test_several_files_come_with_an_archive(tmp_path: Path) -> None:
+def test_map_of_several_files_has_an_archive(tmp_path: Path) -> None:
     cached_map = Cache(tmp_path, 10**6).get_or_make(key("a"), lambda: product(archive=b"PK.."))
     assert cached_map.single_file().name == "kml.zip"
     assert cached_map.file("map.kml") is not None
     assert cached_map.file("other") is None
 
 
-def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
+def test_concurrent_callers_run_one_conversion(tmp_path: Path) -> None:
     cache, count, lock = Cache(tmp_path, 10**6), [], threading.Lock()
 
     def slow() -> ConvertedMap:
@@ -64,7 +64,7 @@ def test_one_of_many_askers_makes_it(tmp_path: Path) -> None:
     assert (cache.misses, cache.hits) == (1, 19)
 
 
-def test_a_failed_maker_leaves_nothing_and_the_next_one_tries(tmp_path: Path) -> None:
+def test_failed_conversion_leaves_nothing_and_is_retried(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
 
     def fail() -> ConvertedMap:
@@ -77,7 +77,7 @@ def test_a_failed_maker_leaves_nothing_and_the_next_one_tries(tmp_path: Path) ->
     assert cache.get_or_make(key("a"), product).single_file().size == 5
 
 
-def test_room_is_made_by_dropping_the_longest_unused(tmp_path: Path) -> None:
+def test_eviction_removes_least_recently_used_map(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 4000)
     for name in "abc":
         cache.get_or_make(key(name), lambda: product(b"x" * 1500))
@@ -86,18 +86,18 @@ def test_room_is_made_by_dropping_the_longest_unused(tmp_path: Path) -> None:
     assert cache.get(key("c")) is not None
 
 
-def test_what_a_killed_process_left_is_cleaned_at_the_next_start(tmp_path: Path) -> None:
+def test_leftovers_of_killed_process_are_removed_at_start(tmp_path: Path) -> None:
     (tmp_path / "making-1").mkdir(parents=True)
     (tmp_path / "making-1" / "0").write_bytes(b"half")
     Cache(tmp_path, 10**6)
-    assert (tmp_path / "making-1").exists(), "a sibling process may be at work on it"
+    assert (tmp_path / "making-1").exists(), "a sibling process may be using it"
     os.utime(tmp_path / "making-1", (0, 0))
     Cache(tmp_path, 10**6)
     assert not (tmp_path / "making-1").exists()
 
 
 def flip(path: Path, *, quietly: bool = False) -> None:
-    """Change a byte in the middle. quietly: as bit rot does, which no time tells."""
+    """Change a byte in the middle. quietly: keep the modification time, as bit rot does."""
     before, data = path.stat(), bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -106,7 +106,7 @@ def flip(path: Path, *, quietly: bool = False) -> None:
 
 
 def zero(path: Path) -> None:
-    """What a power cut leaves of a file whose length alone was written."""
+    """Overwrite a file with zeros, as after a power cut that stored only its length."""
     path.write_bytes(bytes(path.stat().st_size))
 
 
@@ -116,7 +116,9 @@ def entry(folder: Path, name: str) -> Path:
 
 @pytest.mark.parametrize("file", ["0", "whole", "map.json"])
 @pytest.mark.parametrize("harm", [flip, zero, lambda path: path.write_bytes(b""), Path.unlink])
-def test_a_damaged_entry_is_made_again_after_a_start(tmp_path: Path, file: str, harm: Callable[[Path], None]) -> None:
+def test_damaged_entry_is_converted_again_after_restart(
+    tmp_path: Path, file: str, harm: Callable[[Path], None]
+) -> None:
     Cache(tmp_path, 10**6).get_or_make(key("a"), lambda: product(b"x" * 5000, archive=b"PK" * 50))
     harm(entry(tmp_path, "a") / file)
     cache = Cache(tmp_path, 10**6)
@@ -127,21 +129,21 @@ def test_a_damaged_entry_is_made_again_after_a_start(tmp_path: Path, file: str, 
     assert Cache(tmp_path, 10**6).get(key("a")) == cached_map
 
 
-def test_an_entry_that_changes_while_the_server_runs_is_never_served(tmp_path: Path) -> None:
+def test_entry_changed_while_server_runs_is_not_served(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
     cached_map = cache.get_or_make(key("a"), product)
     flip(cached_map.files[0].path, quietly=True)
     with pytest.raises(LostMap):
         cached_map.files[0].read()
     assert cache.damaged == 1
-    assert cache.get(key("a")) is None, "what was found damaged is gone"
+    assert cache.get(key("a")) is None, "a damaged entry is removed"
     cached_map = cache.get_or_make(key("a"), product)
     flip(cached_map.files[0].path)
-    assert cache.get(key("a")) is None, "a file that was written to is hashed again"
+    assert cache.get(key("a")) is None, "a changed file is hashed again"
     assert cache.damaged == 2
 
 
-def test_an_entry_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entry_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Cache(tmp_path, 10**6).get_or_make(key("a"), product)
     hashed: list[Path] = []
     real = caching._hash
@@ -152,7 +154,7 @@ def test_an_entry_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(hashed) == 1
 
 
-def test_an_entry_under_another_key_is_not_served(tmp_path: Path) -> None:
+def test_entry_under_another_key_is_not_served(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
     cache.get_or_make(key("a"), product)
     entry(tmp_path, "b").parent.mkdir(exist_ok=True)
@@ -161,7 +163,7 @@ def test_an_entry_under_another_key_is_not_served(tmp_path: Path) -> None:
     assert cache.damaged == 1
 
 
-def test_an_entry_of_an_earlier_release_is_made_again_without_alarm(tmp_path: Path) -> None:
+def test_entry_of_earlier_release_is_converted_again_without_alarm(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
     cache.get_or_make(key("a"), product)
     described = entry(tmp_path, "a") / "map.json"
@@ -171,14 +173,12 @@ def test_an_entry_of_an_earlier_release_is_made_again_without_alarm(tmp_path: Pa
     assert cache.get_or_make(key("a"), product).files[0].read() == b"hello"
 
 
-def test_a_map_that_cannot_be_written_to_the_disk_itself_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_map_that_cannot_be_synced_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[Path] = []
     cache = Cache(tmp_path, 10**6)
 
     def sync(path: Path) -> None:
-        if path.is_relative_to(tmp_path):  # tests before this one may still be syncing
+        if path.is_relative_to(tmp_path):  # earlier tests may still be syncing
             synced.append(path)
         if len(synced) > 4:
             raise OSError(errno.EIO, "Input/output error")
@@ -194,7 +194,7 @@ def test_a_map_that_cannot_be_written_to_the_disk_itself_is_removed(
     assert cache.get(key("b")) is None
 
 
-def test_a_full_disk_does_not_stop_maps(
+def test_maps_are_served_when_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     cache = Cache(tmp_path, 10**6)
@@ -214,7 +214,7 @@ def test_a_full_disk_does_not_stop_maps(
             b"PK",
             None,
         )
-    assert cache.misses == 2, "it was made once"
+    assert cache.misses == 2, "converted once"
     assert cache.get(key("before")) == stored
     with cache.hold_files() as hold:
         assert [f.read() for f in (*hold(cached_map).files, *hold(stored).files)] == [b"hello", b"before"]
@@ -238,7 +238,7 @@ def test_check_hashes_every_entry_and_removes_the_damaged_ones(tmp_path: Path) -
 
 
 def refusing(monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
-    """Let reading files of this name fail."""
+    """Make reading of files with this name fail."""
     real = Path.open
 
     def refuse(path: Path, mode: str = "r", **more: Any) -> Any:
@@ -251,7 +251,7 @@ def refusing(monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
 
 @pytest.mark.parametrize("name", ["map.json", "0"])
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.EACCES, errno.ESTALE, errno.EIO, errno.EBADMSG])
-def test_only_damage_removes_an_entry_that_cannot_be_read(
+def test_unreadable_entry_is_removed_only_when_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str, number: int
 ) -> None:
     Cache(tmp_path, 10**6).get_or_make(key("a"), product)
@@ -265,9 +265,7 @@ def test_only_damage_removes_an_entry_that_cannot_be_read(
     assert str(tmp_path) not in caplog.text
 
 
-def test_an_entry_that_is_removed_at_once_is_no_problem_of_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_entry_evicted_at_once_is_no_disk_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache = Cache(tmp_path, 10**6)
     refusing(monkeypatch, "map.json", errno.ENOENT)
     cached_map = cache.get_or_make(key("a"), product)
@@ -275,7 +273,7 @@ def test_an_entry_that_is_removed_at_once_is_no_problem_of_the_disk(
 
 
 @pytest.mark.parametrize("error", [shutil.Error("/srv/data/cache/0"), OSError("/srv/data is odd"), PermissionError(13)])
-def test_problem_of_the_disk_names_no_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: OSError) -> None:
+def test_disk_problem_contains_no_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: OSError) -> None:
     def refuse(*_: object) -> None:
         raise error
 

@@ -1,4 +1,4 @@
-"""One edge of each real network is closed: the map loses this edge and nothing else."""
+"""Close one edge of each real network: the map loses this edge and nothing else."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NETWORKS = (
 
 
 def groups_in(folder: Path, name: str) -> list[formats.FileGroup]:
-    """The maps of a format below a folder, folder by folder."""
+    """Group the maps of a format below a folder, folder by folder."""
     out: list[formats.FileGroup] = []
     for place in [folder, *sorted(p for p in folder.rglob("*") if p.is_dir())]:
         files = {f.name: f.read_bytes() for f in sorted(place.iterdir()) if f.is_file()}
@@ -46,7 +46,7 @@ def read(group: formats.FileGroup) -> Layers:
 
 
 def edges(layers: Layers) -> dict[tuple[str, str], tuple[str, str, str]]:
-    """(level, id) of each edge -> level, source and target."""
+    """Map (level, id) of each edge to level, source and target."""
     return {
         (key.level, i): (key.level, str(p["source"]), str(p["target"]))
         for key, part in layers.vector("topology").items()

@@ -1,4 +1,4 @@
-"""A map of a network warns of edges that lead through obstacles, and closures find edges that get nodes at bends."""
+"""Warnings about edges that cross obstacles, and closures of edges that get nodes at bends."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tests.api.conftest import Api
 
 TOPOLOGY = PartKey("topology", GROUND, NETWORK)
 AROUND = [(0.5, 2.5), (0.5, 8.5), (9.5, 8.5), (9.5, 2.5)]
-"""From a to b around a wall on x = 5 that leaves y > 7 free."""
+"""Path from a to b around a wall on x = 5 that leaves y > 7 free."""
 
 
 def site(bend: bool, yaw: float = 0.0, **parts: Part) -> Layers:
-    """Two nodes on both sides of a wall, joined both ways, and one edge along the wall."""
+    """Build two nodes on both sides of a wall, joined in both directions, and one edge along the wall."""
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     at = [tuple(row) for row in (np.array(AROUND) @ turn).tolist()]
     line = at if bend else [at[0], at[-1]]
@@ -70,7 +70,7 @@ def test_straight_edges_through_a_wall_are_reported_and_bent_ones_go_around(yaw:
         )
 
 
-def test_buildings_count_where_there_is_no_grid() -> None:
+def test_buildings_are_obstacles_without_a_grid() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("house", shapely.box(4, 0, 6, 7), {"kind": "building"}),
         ("roof", shapely.box(0, 4, 4, 6), {"kind": "building", "base": 3.0}),
@@ -128,7 +128,7 @@ HOUSE = ("house", shapely.box(4, -2, 6, 4), {"kind": "building"})
 
 
 def detour(*between: tuple[float, float], inside: bool = False, **parts: Part) -> Layers:
-    """One edge from (0, 0) over these places to (10, 0), or to a node inside of ``HOUSE``."""
+    """Build one edge from (0, 0) via these points to (10, 0), or to a node inside ``HOUSE``."""
     end = (5.0, 0.0) if inside else (10.0, 0.0)
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0, 0), {"kind": "node"}),
@@ -156,7 +156,7 @@ def test_bends_inside_a_building_do_not_hide_that_an_edge_leads_through_it(name:
     assert all(crossing(worker.from_layers(fmt, layers, {}, derived=False).report.as_dict()) == [] for layers in clear)
 
 
-def test_buildings_count_where_a_grid_knows_nothing() -> None:
+def test_buildings_are_obstacles_in_unknown_cells() -> None:
     fmt = formats.get_format("tmap2")
     free = OccupancyGrid(np.full((20, 40), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
     unknown = OccupancyGrid(np.full((20, 40), UNKNOWN, np.uint8), 0.5, (-5.0, -5.0, 0.0))
@@ -167,7 +167,7 @@ def test_buildings_count_where_a_grid_knows_nothing() -> None:
         assert len(warnings) == count
 
 
-def test_an_environment_package_warns_of_edges_through_obstacles() -> None:
+def test_environment_package_warns_of_edges_through_obstacles() -> None:
     fmt = formats.get_format("environment")
     warnings = crossing(worker.from_layers(fmt, detour((5, 1)), {}, derived=False).report.as_dict())
     assert len(warnings) == 1

@@ -1,4 +1,4 @@
-"""Files -> files without a server: the same map as of a stored version."""
+"""Conversion of files without a server gives the same map as a stored version."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tests.worlds import CRATE, WALLS, house
 
 
 def cells(files: dict[str, bytes]) -> Any:
-    """The grey values of a map's image, top row first."""
+    """Read the grey values of a map's image, top row first."""
     return next(np.asarray(Image.open(io.BytesIO(d))) for n, d in files.items() if n.endswith((".pgm", ".png")))
 
 
 def test_offline_conversion_keeps_mesh_walls_beside_a_primitive_solid() -> None:
-    """One box must not make a world look complete that is read without its meshes."""
+    """One box must not make a world that is read without its meshes look complete."""
     files = house(WALLS, CRATE)
     alone = cells(direct.offline(house(WALLS), "occupancy_grid").files)
     both = direct.offline(files, "occupancy_grid")
@@ -34,7 +34,7 @@ def test_offline_conversion_keeps_mesh_walls_beside_a_primitive_solid() -> None:
 
 @pytest.mark.parametrize("wanted", ["occupancy_grid", "octomap", "satellite"])
 def test_offline_conversion_equals_the_map_of_all_layers(shared: Path, wanted: str) -> None:
-    """Of the real warehouse with one box more, byte by byte."""
+    """Compare the real warehouse with one more box, byte by byte."""
     root = shared / "data/gazebo_sdf/aws_small_warehouse"
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.suffix in (".sdf", ".DAE")}
     world = (root / "worlds/no_roof_small_warehouse.world").read_bytes()

@@ -1,4 +1,4 @@
-"""Maps from layers: what their reports say."""
+"""Reports of maps converted from layers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_map(name: str, layers: Layers, mode: ClosureMode = "apply") -> worker.
 
 
 def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:
-    """The edges of a map, as our own reader finds them; a node is a or b by its place, west or east."""
+    """Read the edges of a map with our own reader; a node is a or b by its position, west or east."""
     (group,), _ = formats.group(files, name)
     out = set()
     for part in formats.read(group, ReadContext()).vector("topology").values():
@@ -51,7 +51,7 @@ def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("name", PLANNED)
-def test_blocked_edge_is_left_out_and_reported(name: str) -> None:
+def test_blocked_edge_is_omitted_and_reported(name: str) -> None:
     written = write_map(name, network(blocked=True))
     assert edges_in(name, written.files) == {("b", "a")}
     assert [d["count"] for d in written.report.as_dict()["dropped"] if d["what"] == "blocked edges"] == [1]
@@ -70,7 +70,7 @@ def test_blocked_edge_stays_with_a_warning_when_marked(name: str) -> None:
     assert name in warning
 
 
-def test_formats_that_nobody_plans_on_mark_blocked_edges() -> None:
+def test_formats_without_planners_mark_blocked_edges() -> None:
     written = write_map("geojson", network(blocked=True))
     assert not written.report.as_dict()["warnings"]
     assert b'"blocked":true' in b"".join(written.files.values())

@@ -1,4 +1,4 @@
-"""A report is the same value after it was JSON on disk."""
+"""A report is unchanged by a round trip through JSON."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_report_survives_json() -> None:
         assert Report.from_dict(orjson.loads(orjson.dumps(report.as_dict()))) == report
 
 
-def test_members_without_a_value_are_left_out_of_json() -> None:
+def test_report_json_omits_members_without_a_value() -> None:
     assert list(Report("kml").as_dict()) == [
         "format",
         "layers",

@@ -1,4 +1,4 @@
-"""Maps that are put together from the maps of several parts."""
+"""Maps assembled from the maps of several parts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def product(name: str, **more: Any) -> ConvertedMap:
     return ConvertedMap({name: (name.encode(), "image/tiff")}, None, replace(EMPTY, **more))
 
 
-def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
+def test_files_with_equal_names_are_reported(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     members = tuple(Member(recipe(str(n)), "L2/", ("L2", name)) for n, name in enumerate(("a_b", "a/b")))
     cached_maps = [cache.get_or_make(f"{n:064}", lambda: product("a_b.tif")) for n in range(2)]
@@ -103,14 +103,14 @@ def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Pat
     spread = recipe("0", spread=Spread("ground"))
     assert select_file(spread, cached_map, "a.tif").name == "L2/a.tif"
     assert select_file(spread, cached_map, "b.tif").name == "b.tif"
-    with pytest.raises(NotFound, match="its files are"):
+    with pytest.raises(NotFound, match="its files: "):
         select_file(spread, cached_map, "c.tif")
     with pytest.raises(NotFound):
         select_file(replace(spread, spread=None), cached_map, "a.tif")
 
 
 def tower(*kinds: str) -> Layers:
-    """A grid on two levels, and on L2 a zone of each of these kinds."""
+    """Build a grid on two levels, and on L2 a zone of each of these kinds."""
     cells = np.zeros((4, 6), np.uint8)
     grid = OccupancyGrid(cells, 0.5, (0.0, 0.0, 0.0), "trinary", 0.65, 0.196, False, {})
     parts: dict[PartKey, Any] = {PartKey("occupancy", level, "map"): grid for level in ("ground", "L2")}
@@ -153,7 +153,7 @@ def test_whole_site_without_a_part_that_fits_is_not_found() -> None:
     for options in ({"level": "*", "grid": "keepout"}, {"level": "L9", "grid": "*"}):
         with pytest.raises(NotFound):
             worker.from_layers(fmt, tower(), options, derived=True)
-    with pytest.raises(NotFound, match="none of them can be derived"):
+    with pytest.raises(NotFound, match="none can be derived"):
         worker.from_layers(fmt, tower("speed"), {"level": "*", "grid": "keepout"}, derived=True)
 
 

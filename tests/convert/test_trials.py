@@ -1,4 +1,4 @@
-"""Trials of derivations are remembered over a restart, and a damaged memory is none."""
+"""Trial results survive a restart; damaged ones are ignored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.api.conftest import Api
 FAILED = ChainFailure("occupancy_to_topology", "name one\nwith grid=", choose=True)
 
 
-def test_outcomes_last(tmp_path: Path) -> None:
+def test_trial_results_survive_restart(tmp_path: Path) -> None:
     first = Trials(tmp_path / "trials")
     first.add("works", None, lasting=True)
     first.add("fails", ChainFailure("a", "first"), lasting=True)
@@ -49,7 +49,7 @@ def test_outcomes_last(tmp_path: Path) -> None:
         lambda raw: b"\xff\xfe\n" + raw[3:],
     ],
 )
-def test_damaged_lines_are_passed_over(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+def test_damaged_lines_are_skipped(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
     path = tmp_path / "trials"
     Trials(path).add("works", None, lasting=True)
     path.write_bytes(damage(path.read_bytes()))
@@ -62,7 +62,7 @@ def test_damaged_lines_are_passed_over(tmp_path: Path, damage: Callable[[bytes],
     assert Trials(path)["next"] is None
 
 
-def test_fields_of_another_release_are_passed_over(tmp_path: Path) -> None:
+def test_fields_of_another_release_are_skipped(tmp_path: Path) -> None:
     path = tmp_path / "trials"
     for text in (b'["key",{"other":1}]', b'["key"]', b"7"):
         path.write_bytes(trials._digest(text) + b" " + text + b"\n")
@@ -70,7 +70,7 @@ def test_fields_of_another_release_are_passed_over(tmp_path: Path) -> None:
             Trials(path)["key"]
 
 
-def test_memory_and_file_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_in_memory_and_file_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trials, "MAX_TRIALS", 5)
     path = tmp_path / "trials"
     trial_record = Trials(path)
@@ -84,7 +84,7 @@ def test_memory_and_file_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert [p.name for p in tmp_path.iterdir()] == ["trials"]
 
 
-def test_disk_that_refuses_leaves_the_memory(tmp_path: Path) -> None:
+def test_trials_stay_in_memory_when_disk_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "trials").mkdir()
     trial_record = Trials(tmp_path / "trials")
     trial_record.add("works", None, lasting=True)
@@ -92,7 +92,7 @@ def test_disk_that_refuses_leaves_the_memory(tmp_path: Path) -> None:
 
 
 class Runs:
-    """Runs jobs at once and counts them."""
+    """Runner that runs jobs immediately and counts them."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -114,7 +114,7 @@ def version(api: Api, fresh: Callable[[], str]) -> Any:
     return api.app.state.services.store.versions.get(env, 1)
 
 
-def test_coverage_after_a_restart_tries_nothing(api: Api, version: Any, tmp_path: Path) -> None:
+def test_coverage_after_restart_runs_no_trial(api: Api, version: Any, tmp_path: Path) -> None:
     run, again = Runs(), Runs()
     before = open_maps(api, tmp_path, run).coverage(version)
     assert run.count
@@ -122,7 +122,7 @@ def test_coverage_after_a_restart_tries_nothing(api: Api, version: Any, tmp_path
     assert again.count == 0
 
 
-def test_coverage_after_damage_tries_again(api: Api, version: Any, tmp_path: Path) -> None:
+def test_coverage_after_damage_repeats_trials(api: Api, version: Any, tmp_path: Path) -> None:
     run, again = Runs(), Runs()
     before = open_maps(api, tmp_path, run).coverage(version)
     path = tmp_path / "trials"
@@ -131,7 +131,7 @@ def test_coverage_after_damage_tries_again(api: Api, version: Any, tmp_path: Pat
     assert 0 < again.count <= run.count
 
 
-def test_dead_workers_are_no_lasting_verdict(api: Api, version: Any, tmp_path: Path) -> None:
+def test_result_of_dead_worker_is_not_stored(api: Api, version: Any, tmp_path: Path) -> None:
     def die(*_: Any, **__: Any) -> Any:
         raise WorkerDied("out of memory")
 
@@ -142,7 +142,7 @@ def test_dead_workers_are_no_lasting_verdict(api: Api, version: Any, tmp_path: P
     assert dead != well
 
 
-def test_verdict_of_a_model_does_not_last(version: Any) -> None:
+def test_trial_result_with_a_model_is_not_stored(version: Any) -> None:
     step = derive.all_derivations()["imagery_to_objects"].step()
     plain = DerivationChain((step,), ())
     assert module._is_lasting(plain)

@@ -1,4 +1,4 @@
-"""A real PostgreSQL, and the command line, for the container files' tests."""
+"""Fixtures of the container tests: a real PostgreSQL and the command line."""
 
 from tests.cli.conftest import offline
 from tests.postgres import postgres_cluster, postgres_url

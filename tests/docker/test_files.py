@@ -1,4 +1,4 @@
-"""The container files against their schema, linter and each other; the lock file and CI against what they promise."""
+"""Checks of the container files (schema, linter, consistency), the lock file and CI."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ def compose() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("path", [COMPOSE, TOP / "docker" / "robot.compose.yaml"], ids=lambda p: p.name)
-def test_compose_fits_its_schema(path: Path) -> None:
+def test_compose_file_matches_its_schema(path: Path) -> None:
     process = tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", path)
     assert process.returncode == 0, process.stdout + process.stderr
 
 
-def test_the_schema_check_refuses_what_is_wrong(tmp_path: Path) -> None:
+def test_schema_check_rejects_wrong_values(tmp_path: Path) -> None:
     wrong = tmp_path / "compose.yaml"
     wrong.write_text(COMPOSE.read_text().replace("cap_drop:", "cap_dropped:"))
     assert tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", wrong).returncode != 0
 
 
 @pytest.mark.parametrize("path", [DOCKERFILE, TOP / "docker" / "agent.Dockerfile"], ids=lambda p: p.name)
-def test_hadolint_has_nothing_to_say(path: Path) -> None:
+def test_hadolint_reports_nothing(path: Path) -> None:
     process = tool("hadolint", "--no-color", path)
     assert process.returncode == 0, process.stdout + process.stderr
 
 
-def test_the_server_is_confined(compose: dict[str, Any]) -> None:
+def test_server_container_is_confined(compose: dict[str, Any]) -> None:
     for name in ("server", "migrate"):
         service = compose["services"][name]
         assert service["read_only"] is True
@@ -61,7 +61,7 @@ def test_the_server_is_confined(compose: dict[str, Any]) -> None:
     assert all(not u.startswith(("0", "root")) for u in user)
 
 
-def test_every_secret_and_volume_that_is_used_is_declared_and_made(compose: dict[str, Any], tmp_path: Path) -> None:
+def test_used_secrets_and_volumes_are_declared_and_created(compose: dict[str, Any], tmp_path: Path) -> None:
     used = {secret for service in compose["services"].values() for secret in service.get("secrets", ())}
     assert used == set(compose["secrets"])
     done = subprocess.run(
@@ -79,7 +79,7 @@ def test_every_secret_and_volume_that_is_used_is_declared_and_made(compose: dict
     assert {path.name: path.read_text() for path in (tmp_path / "s").iterdir()} == secrets
 
 
-def test_the_database_url_names_what_compose_creates(compose: dict[str, Any], tmp_path: Path) -> None:
+def test_database_url_matches_compose(compose: dict[str, Any], tmp_path: Path) -> None:
     subprocess.run([sys.executable, TOP / "docker" / "make_secrets.py", tmp_path], capture_output=True, check=True)
     url = urlsplit((tmp_path / "fleetmap_database_url").read_text().strip())
     database = compose["services"]["database"]["environment"]
@@ -90,13 +90,13 @@ def test_the_database_url_names_what_compose_creates(compose: dict[str, Any], tm
     assert database["POSTGRES_PASSWORD_FILE"] == "/run/secrets/database_password"
 
 
-def test_no_secret_can_be_committed_or_built_in() -> None:
+def test_secrets_are_excluded_from_git_and_image() -> None:
     assert "secrets/" in (TOP / "docker" / ".gitignore").read_text().split()
     allowed = [line for line in (TOP / ".dockerignore").read_text().splitlines() if line.startswith("!")]
     assert not any("docker" in line or "data" in line for line in allowed)
 
 
-def test_the_image_is_built_from_what_dockerignore_lets_in() -> None:
+def test_image_needs_only_files_that_dockerignore_allows() -> None:
     allowed = {line[1:] for line in (TOP / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     copied = set()
     for line in re.findall(r"^COPY (?!--from)(.*)$", DOCKERFILE.read_text(), re.MULTILINE):
@@ -105,7 +105,7 @@ def test_the_image_is_built_from_what_dockerignore_lets_in() -> None:
     assert all((TOP / name).exists() for name in allowed)
 
 
-def test_the_lock_file_pins_everything_by_hash_from_the_public_index() -> None:
+def test_lock_file_pins_everything_by_hash_from_the_public_index() -> None:
     lock = tomllib.loads((TOP / "uv.lock").read_text())
     project_packages = [p for p in lock["package"] if "editable" in p["source"]]
     assert [p["name"] for p in project_packages] == ["fleet-map-server"]
@@ -120,7 +120,7 @@ def test_the_lock_file_pins_everything_by_hash_from_the_public_index() -> None:
             assert artifact["hash"].startswith("sha256:")
 
 
-def test_the_lock_file_knows_every_dependency() -> None:
+def test_lock_file_contains_every_dependency() -> None:
     project = tomllib.loads((TOP / "pyproject.toml").read_text())
     lock = tomllib.loads((TOP / "uv.lock").read_text())
     locked = {package["name"] for package in lock["package"]}
@@ -132,7 +132,7 @@ def test_the_lock_file_knows_every_dependency() -> None:
     assert not names - locked
 
 
-def test_the_same_uv_everywhere() -> None:
+def test_uv_version_is_the_same_everywhere() -> None:
     versions = {
         *re.findall(r"UV_VERSION := (\S+)", (TOP / "Makefile").read_text()),
         *re.findall(r"uv==(\d\S*)", DOCKERFILE.read_text()),

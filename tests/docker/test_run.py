@@ -1,7 +1,7 @@
-"""The server exactly as the image's entry point and environment, and the compose file, would start it.
+"""Run the server as the image's entry point and environment and the compose file start it.
 
-No container engine is needed: the Dockerfile and compose.yaml are read, their paths and the database's address are
-mapped to this machine, and what they say is run against a real PostgreSQL with PostGIS.
+Needs no container engine: the tests read the Dockerfile and compose.yaml, map their paths and the database's address to
+this machine, and run the commands against a real PostgreSQL with PostGIS.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TOP = Path(__file__).resolve().parents[2]
 
 
 def instructions() -> list[tuple[str, str]]:
-    """The Dockerfile's last stage as (instruction, argument), continued lines joined."""
+    """Parse the Dockerfile's last stage into (instruction, argument), with continued lines joined."""
     text = (TOP / "docker" / "Dockerfile").read_text()
     text = re.sub(r"^\s*#.*\n", "", text, flags=re.MULTILINE)
     lines = [line.strip() for line in re.sub(r"\\\n", " ", text).splitlines() if line.strip()]
@@ -40,7 +40,7 @@ def instructions() -> list[tuple[str, str]]:
 
 
 def image() -> dict[str, Any]:
-    """What the image says: environment, entry point, command, health check."""
+    """Read the image's environment, entry point, command and health check."""
     configuration: dict[str, Any] = {"env": {}}
     for word, argument in instructions():
         if word == "ENV":
@@ -53,7 +53,7 @@ def image() -> dict[str, Any]:
 
 
 class Container:
-    """A service of the compose file on this machine: its environment and paths, mapped below one folder."""
+    """Service of the compose file on this machine, with environment and paths mapped below one folder."""
 
     def __init__(self, name: str, folder: Path, database_url: str) -> None:
         compose = yaml.safe_load((TOP / "docker" / "compose.yaml").read_text())
@@ -63,7 +63,7 @@ class Container:
         defaulted = {k: re.sub(r"\$\{\w+:-(.*?)\}", r"\1", str(v)) for k, v in environment.items()}
         self.environment = {k: self._mapped(v) for k, v in defaulted.items()}
         self.environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-        # What is compiled is compiled already: bytecode when the image is built, native code at an earlier start.
+        # Share compiled code: bytecode is compiled when the image is built, native code at an earlier start.
         compiled = {k: os.environ[k] for k in ("PYTHONPYCACHEPREFIX", "NUMBA_CACHE_DIR") if k in os.environ}
         self.environment |= compiled
         if "PYTHONPYCACHEPREFIX" in compiled:
@@ -127,14 +127,14 @@ def free_port() -> int:
 
 @pytest.fixture
 def containers(tmp_path: Path, postgres_url: str) -> tuple[Container, Container]:
-    """The migrate service and the server, against a fresh database."""
+    """Migrate service and server, with a new database."""
     migrate, server = (Container(name, tmp_path, postgres_url) for name in ("migrate", "server"))
     server.environment["FLEETMAP_PORT"] = str(free_port())
     return migrate, server
 
 
 @pytest.mark.postgres
-def test_the_image_serves_maps_from_postgis(
+def test_image_serves_maps_from_postgis(
     containers: tuple[Container, Container], offline: Fleetmap, tmp_path: Path
 ) -> None:
     migrate, server = containers
@@ -145,7 +145,7 @@ def test_the_image_serves_maps_from_postgis(
     assert early.returncode == 1, "without its schema the server must not start"
     assert "migrate" in early.stderr
 
-    for _ in range(2):  # compose runs it at every start
+    for _ in range(2):  # compose runs it on every start
         done = migrate.run(migrate.command)
         assert done.returncode == 0, done.stderr
 
@@ -178,20 +178,20 @@ def test_the_image_serves_maps_from_postgis(
     log = (tmp_path / "log").read_text()
     assert status == 0, log
     assert took < 20
-    assert token not in log, "a secret stands in the log"
+    assert token not in log, "the log contains a secret"
     assert "Traceback" not in log
     assert (tmp_path / "data").is_dir()
     assert not list((tmp_path / "data").glob("*.sqlite3")), "everything is in PostgreSQL"
 
 
-def test_the_image_needs_no_shell() -> None:
+def test_image_needs_no_shell() -> None:
     configuration = image()
     for name in ("entrypoint", "cmd", "healthcheck"):
         assert isinstance(configuration[name], list), f"{name} must be in exec form"
         assert configuration[name][0] not in ("sh", "bash", "/bin/sh")
 
 
-def test_what_the_image_writes_lies_in_its_volume() -> None:
+def test_image_writes_only_to_its_volume() -> None:
     from app.config import Settings
 
     configuration = image()

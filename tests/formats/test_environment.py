@@ -476,7 +476,7 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     ):
         other = read_upload(changed)
         assert [p.problem for p in other.warnings if p.file == content] == [
-            f"not used, the maps of the package count: {reason}"
+            f"exact content ignored; the maps of the package are used: {reason}"
         ]
         assert not any(use.used for name, use in other.files.items() if "/fleet_map/" in name)
         assert hashes(other.parts) != hashes(parts)
@@ -528,14 +528,14 @@ def test_files_that_are_no_maps_do_not_make_the_maps_of_a_package_count(root: st
     plain, with_more = read_upload(files), read_upload({**files, **added})
     assert hashes(with_more.parts) == hashes(plain.parts)
     assert [(p.file, p.problem) for p in with_more.warnings] == [
-        (f"{root}config/notes.txt", "no format reads this file: it is kept as a source")
+        (f"{root}config/notes.txt", "no format can read this file; it is stored as a source only")
     ]
     used = {name for name, use in with_more.files.items() if use.used}
     assert used == files.keys() | {f"{root}config/fleet_map/.DS_Store"}
     assert "Somebody" in str(with_more.credit(PartKey("occupancy", "ground", "map")))
     other = read_upload({**files, **added, f"{root}config/location/more.kml": b"<kml/>"})
-    assert f"the maps of the package count: {root}config/location/more.kml was added" in [
-        p.problem.removeprefix("not used, ") for p in other.warnings if p.file == content
+    assert f"the maps of the package are used: {root}config/location/more.kml was added" in [
+        p.problem.removeprefix("exact content ignored; ") for p in other.warnings if p.file == content
     ]
 
 

@@ -1020,5 +1020,5 @@ def test_unknown_elements_are_named_but_those_of_plugins() -> None:
     )
     text = f"<sdf version='1.7'><world name='w'>\n{model}</world></sdf>"
     (warning,) = read_upload({"w.world": text.encode()}).warnings
-    assert warning.problem == "unknown elements, kept without effect: <colision> (did you mean collision?)"
+    assert warning.problem == "unknown elements: <colision> (did you mean collision?); they are stored without effect"
     assert warning.line == 2

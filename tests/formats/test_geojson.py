@@ -345,7 +345,7 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        ("", "not JSON"),
+        ("", "invalid JSON"),
         ("[]", "one object"),
         ('{"type": "Topology"}', "no GeoJSON type"),
         ('{"type": ["Feature"]}', "no GeoJSON type"),

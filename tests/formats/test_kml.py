@@ -813,5 +813,7 @@ def test_unknown_elements_are_named_with_their_number() -> None:
     for data in (text.encode(), ('<?xml version="1.0" encoding="UTF-16"?>' + text).encode("utf-16")):
         _, context = load(data)
         (warning,) = context.warnings
-        assert warning.problem == ("unknown elements, kept without effect: <nam> (did you mean name?) (2 times), <zzz>")
+        assert warning.problem == (
+            "unknown elements: <nam> (did you mean name?) (2 times), <zzz>; they are stored without effect"
+        )
         assert warning.line == 2

@@ -223,7 +223,7 @@ def test_lies_in_headers_are_found_before_anything_is_allocated(data: bytes, sai
 def test_limits_are_kept() -> None:
     with pytest.raises(TooLarge, match="limit is 2"):
         read(FIELD, limits=Limits(voxels=2))
-    with pytest.raises(TooLarge, match="which is the limit"):
+    with pytest.raises(TooLarge, match="more than the limit of"):
         read(SPIRAL, limits=Limits(unpacked_bytes=100))
 
 

@@ -283,7 +283,7 @@ def test_a_tiff_without_a_crs_takes_the_option() -> None:
     picture, context = read({"a.tif": data}, options={"crs": "epsg:27700"})
     assert picture.crs == "EPSG:27700"
     assert context.warnings == []
-    with pytest.raises(UnreadableFile, match="nowhere on earth"):
+    with pytest.raises(UnreadableFile, match="outside the area of"):
         read({"a.tif": data}, options={"crs": "EPSG:99999"})
 
 
@@ -498,7 +498,7 @@ def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given
     assert [k.layer for k in upload_bundle.parts] == ["occupancy"]
     (warning,) = upload_bundle.warnings
     assert warning.file == "config/location/satellite-auto.png"
-    assert "kept as a source" in warning.problem
+    assert "stored as a source" in warning.problem
     assert "corners=" in warning.problem
     upload_bundle = upload_reader.read(
         files, UploadHints(options={"corners": "53.2,-0.6,53.1,-0.5"}), EnvironmentContext(), LIMITS

@@ -52,7 +52,7 @@ def test_only_what_is_literal_on_every_run() -> None:
     assert variables == {"COMMON_RELEASE": "v1.0.1", "FIELD_NAME": 'east "path"', "FIELD_ID": "p1"}
     text = "\n".join(warnings)
     for name in ("DATUM_FILE", "LOOPED", "INSIDE", "CASED", "PROPERTIES_FILE", "__dirname"):
-        assert f"{name} is left out" in text
+        assert f"{name} is skipped" in text
     assert "line 9: PROPERTIES_FILE" in text
     assert "HIDDEN" not in text
 

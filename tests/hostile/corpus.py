@@ -1,7 +1,7 @@
-"""Hostile uploads, made up by name: what each holds is said here, and whether it must be refused.
+"""Hostile uploads by name, with the expected verdict.
 
-``verdict``: ``refused`` (never stored), ``read`` (odd, but real: taken in, with a warning where one is due) or ``any``
-(damage that may or may not be noticed; never a hang, never a crash).
+``verdict``: ``refused`` (never stored), ``read`` (unusual, but real: accepted, with a warning if appropriate) or ``any``
+(damage that may be detected or not; never a hang, never a crash).
 """
 
 # ruff: noqa: E501, UP031 - lines of data, one case each; braces of JSON
@@ -28,7 +28,7 @@ Verdict = Literal["refused", "read", "any"]
 
 @dataclass(frozen=True)
 class Case:
-    """One upload. format: what the sender says it is."""
+    """One upload. format: as stated by the sender."""
 
     name: str
     files: dict[str, bytes]
@@ -36,7 +36,7 @@ class Case:
     format: str | None = None
 
 
-# --- building stones ---------------------------------------------------------------------------------------------
+# --- building blocks ---------------------------------------------------------------------------------------------
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
@@ -44,7 +44,7 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 
 
 def png(width: int, height: int, pixels: bytes | None, *, depth: int = 8, colour: int = 0, more: bytes = b"") -> bytes:
-    """A PNG with this header; ``pixels`` are the packed rows, None: a few bytes that cannot be all of it."""
+    """Build a PNG with this header; ``pixels`` are the packed rows, None: only a few bytes."""
     body = zlib.compress(b"\0" * 64 if pixels is None else pixels, 9)
     head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + more + chunk(b"IDAT", body) + chunk(b"IEND", b"")
@@ -59,7 +59,7 @@ def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> byt
 
 
 def raw_zip(members: list[tuple[bytes, bytes, dict[str, int]]]) -> bytes:
-    """A stored archive made by hand, so that it can lie: per member name, body, and fields of headers to override."""
+    """Build an archive by hand, with arbitrary headers: per member name, body, and header fields to override."""
     out, directory = b"", b""
     for name, body, lies in members:
         crc = lies.get("crc", zlib.crc32(body))
@@ -80,7 +80,7 @@ def raw_zip(members: list[tuple[bytes, bytes, dict[str, int]]]) -> bytes:
 
 @functools.cache
 def zeros(mebibytes: int) -> tuple[bytes, dict[str, int]]:
-    """A member that unfolds to so many MiB of zeros, for ``raw_zip``: compressed once, for all that hold it."""
+    """Build a member for ``raw_zip`` that decompresses to this many MiB of zeros; cached."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
     size = mebibytes * 2**20
@@ -127,7 +127,7 @@ HUGE = "9" * 5000
 
 
 def yaml_cases() -> Iterator[Case]:
-    """What YAML can do, in a datum, a grid and a network."""
+    """Yield YAML attacks in a datum, a grid and a network."""
 
     def datum(name: str, tail: str | bytes, verdict: Verdict = "refused") -> Case:
         body = DATUM.format(lat=53.0, lon=-0.5).encode() + (tail.encode() if isinstance(tail, str) else tail)
@@ -251,7 +251,7 @@ LAUGHS = (
 
 
 def xml_cases() -> Iterator[Case]:
-    """What XML can do, in a drawing and in an OSM extract."""
+    """Yield XML attacks in a drawing and in an OSM extract."""
     place = KML.format(name="&b;", at="7,50")
     extract = "<osm version='0.6'><node id='1' lat='50' lon='7'><tag k='name' v='&a;'/></node></osm>"
     for root, body, file in (("kml", place, "a.kml"), ("osm", extract, "a.osm")):
@@ -384,7 +384,7 @@ def xml_cases() -> Iterator[Case]:
 
 
 def lanelet_cases() -> Iterator[Case]:
-    """Lanelets that lead astray: their points, their bounds, what they say of themselves, the file beside them."""
+    """Yield lanelets with wrong points, bounds, attributes and companion files."""
     node = (
         "<node id='%d' lat='%s' lon='%s'><tag k='local_x' v='%s'/><tag k='local_y' v='%s'/><tag k='ele' v='%s'/></node>"
     )
@@ -448,7 +448,7 @@ def lanelet_cases() -> Iterator[Case]:
 
 
 def pbf_cases() -> Iterator[Case]:
-    """Blocks whose lengths and contents lie."""
+    """Yield PBF blocks with wrong lengths and contents."""
 
     def blob(kind: bytes, body: bytes, size: int | None = None) -> bytes:
         inner = (
@@ -498,7 +498,7 @@ def zigzag(value: int) -> int:
 
 
 def json_cases() -> Iterator[Case]:
-    """What JSON can do, in GeoJSON."""
+    """Yield JSON attacks in GeoJSON."""
     point = '{"type": "Point", "coordinates": [7, 50]}'
     for name, data in {
         "brackets": b'{"type": "FeatureCollection", "features": ' + b"[" * 60_000,
@@ -577,7 +577,7 @@ def json_cases() -> Iterator[Case]:
 
 
 def picture_cases() -> Iterator[Case]:
-    """Pictures of grids that lie, are damaged, or unfold to much."""
+    """Yield images of grids with wrong headers, damage, or a large uncompressed size."""
     named = ROOM.replace(b"room.pgm", b"room.png")
     rows = b"".join(b"\0" + bytes(8) for _ in range(8))
     for name, data in {
@@ -667,7 +667,7 @@ def picture_cases() -> Iterator[Case]:
 
 
 def archive_cases() -> Iterator[Case]:
-    """Archives that escape, lie or unfold; as a folder and as a KMZ."""
+    """Yield archives with escaping names, wrong headers or decompression bombs; as a folder and as a KMZ."""
     doc = KML.format(name="x", at="7,50").encode()
     body = b"x" * 100
     plain = (b"doc.kml", doc, {})
@@ -726,7 +726,7 @@ def archive_cases() -> Iterator[Case]:
 
 
 def folder_cases() -> Iterator[Case]:
-    """Folders as robots have them, with scripts."""
+    """Yield folders as on robots, with scripts."""
     datum = {"config/location/datum.yaml": DATUM.format(lat=53.0, lon=-0.5).encode()}
     scripts = {
         "command": b"export A=$(touch /tmp/evil)\nexport B=`id`\nC=1\n",
@@ -765,7 +765,7 @@ NAV_GRAPH = "building_name: b\nlevels:\n  L1:\n    vertices:\n    - [{x}, 0.0, {
 
 
 def network_cases() -> Iterator[Case]:
-    """The networks of topological_navigation (the older list), environment_common, Fawkes and Open-RMF."""
+    """Yield networks of topological_navigation (the older list), environment_common, Fawkes and Open-RMF."""
     bad_numbers = (
         ".nan",
         ".inf",
@@ -1041,13 +1041,13 @@ def network_cases() -> Iterator[Case]:
     )
 
 
-# --- pictures with a place ---------------------------------------------------------------------------------------
+# --- georeferenced images ----------------------------------------------------------------------------------------
 
 
 def tiff(
     tags: dict[int, tuple[int, int, int]], tail: bytes = b"", *, following: int = 0, count: int | None = None
 ) -> bytes:
-    """A little-endian TIFF of one page: tag -> (type, count, value or offset); the tail follows it at once."""
+    """Build a little-endian TIFF of one page: tag -> (type, count, value or offset), followed by the tail."""
     body = b"".join(struct.pack("<HHII", tag, *entry) for tag, entry in sorted(tags.items()))
     number = len(tags) if count is None else count
     return b"II*\0" + struct.pack("<IH", 8, number) + body + struct.pack("<I", following) + tail
@@ -1056,7 +1056,7 @@ def tiff(
 def geotiff(
     changed: dict[int, tuple[int, int, int] | None] | None = None, pixels: bytes = bytes(12), **more: int
 ) -> bytes:
-    """A whole one of 4 × 3 grey pixels with a place, with other values of some tags (None: without the tag)."""
+    """Build a GeoTIFF of 4 × 3 grey pixels, with other values of some tags (None: without the tag)."""
     tags: dict[int, tuple[int, int, int]] = {
         256: (3, 1, 4), 257: (3, 1, 3), 258: (3, 1, 8), 259: (3, 1, 1), 262: (3, 1, 1), 273: (4, 1, 0), 277: (3, 1, 1),
         278: (3, 1, 3), 279: (4, 1, len(pixels)), 33550: (12, 3, 0), 33922: (12, 6, 0),
@@ -1072,7 +1072,7 @@ def geotiff(
 
 
 def satellite_cases() -> Iterator[Case]:
-    """TIFF that lies, loops or unfolds; world files of odd numbers; pictures that take long."""
+    """Yield TIFF with wrong tags, loops or bombs; world files with invalid numbers; slow images."""
     yield Case("satellite/as it should be", {"a.tif": geotiff()}, "read")
     packed = zlib.compress(bytes(2**24), 9)
     huge = (4, 1, 2**32 - 1)
@@ -1174,7 +1174,7 @@ def satellite_cases() -> Iterator[Case]:
 
 
 def many_pages(count: int) -> bytes:
-    """Pages of one pixel each, all of them the same but for the next one's place."""
+    """Build pages of one pixel each, equal except for the offset of the next one."""
     out = [geotiff(following=0)]
     start = len(out[0])
     size = 2 + 12 * 9 + 4
@@ -1206,13 +1206,13 @@ def many_pages(count: int) -> bytes:
 
 
 def pcd(fields: str = "x y z", size: str = "4 4 4", kind: str = "F F F", n: object = 1, data: str = "binary") -> bytes:
-    """A PCD's header."""
+    """Build the header of a PCD."""
     lines = f"VERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\nDATA {data}\n"
     return lines.encode()
 
 
 def cloud_cases() -> Iterator[Case]:
-    """Headers that promise what is not there, streams that unfold without end, numbers that are none."""
+    """Yield point clouds with wrong headers, decompression bombs and invalid numbers."""
     point = struct.pack("<3f", 1, 2, 3)
 
     def case(name: str, data: bytes, verdict: Verdict, end: str = "pcd") -> Case:
@@ -1309,7 +1309,7 @@ def cloud_cases() -> Iterator[Case]:
 
 
 def sdf_cases() -> Iterator[Case]:
-    """Worlds whose includes, meshes, numbers and lists are not what they say."""
+    """Yield worlds with invalid includes, meshes, numbers and lists."""
 
     def upload(inner: str, more: dict[str, bytes] | None = None, version: str = "1.7") -> dict[str, bytes]:
         world = f'<sdf version="{version}"><world name="w">{inner}</world></sdf>'
@@ -1432,7 +1432,7 @@ def sdf_cases() -> Iterator[Case]:
 
 
 def package_cases() -> Iterator[Case]:
-    """Packages of an environment whose parts are not what their places say."""
+    """Yield environment packages whose parts do not match their paths."""
     datum = b"datum_latitude: 53.2\ndatum_longitude: -0.5\n"
     for name, inside, verdict in (
         (
@@ -1479,7 +1479,7 @@ ACCORDING_TO_KIND = (
 
 
 def cases() -> list[Case]:
-    """All of them."""
+    """List all cases."""
     return [case for kind in ACCORDING_TO_KIND for case in kind()]
 
 
@@ -1492,7 +1492,7 @@ VALUES = (
 
 
 def damaged(data: bytes, seed: int, count: int) -> Iterator[bytes]:
-    """So many damaged copies: cut, flipped, doubled, with other values, with lines that moved."""
+    """Yield ``count`` damaged copies: cut, flipped, doubled, with other values, with moved lines."""
     dice = random.Random(seed)
     for k in range(count):
         kind = k % 6
@@ -1524,7 +1524,7 @@ def damaged(data: bytes, seed: int, count: int) -> Iterator[bytes]:
 
 
 def sample_maps() -> list[tuple[str, dict[str, bytes]]]:
-    """(format, files) of each of our own samples."""
+    """List (format, files) of each of our own samples."""
     out = []
     for folder in sorted(SAMPLES.iterdir()):
         for item in sorted(folder.iterdir()):

@@ -1,7 +1,7 @@
-"""Mutations of every sample through the read boundary: `make fuzz`; a bounded part of it is a test.
+"""Fuzz the upload reader with mutations of every sample: `make fuzz`; a bounded part is a test.
 
-The law: an upload is read, or refused with a file and a reason. What is read is written in its own format and read
-again. Nothing else is raised, no input takes more than ``CPU_SECONDS`` or the memory of a worker.
+Invariant: an upload is read, or rejected with a file and a reason. Content that was read is written in its own format
+and read again. Nothing else is raised, no input takes more than ``CPU_SECONDS`` or the memory of a worker.
 
     make fuzz ARGS="--minutes 30 --seed 7 --format kml"
 """
@@ -51,7 +51,7 @@ WORDS = (
 
 
 def mutate(data: bytes, dice: random.Random, other: bytes = b"") -> bytes:
-    """Change a file in one to four ways: bytes, lines, numbers, words, cuts, copies, pieces of another file."""
+    """Apply one to four changes to a file: bytes, lines, numbers, words, cuts, copies, pieces of another file."""
     for _ in range(dice.randint(1, 4)):
         data = dice.choice(MUTATIONS)(data, dice, other)
     return data
@@ -108,7 +108,7 @@ MUTATIONS = (_bytes, _cut, _lines, _splice, *(_token(NUMBER, NUMBERS),) * 3, *(_
 
 
 class OverrunError(BaseException):
-    """An input took too long; no reader catches it."""
+    """Timeout of an input; no reader catches it."""
 
 
 def _overrun(number: int, frame: object) -> None:
@@ -116,7 +116,7 @@ def _overrun(number: int, frame: object) -> None:
 
 
 def outcome(name: str | None, files: Files) -> str:
-    """Read files as an upload, and what was read again from its own format; raises where the law does not hold."""
+    """Read files as an upload, and again from their own format; raises if the invariant is violated."""
     signal.signal(signal.SIGPROF, _overrun)
     signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
     try:
@@ -152,7 +152,7 @@ def _again(upload_bundle: upload_reader.Bundle) -> str:
             continue
         try:
             written = formats.write(fmt, layers, WriteContext())
-        except FleetMapError as error:  # what was read lacks what the format needs: a network without an edge
+        except FleetMapError as error:  # the content lacks what the format needs: a network without an edge
             assert error.detail
             continue
         upload_reader.read(written, UploadHints(name), EnvironmentContext(HERE), LIMITS)
@@ -160,9 +160,9 @@ def _again(upload_bundle: upload_reader.Bundle) -> str:
 
 
 def run(seed: int, seconds: float, only: str | None = None, limit: int = 10**9) -> tuple[Counter[str], list[str]]:
-    """Mutate until the CPU time is used up; counts of outcomes, and what broke the law, each place once.
+    """Mutate until the CPU time is used up. Returns counts of outcomes, and violations, each location once.
 
-    ``limit``: mutations at most.
+    ``limit``: maximum number of mutations.
     """
     maps = [(name, files) for name, files in sample_maps() if only in (None, name)]
     counts: Counter[str] = Counter()
@@ -190,7 +190,7 @@ def run(seed: int, seconds: float, only: str | None = None, limit: int = 10**9) 
 
 
 def main() -> int:
-    """Fuzz for some minutes of CPU time; 1 where the law was broken."""
+    """Fuzz for some minutes of CPU time. Returns 1 if the invariant was violated."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0, help="CPU time; default: 10")
     parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(2**31), help="default: any")

@@ -1,4 +1,4 @@
-"""Clients that take up connections: silent, slow, or refused. The server goes on answering all others."""
+"""Clients that occupy connections: silent, slow, or rejected. The server still serves all others."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tests.cli.conftest import ServerProcess
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}
 CLOSED_SECONDS = 1.0
 PATIENCE_SECONDS = 10.0
-"""How much longer a test waits on a busy machine before it gives up."""
+"""Additional time in seconds that a test waits on a busy machine."""
 
 JSON_HEAD = "Content-Type: application/json\r\nContent-Length: 100000\r\n"
 
 
 class FakeConnection:
-    """A connection that says whether it was closed."""
+    """Connection that records whether it was closed."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -48,7 +48,7 @@ class Clock:
 
 
 def crowd(connections: Connections, number: int, address: str) -> list[FakeConnection]:
-    """New connections of one address, all accepted."""
+    """Open connections of one address, all accepted."""
     fakes = [FakeConnection() for _ in range(number)]
     assert all(connections.open(one, address) for one in fakes)
     return fakes
@@ -58,10 +58,10 @@ def still_open(crowd: list[FakeConnection]) -> int:
     return sum(not one.closed for one in crowd)
 
 
-# --- which connections give way ---
+# --- which connections are closed ---
 
 
-def test_oldest_connection_of_an_address_gives_way_beyond_its_limit() -> None:
+def test_oldest_connection_of_an_address_is_closed_beyond_its_limit() -> None:
     connections = Connections(ConnectionLimits(total=100, per_address=5))
     first = crowd(connections, 5, "10.0.0.1")
     other = crowd(connections, 5, "10.0.0.2")
@@ -73,7 +73,7 @@ def test_oldest_connection_of_an_address_gives_way_beyond_its_limit() -> None:
     assert still_open(local) == 20, "loopback addresses have no limit of their own"
 
 
-def test_proven_connections_do_not_count_for_their_address() -> None:
+def test_authenticated_connections_do_not_count_for_their_address() -> None:
     connections = Connections(ConnectionLimits(total=100, per_address=5))
     robots = []
     for _ in range(20):  # behind one NAT
@@ -84,7 +84,7 @@ def test_proven_connections_do_not_count_for_their_address() -> None:
     assert len(connections) == 25
 
 
-def test_strangers_leave_a_quarter_of_the_places_and_displace_no_one_with_a_token() -> None:
+def test_anonymous_connections_leave_a_quarter_and_close_none_with_a_token() -> None:
     clock = Clock()
     connections = Connections(ConnectionLimits(total=100, per_address=1000), clock)
     (robot,) = crowd(connections, 1, "10.0.0.1")
@@ -96,15 +96,15 @@ def test_strangers_leave_a_quarter_of_the_places_and_displace_no_one_with_a_toke
     assert still_open(strangers) == 75
     crowd(connections, 1, "10.0.0.1")
     assert still_open(expected) == 24
-    assert still_open(strangers) == 74, "a trusted address takes the place of a stranger"
+    assert still_open(strangers) == 74, "a trusted address replaces an anonymous one"
     assert not robot.closed
     clock.time += TRUST_SECONDS + 1
     late = crowd(connections, 30, "10.0.0.1")
     assert still_open(late) == 30
-    assert len(connections) == 100, "its address is not trusted any longer"
+    assert len(connections) == 100, "its address is no longer trusted"
 
 
-def test_connections_with_a_token_give_way_only_while_idle() -> None:
+def test_connections_with_a_token_are_closed_only_while_idle() -> None:
     connections = Connections(ConnectionLimits(total=16, per_address=100))
     proven = []
     for _ in range(16):
@@ -117,14 +117,14 @@ def test_connections_with_a_token_give_way_only_while_idle() -> None:
     assert connections.open(late, "10.0.0.1")
     assert [k for k, one in enumerate(proven) if one.closed] == [3]
     connections.prove(late)
-    connections.prove(proven[3])  # its answer came too late
+    connections.prove(proven[3])  # its response came too late
     assert len(connections) == 16
     for one in [*proven, late]:
         connections.close(one)
     assert len(connections) == 0
 
 
-def test_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
+def test_limit_of_open_files_is_raised_to_its_maximum() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     hard = before[1] if before[1] != resource.RLIM_INFINITY else 2**20
     try:
@@ -156,7 +156,7 @@ def connect(url: str) -> socket.socket:
 
 
 def read_to_end(line: socket.socket, trickle: bytes = b"") -> tuple[bytes, float]:
-    """What comes until the server closes, and how long that takes after the answer; ``trickle`` is sent meanwhile."""
+    """Read until the server closes; return the bytes and the seconds after the response. Sends ``trickle``."""
     out, answered, started = b"", 0.0, time.monotonic()
     while time.monotonic() - started < PATIENCE_SECONDS:
         if not select.select([line], [], [], 0.05)[0]:
@@ -197,7 +197,7 @@ REFUSED = [
 
 
 def send_head(url: str, target: str, token: str, head: str) -> socket.socket:
-    """A connection with the head of a request, whose body has yet to come."""
+    """Open a connection and send the header of a request, without its body."""
     line = connect(url)
     method, path = target.split()
     bearer = f"Authorization: Bearer {token}\r\n" if token else ""
@@ -205,8 +205,8 @@ def send_head(url: str, target: str, token: str, head: str) -> socket.socket:
     return line
 
 
-def test_refused_body_is_not_awaited(api: Api) -> None:
-    """The answer comes, says that the connection closes, and it does: also while the body goes on trickling."""
+def test_rejected_body_is_not_awaited(api: Api) -> None:
+    """The response announces that the connection closes, and it does, even while the client still sends the body."""
     lines = [send_head(api.url, target, token, head) for target, token, head, _ in REFUSED]
     for line, (target, _, head, status) in zip(lines, REFUSED, strict=True):
         chunk = b"1\r\n \r\n" if "chunked" in head else b" "
@@ -217,8 +217,8 @@ def test_refused_body_is_not_awaited(api: Api) -> None:
         assert seconds < CLOSED_SECONDS + PATIENCE_SECONDS / 2, target
 
 
-def test_refused_large_body_gets_its_answer(api: Api) -> None:
-    """A client that sends all before it reads is not reset."""
+def test_rejected_large_body_gets_a_response(api: Api) -> None:
+    """A client that sends everything before it reads is not reset."""
     with connect(api.url) as line:
         body = bytes(20_000_000)
         line.sendall(
@@ -246,7 +246,7 @@ ASK = b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n"
 
 
 @pytest.mark.parametrize("number", [1, 3])
-def test_what_is_no_request_breaks_no_answer_before_it(api: Api, number: int) -> None:
+def test_malformed_request_keeps_earlier_responses(api: Api, number: int) -> None:
     with connect(api.url) as line:
         line.sendall((ASK + b"\r\n") * number + b"nonsense\r\n\r\n" + bytes(100_000))
         answers, _ = read_to_end(line)
@@ -259,7 +259,7 @@ def test_what_is_no_request_breaks_no_answer_before_it(api: Api, number: int) ->
     assert answers == b""
 
 
-def test_half_a_request_behind_an_answer_ends_the_connection(api: Api) -> None:
+def test_incomplete_request_after_a_response_ends_the_connection(api: Api) -> None:
     with connect(api.url) as line:
         line.sendall(ASK + b"\r\n" + ASK + b"Transfer-Encoding: chunked\r\n\r\nnonsense\r\n")
         assert b"HTTP/1.1 400 " not in read_to_end(line)[0]
@@ -268,7 +268,7 @@ def test_half_a_request_behind_an_answer_ends_the_connection(api: Api) -> None:
         assert read_to_end(line)[0].startswith(b"HTTP/1.1 400 ")
 
 
-def test_slow_bodies_and_heads_end(api: Api) -> None:
+def test_slow_bodies_and_headers_time_out(api: Api) -> None:
     bearer = f"Authorization: Bearer {ADMIN}\r\n"
     with connect(api.url) as body, connect(api.url) as head, connect(api.url) as blank:
         body.sendall(f"POST /api/v1/environments HTTP/1.1\r\nHost: x\r\n{bearer}{JSON_HEAD}\r\n".encode())
@@ -278,10 +278,10 @@ def test_slow_bodies_and_heads_end(api: Api) -> None:
         assert b"1000 bytes a second" in answer
         head.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: ")
         assert read_to_end(head, b"x")[0] == b""
-        assert read_to_end(blank, b"\r\n")[0].startswith(b"HTTP/1.1 200 "), "empty lines are no request"
+        assert read_to_end(blank, b"\r\n")[0].startswith(b"HTTP/1.1 200 "), "empty lines before a request are ignored"
 
 
-def test_client_that_does_not_read_is_given_up(api: Api) -> None:
+def test_connection_of_client_that_does_not_read_is_closed(api: Api) -> None:
     with connect(api.url) as line:
         line.sendall(b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n\r\n" * 200)
         with pytest.raises((ConnectionResetError, BrokenPipeError)):
@@ -315,7 +315,7 @@ def test_unfinished_handshakes_are_bounded(tmp_path: Path) -> None:
 
 
 def trickle(address: str, number: int, flood: list[socket.socket]) -> Iterator[None]:
-    """Open connections that send a byte now and then, of a head or a body without a token; yields at each 100th."""
+    """Open connections that slowly send bytes of a header, or of a body without a token; yields at each 100th."""
     for k in range(number):
         line = connect(address)
         head = f"POST /api/v1/environments HTTP/1.1\r\nHost: x\r\n{JSON_HEAD}"
@@ -329,7 +329,7 @@ def trickle(address: str, number: int, flood: list[socket.socket]) -> Iterator[N
 
 
 def test_server_answers_during_a_flood_of_slow_connections(tmp_path: Path) -> None:
-    """600 sockets send a byte a second each: some a head, some a body without a token. All others get their answer."""
+    """600 sockets send a byte per second each, of a header or of a body without a token. Others get their response."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(900, limits[1]), limits[1]))
     number = 600

@@ -1,4 +1,4 @@
-"""Hostile files through the read boundary: refused with file and reason, or read; no crash, no hang, little memory."""
+"""Hostile files are rejected with file and reason, or read, without crash, hang or high memory use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import ACCORDING_TO_KIND, Case, cases, damaged, sample_maps, zipped
 
 SECONDS = 15.0
-"""Of CPU time, for one case; the slowest ones take one or two."""
+"""CPU time limit of one case, in seconds; the slowest ones take one or two."""
 
 MEMORY = 6 * 2**30
 COPIES = 60
@@ -27,7 +27,7 @@ LIMITS = Limits()
 
 @pytest.fixture(autouse=True, scope="module")
 def little_memory() -> Iterator[None]:
-    """An address space like a worker's: what would eat more fails here instead of the machine."""
+    """Limit the address space like a worker's, to protect the machine."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, before[1]))
     yield
@@ -35,7 +35,7 @@ def little_memory() -> Iterator[None]:
 
 
 def outcome(case: Case) -> str:
-    """``read`` or ``refused``; anything else fails here."""
+    """Return ``read`` or ``refused``; fail for anything else."""
     start = time.process_time()
     try:
         upload_bundle = upload_reader.read(
@@ -50,7 +50,7 @@ def outcome(case: Case) -> str:
             assert all(p.file and p.problem for p in error.problems), f"{case.name}: which file? {error.detail}"
     else:
         result = "read"
-        # What was read can be answered as JSON: no NaN, no integer beyond 64 bit, no lone surrogate.
+        # The content must be valid JSON: no NaN, no integer beyond 64 bits, no lone surrogate.
         for part in upload_bundle.parts.values():
             orjson.dumps([list(getattr(part, "ids", ())), list(getattr(part, "properties", ()))])
         orjson.dumps([w.as_dict() for w in upload_bundle.warnings])
@@ -59,7 +59,7 @@ def outcome(case: Case) -> str:
 
 
 @pytest.mark.parametrize("kind", ACCORDING_TO_KIND, ids=lambda kind: kind.__name__)
-def test_hostile_files(kind: object) -> None:
+def test_hostile_files_have_their_verdict(kind: object) -> None:
     wrong = []
     for case in kind():  # type: ignore[operator]
         result = outcome(case)
@@ -68,20 +68,20 @@ def test_hostile_files(kind: object) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_case_has_a_name_of_its_own() -> None:
+def test_hostile_cases_have_unique_names() -> None:
     names = [case.name for case in cases()]
     assert len(names) > 700
     assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize(("name", "files"), [pytest.param(n, f, id=f"{n}/{min(f)}") for n, f in sample_maps()])
-def test_damaged_samples(name: str, files: dict[str, bytes]) -> None:
+def test_damaged_samples_are_read_or_rejected(name: str, files: dict[str, bytes]) -> None:
     results = set()
     for victim in sorted(files):
         for k, data in enumerate(damaged(files[victim], seed=len(files[victim]), count=COPIES)):
             case = Case(f"{victim}, damage {k}", {**files, victim: data}, "any", name if k % 2 else None)
             results.add(outcome(case))
-    assert "refused" in results, "no damage at all is noticed"
+    assert "refused" in results, "no damage was detected"
 
 
 def test_archives_of_one_upload_share_the_limit() -> None:

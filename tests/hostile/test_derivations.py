@@ -1,5 +1,4 @@
-"""Bad content through the derivations: a clear problem, or a result that holds something; never an empty map that looks
-right, never a 500."""
+"""Derivations of bad content give a clear problem or a non-empty result, never a plausible empty map or a 500."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ METHODS: dict[str, list[dict[str, Any]]] = {
     "occupancy_to_topology": [{"method": "skeleton"}, {"method": "roadmap"}, {"method": "voronoi"}]
 }
 GIVES = {
-    # What there is to be made of such a grid; everything else is refused.
+    # Derivations that work on such a grid; all others are rejected.
     ("occupancy_to_voxels", "all occupied"),
     ("occupancy_to_voxels", "1 x 1 occupied"),
     ("occupancy_to_voxels", "all free"),
@@ -65,7 +64,7 @@ GIVES = {
 
 
 @pytest.mark.parametrize("case", GRIDS)
-def test_grids_without_content_through_the_server(api: Api, fresh: Callable[[], str], case: str) -> None:
+def test_grids_without_content_return_problems(api: Api, fresh: Callable[[], str], case: str) -> None:
     assert OF_GRIDS, "no derivation takes a grid"
     env = fresh()
     api.post("environments", {"name": env})
@@ -79,7 +78,7 @@ def test_grids_without_content_through_the_server(api: Api, fresh: Callable[[], 
                 continue
             assert answer.status_code == 422, (name, values, answer.text)
             assert "grid" in answer.json()["detail"], (name, answer.text)
-    # What is to be had is told by the coverage table, and it is true.
+    # The coverage table matches the downloads.
     for row in api.get(f"environments/{env}/versions/1/maps").json():
         answer = api("GET", f"environments/{env}/versions/1/maps/{row['format']}")
         if row["state"] == "missing":
@@ -126,7 +125,7 @@ SOUND = {
     "each triangle twice",
     "a body and points",
 }
-"""They stand in a robot's way, and are seen."""
+"""Meshes that are obstacles for a robot, and are detected."""
 
 
 def world(mesh: bytes | None) -> dict[str, bytes]:
@@ -141,7 +140,7 @@ def world(mesh: bytes | None) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("case", MESHES)
-def test_bad_meshes_are_cut_and_filled_or_told(api: Api, fresh: Callable[[], str], case: str) -> None:
+def test_bad_meshes_are_sliced_or_reported(api: Api, fresh: Callable[[], str], case: str) -> None:
     env = fresh()
     api.post("environments", {"name": env})
     answer = api.upload(env, world(MESHES[case]), expect=None)
@@ -164,7 +163,7 @@ def test_bad_meshes_are_cut_and_filled_or_told(api: Api, fresh: Callable[[], str
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
-def test_a_picture_without_a_place_is_refused_with_a_way_out(api: Api, fresh: Callable[[], str]) -> None:
+def test_picture_without_position_is_rejected_with_advice(api: Api, fresh: Callable[[], str]) -> None:
     env = fresh()
     api.post("environments", {"name": env})
     ok, png = cv2.imencode(".png", np.full((20, 30, 3), 90, np.uint8))
@@ -173,7 +172,7 @@ def test_a_picture_without_a_place_is_refused_with_a_way_out(api: Api, fresh: Ca
     text = refused["detail"] + json.dumps(refused.get("errors", []))
     assert "corners=" in text
     assert "metres_per_pixel" in text
-    # On earth, but in an environment that does not say where it lies.
+    # In WGS 84, but in an environment without a datum.
     world_file = b"0.00001\n0\n0\n-0.00001\n10\n52\n"
     api.upload(env, {"above.png": png.tobytes(), "above.pgw": world_file}, format="satellite", crs="EPSG:4326")
     for method in ("imagery_to_occupancy", "imagery_to_objects"):
@@ -183,7 +182,7 @@ def test_a_picture_without_a_place_is_refused_with_a_way_out(api: Api, fresh: Ca
 
 
 def pictures(seed: int) -> GeoImage:
-    """A picture of any kind: of noise, of one colour, of blocks; of any type, number of bands, place and size."""
+    """Build a random image of noise, one colour or blocks, of any type, number of bands, position and size."""
     rng = np.random.default_rng(seed)
     height, width = (int(v) for v in rng.integers(1, 90, 2))
     if seed % 7 == 0:
@@ -230,7 +229,7 @@ ODD: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("seed", range(45))
-def test_any_picture_gives_something_or_a_clear_problem(seed: int) -> None:
+def test_any_picture_gives_objects_or_a_clear_problem(seed: int) -> None:
     layers = Layers({PartKey("imagery", "ground", "satellite"): pictures(seed)})
     for module in (imagery_to_objects, imagery_to_occupancy):
         function = getattr(module, module.__name__.rpartition(".")[2])
@@ -293,7 +292,7 @@ def test_any_grid_gives_objects_or_a_clear_problem(seed: int) -> None:
     assert isinstance(part, Features)
     assert len(part)
     assert shapely.is_valid(part.geometry).all()
-    # They stand where the grid is, and a world can be written of them.
+    # They are inside the grid, and can be written as a world.
     x, y, yaw = grid.origin
     around = shapely.transform(
         shapely.box(0, 0, grid.width * grid.resolution, grid.height * grid.resolution),

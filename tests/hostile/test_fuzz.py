@@ -1,4 +1,4 @@
-"""A bounded part of `make fuzz`: the same mutations on every machine, chosen by Hypothesis where it finds more."""
+"""Bounded part of `make fuzz`: the same mutations on every machine; Hypothesis also chooses some."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.hostile.fuzz import mutate, outcome, run
 MAPS = list(sample_maps())
 
 
-def test_mutated_samples_are_read_or_refused() -> None:
+def test_mutated_samples_are_read_or_rejected() -> None:
     counts, failures = run(seed=20261122, seconds=8.0, limit=600)
     assert not failures, "\n".join(failures)
     assert counts["refused"] > counts.total() // 10, counts
@@ -22,7 +22,7 @@ def test_mutated_samples_are_read_or_refused() -> None:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(k=st.integers(0, len(MAPS) - 1), seed=st.integers(0, 2**32), tail=st.binary(max_size=40))
-def test_any_mutation_is_read_or_refused(k: int, seed: int, tail: bytes) -> None:
+def test_any_mutation_is_read_or_rejected(k: int, seed: int, tail: bytes) -> None:
     name, files = MAPS[k]
     dice = random.Random(seed)
     victim = dice.choice(sorted(files))

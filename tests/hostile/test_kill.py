@@ -1,4 +1,4 @@
-"""kill -9 of the server while uploads arrive: what was acknowledged is there byte for byte, else nothing or all."""
+"""kill -9 of the server during uploads: acknowledged versions are intact, others complete or not at all."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Files = dict[str, bytes]
 
 @dataclass
 class Ledger:
-    """What was sent, by the hashes of its files, and which versions the server acknowledged."""
+    """Sent uploads, by the hashes of their files, and acknowledged versions."""
 
     sent: dict[frozenset[tuple[str, str]], Files] = field(default_factory=dict)
     acknowledged: dict[int, Files] = field(default_factory=dict)
@@ -46,7 +46,7 @@ def digests(files: Files) -> frozenset[tuple[str, str]]:
 
 
 def upload_until_dead(address: str, ledger: Ledger, dice: random.Random) -> None:
-    """One grid after another, some of them large, until the server is gone."""
+    """Upload one grid after another, some of them large, until the server dies."""
     with httpx.Client(base_url=address, headers=HEADERS, timeout=20) as client, contextlib.suppress(httpx.HTTPError):
         while True:
             width, height = dice.randint(10, 900), dice.randint(10, 900)
@@ -66,7 +66,7 @@ def upload_until_dead(address: str, ledger: Ledger, dice: random.Random) -> None
 
 @contextlib.contextmanager
 def serving(folder: Path, starts: list[float]) -> Iterator[tuple[ServerProcess, str]]:
-    """A started server and its address; ``starts`` gets the seconds until it was healthy."""
+    """Start a server and yield it with its address; append the seconds until it was healthy to ``starts``."""
     start = time.monotonic()
     process = ServerProcess(
         "--data-dir", str(folder / "data"), environment={"FLEETMAP_ADMIN_TOKEN": TOKEN}, folder=folder
@@ -79,7 +79,7 @@ def serving(folder: Path, starts: list[float]) -> Iterator[tuple[ServerProcess, 
 
 
 def check(folder: Path, address: str, ledger: Ledger) -> int:
-    """The invariants after a fault; the number of versions."""
+    """Check the invariants after a fault; return the number of versions."""
     with httpx.Client(base_url=address, headers=HEADERS, timeout=20) as client:
         head = client.get(ENVIRONMENT).json()["version"]
         versions = client.get(f"{ENVIRONMENT}/versions", params={"limit": 1000}).json()
@@ -110,7 +110,7 @@ def check(folder: Path, address: str, ledger: Ledger) -> int:
 
 
 def kill_while_uploads_arrive(tmp_path: Path, dice: random.Random, kills: int) -> tuple[Ledger, list[float]]:
-    """Kill the server that often and check all versions each time; ``starts``: seconds of each start until healthy."""
+    """Kill the server ``kills`` times and check all versions each time; also return the seconds of each start."""
     ledger = Ledger()
     starts: list[float] = []
     with serving(tmp_path, starts) as (_, address):
@@ -127,7 +127,7 @@ def kill_while_uploads_arrive(tmp_path: Path, dice: random.Random, kills: int) -
                 sender.start()
             before, deadline = len(ledger.acknowledged), time.monotonic() + 30
             while len(ledger.acknowledged) == before and time.monotonic() < deadline:
-                time.sleep(0.005)  # its first upload takes long: workers start
+                time.sleep(0.005)  # its first upload is slow: workers start
             time.sleep(dice.uniform(0.0, 0.6))
             process.process.send_signal(signal.SIGKILL)
             for sender in senders:
@@ -141,7 +141,7 @@ def kill_while_uploads_arrive(tmp_path: Path, dice: random.Random, kills: int) -
 
 
 @pytest.mark.parametrize("seed", [1])
-def test_kill_9_while_uploads_arrive(tmp_path: Path, seed: int) -> None:
+def test_acknowledged_uploads_survive_kill_9(tmp_path: Path, seed: int) -> None:
     _, starts = kill_while_uploads_arrive(tmp_path, random.Random(seed), KILLS)
-    # The first start also makes the database, so on a machine busy with other things it says what a start takes here.
+    # The first start also creates the database: it is the reference for a start on a busy machine.
     assert max(starts[1:]) < max(HEALTHY_SECONDS, 2 * starts[0])

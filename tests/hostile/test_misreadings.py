@@ -1,4 +1,4 @@
-"""Values out of range are refused with their place; what is not understood is reported by name. Nothing is misread."""
+"""Values out of range are rejected with their location; unknown content is reported by name. Nothing is misread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HERE = EnvironmentContext(Datum(50.0, 7.0))
 
 @dataclass(frozen=True)
 class Row:
-    """A sample with one change. sample: folder and main file; others beside it go along. old: a pattern, replaced once.
+    """Sample with one change. sample: folder and main file; its companions are included. old: pattern, replaced once.
 
     refused, warned: a text of the problem (one of the two).
     """
@@ -137,7 +137,7 @@ def read(files: dict[str, bytes]) -> list[Problem]:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.sample.partition('/')[0]}: {row.new[:40]}")
-def test_changed_sample_is_refused_or_reported(row: Row) -> None:
+def test_changed_sample_is_rejected_or_reported(row: Row) -> None:
     plain = {w.problem for w in read(upload(row))}
     files = changed(row)
     if row.refused:
@@ -153,8 +153,8 @@ def test_changed_sample_is_refused_or_reported(row: Row) -> None:
     assert row.where in (findings[0].where or "")
 
 
-def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
-    """Binary samples with a change, and why they are refused."""
+def bad_binaries() -> list[tuple[str, Callable[[bytes], bytes], str]]:
+    """List binary samples with a change, and the reason of their rejection."""
 
     def infinite(data: bytes) -> bytes:
         body = data.index(b"data\n") + 5
@@ -177,8 +177,8 @@ def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
     ]
 
 
-@pytest.mark.parametrize(("sample", "change", "reason"), odd_files(), ids=lambda v: v if isinstance(v, str) else "")
-def test_changed_binary_sample_is_refused(sample: str, change: Callable[[bytes], bytes], reason: str) -> None:
+@pytest.mark.parametrize(("sample", "change", "reason"), bad_binaries(), ids=lambda v: v if isinstance(v, str) else "")
+def test_changed_binary_sample_is_rejected(sample: str, change: Callable[[bytes], bytes], reason: str) -> None:
     data = (SAMPLES / sample).read_bytes()
     read({sample: data})
     with pytest.raises(BadUpload, match=reason) as caught:
@@ -191,7 +191,7 @@ def test_utf16_stylesheet_is_reported() -> None:
     assert any("xml-stylesheet" in w.problem for w in read({"a.kml": text.encode("utf-16")}))
 
 
-def test_warnings_that_repeat_are_one() -> None:
+def test_repeated_warnings_are_merged() -> None:
     same = [Problem(f"the edge 'e{k}' leads to 'x{k}', which is no node", "a.yaml", where=f"n{k}") for k in range(41)]
     other = Problem("no list of nodes", "a.yaml")
     warnings = group_warnings([*same, other, other], 1000)
@@ -204,7 +204,7 @@ def test_warnings_that_repeat_are_one() -> None:
     assert [w.problem for w in group_warnings(many, 5)][5:] == ["and 1 more warnings"]
 
 
-def test_nodes_with_the_same_unknown_key_are_one_warning() -> None:
+def test_unknown_key_in_several_nodes_gives_one_warning() -> None:
     sample = (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_text()
     count = sample.count("    parent_frame:")
     assert count > 3

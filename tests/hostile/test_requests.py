@@ -1,4 +1,4 @@
-"""Requests that are JSON and still nonsense: told as a problem, nothing stored."""
+"""Invalid requests in valid JSON are rejected with a problem, and nothing is stored."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield api
 
 
-def nonsense() -> Iterator[tuple[str, str, Any, str]]:
-    """Method, path, JSON, and a word of the refusal."""
+def invalid_requests() -> Iterator[tuple[str, str, Any, str]]:
+    """Yield method, path, JSON, and a word of the error."""
     for time in ("9999-12-31T23:59:59-23:59", "0001-01-01T00:00:00+23:59"):
         yield "PUT", "environments/farm/channels/staging", {"version": 1, "activate_at": time}, ""
         yield "POST", "tokens", {"name": "a", "role": "viewer", "expires": time}, ""
@@ -45,14 +45,14 @@ def nonsense() -> Iterator[tuple[str, str, Any, str]]:
     yield "GET", "environments?q=%00", None, ""
 
 
-def test_nonsense_is_refused_and_stores_nothing(api: Api) -> None:
-    for method, path, body, word in nonsense():
+def test_invalid_requests_are_rejected_and_store_nothing(api: Api) -> None:
+    for method, path, body, word in invalid_requests():
         assert word in api.problem(method, path, 422, json=body)["detail"]
     assert api.get("environments/farm").json()["version"] == 1
 
 
 @pytest.mark.parametrize("origin", [[], {}, 5, None, True])
-def test_words_of_another_type_that_an_edit_brings(api: Api, origin: Any) -> None:
+def test_edit_with_properties_of_other_types(api: Api, origin: Any) -> None:
     api.post("environments", {"name": "odd", "datum": {"latitude": 50.0, "longitude": 7.0}})
     try:
         node = {
@@ -71,9 +71,11 @@ def test_words_of_another_type_that_an_edit_brings(api: Api, origin: Any) -> Non
         api("POST", "environments/odd/purge")
 
 
-def test_hostile_networks_over_http(api: Api) -> None:
-    """The readers of plain YAML networks, in the server's workers: refused with a place or stored, never an error of
-    ours; what is stored can be had back in its own format."""
+def test_hostile_networks_are_rejected_or_stored(api: Api) -> None:
+    """Plain YAML networks are rejected with a location or stored, never a server error.
+
+    Stored ones can be downloaded in their own format.
+    """
     stored = 0
     for k, case in enumerate(network_cases()):
         env = f"hostile-{k}"

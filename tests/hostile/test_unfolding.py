@@ -1,4 +1,4 @@
-"""Compressed uploads that unfold to far more than they are: refused early, with little memory and work."""
+"""Decompression bombs are rejected early, with little memory and time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UNFOLDED_BYTES = 32 * 2**20
 
 
 def measured_upload(path: str) -> tuple[str, int, float]:
-    """In a worker: error class of reading this file as an upload, the growth of peak memory, the CPU time."""
+    """Read a file as an upload (in a worker); return the error class, the growth of peak memory, the CPU time."""
     before, start = _peak_bytes(), time.process_time()
     data = Path(path).read_bytes()
     try:
@@ -49,7 +49,7 @@ def _peak_bytes() -> int:
 
 
 def bomb(name: str, size: int, more: dict[str, bytes] | None = None) -> bytes:
-    """An archive with one member of this many zero bytes, written without holding them."""
+    """Build an archive with one member of this many zero bytes, without having them in memory."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for other, body in (more or {}).items():
@@ -85,7 +85,7 @@ def worker() -> Iterator[Pool]:
     pool.close()
 
 
-def test_bombs_are_refused_with_little_memory(worker: Pool, tmp_path: Path) -> None:
+def test_decompression_bombs_are_rejected_with_little_memory(worker: Pool, tmp_path: Path) -> None:
     for name, data in uploads():
         path = tmp_path / name
         path.write_bytes(data)
@@ -100,7 +100,7 @@ def test_small_archives_may_compress_well() -> None:
     assert len(upload_reader.unpack({"a.zip": zipped({"doc.kml": DOCUMENT, "a.txt": body})}, Limits())) == 2
 
 
-def test_a_blank_image_may_compress_better_than_a_text() -> None:
+def test_empty_image_may_compress_better_than_text() -> None:
     blank = bytes(2 * UNPACKED_FREE_BYTES)
     limits = Limits(pixels=len(blank))
     assert upload_reader.unpack({"a.zip": zipped({"blank.pgm": blank})}, limits)["blank.pgm"] == blank
@@ -109,7 +109,7 @@ def test_a_blank_image_may_compress_better_than_a_text() -> None:
             upload_reader.unpack({"a.zip": zipped(files)}, limits)
 
 
-def test_a_text_in_an_archive_has_the_limit_of_a_text() -> None:
+def test_text_in_an_archive_has_the_limit_of_text() -> None:
     with pytest.raises(
         TooLarge, match=r"doc\.kml: declares \d+ bytes; the limit for a text of \d+ compressed bytes is 50"
     ) as caught:
@@ -117,18 +117,18 @@ def test_a_text_in_an_archive_has_the_limit_of_a_text() -> None:
     assert [(p.file, p.where) for p in caught.value.problems] == [("a.zip", "doc.kml")]
 
 
-def test_compressed_points_are_held_against_the_ratio() -> None:
+def test_compressed_points_are_limited_by_the_ratio() -> None:
     spiral = (SAMPLES / "las" / "spiral.laz").read_bytes()
     count = 20_000_000
     lie = bytearray(spiral)
     struct.pack_into("<Q", lie, 247, count)
-    with pytest.raises(TooLarge, match="bytes unfold to more than 16777216 bytes"):
+    with pytest.raises(TooLarge, match="bytes decompress to more than the limit of 16777216 bytes"):
         _read("las", "a.laz", bytes(lie))
     packed = (
         b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH %d\nHEIGHT 1\nPOINTS %d\nDATA binary_compressed\n"
     )
     packed = packed % (count, count) + struct.pack("<II", 100, 12 * count) + bytes(100)
-    with pytest.raises(TooLarge, match="100 bytes unfold to more than 16777216 bytes"):
+    with pytest.raises(TooLarge, match="100 bytes decompress to more than the limit of 16777216 bytes"):
         _read("pcd", "a.pcd", b"VERSION .7\n" + packed)
 
 

@@ -1,25 +1,25 @@
-"""YAML as plain JSON-like values, read safely and written deterministically: the only way in which formats do it.
+"""Safe YAML reading to JSON-like values and deterministic writing, for all formats.
 
-``load`` gives None, bool, int (64 bit), finite float, text, list and dict with text keys, and nothing else. What a
-plain scalar means follows PyYAML (YAML 1.1), which the robots' own tools use, without its traps:
+``load`` returns only None, bool, int (64 bits), finite float, str, list and dict with string keys. Plain scalars are
+resolved like PyYAML (YAML 1.1), which the robots' own tools use, except:
 
 * dates and times, sexagesimals (``12:30``), numbers with a leading zero (``010``), with underscores (``1_2``) and
-  binary ones stay the texts they are; so a node called ``1_2`` is not 12, and ``last_updated`` never becomes a date
-* ``1e-05`` is a float although PyYAML takes it for a text (Python and C++ print floats so); ``7e12`` is a text
-* keys are the texts as written: ``0``, ``yes`` and ``2022`` are the keys "0", "yes" and "2022"
+  binary ones stay strings; so a node named ``1_2`` is not 12, and ``last_updated`` never becomes a date
+* ``1e-05`` is a float although it is a string for PyYAML (Python and C++ print floats so); ``7e12`` is a string
+* keys are strings as written: ``0``, ``yes`` and ``2022`` are the keys "0", "yes" and "2022"
 
-Two ways lead to the same values: large generated files consist of few different lines in plain block layout, so
-``load_lines`` understands each distinct line once and puts the rest together at dictionary speed (several times
-faster than any general parser), also collections in flow style that end with their line; whatever it does not know,
-and every error, is left to ``load_events``, which builds the values from libyaml's events. Tests hold that both agree.
+Two parsers return the same values. Large generated files consist of few different lines in plain block layout, so
+``load_lines`` parses each distinct line once and assembles the rest at dictionary speed (several times faster than any
+general parser), also flow collections that end with their line. It leaves everything else, and every error, to
+``load_events``, which builds the values from libyaml's events. Tests verify that both agree.
 
-Refused, each with its line: NaN and infinities, integers beyond 64 bit, duplicate keys, ``<<``, tags other than
+Rejected, each with its line: NaN and infinities, integers beyond 64 bits, duplicate keys, ``<<``, tags other than
 YAML's own scalars and collections, ``%TAG``, a second document, nesting deeper than ``Limits.yaml_depth``, more than
-``Limits.yaml_nodes`` nodes, aliases that unfold to much more than the file, aliases to a collection that contains them.
-A format with tags of its own names their prefixes: mappings and lists so tagged come as ``Tagged``, and ``%TAG`` may
-stand for these prefixes.
+``Limits.yaml_nodes`` nodes, aliases that expand to much more than the file, aliases to a collection that contains them.
+A format with tags of its own passes their prefixes: mappings and lists with such tags are returned as ``Tagged``, and
+``%TAG`` may abbreviate these prefixes.
 
-``text``, ``block`` and ``mapping`` write what readers of YAML 1.1 (PyYAML) and 1.2 (yaml-cpp) take for the same value.
+``text``, ``block`` and ``mapping`` write YAML with the same value for readers of YAML 1.1 (PyYAML) and 1.2 (yaml-cpp).
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ __all__ = ["CONSTANTS", "PlainScalar", "Tagged", "block", "decimal", "load", "ma
 
 
 def load(data: bytes, limits: Limits, *, tags: Sequence[str] = (), typed: bool = True) -> Any:
-    """The one document of a UTF-8 YAML file as JSON-like values; an empty file is None.
+    """Parse the only document of a UTF-8 YAML file to JSON-like values; an empty file is None.
 
-    tags: prefixes of the format's own tags, which collections may carry. typed: whether scalars get their meaning;
-    if not, all are texts, those without quotes ``PlainScalar``.
-    Values behind aliases, and equal mappings at the end of rows in flow style, are shared objects: do not change them
-    in place. Raises UnreadableFile or TooLarge, with line.
+    tags: prefixes of the format's own tags, which collections may have. typed: whether to resolve scalars; if not, all
+    are strings, unquoted ones ``PlainScalar``.
+    Values of aliases, and equal mappings at the end of rows in flow style, are shared objects: do not change them in
+    place. Raises UnreadableFile or TooLarge, with the line.
     """
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes of YAML; the limit is {limits.text_bytes}")
@@ -57,7 +57,7 @@ def load(data: bytes, limits: Limits, *, tags: Sequence[str] = (), typed: bool =
 
 
 def _text(data: bytes) -> str:
-    """Strict UTF-8 without a byte order mark."""
+    """Decode strict UTF-8 and remove a byte order mark."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

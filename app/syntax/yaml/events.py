@@ -1,4 +1,4 @@
-"""The reference way of reading: any YAML that we take, from libyaml's events."""
+"""Reference parser for all supported YAML, based on libyaml's events."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from app.syntax.yaml.scalars import TAG, UNFOLD_FREE, UNFOLD_TIMES, PlainScalar,
 
 
 def _tagged_scalar(tag: str, text: str) -> Any:
-    """The value of a scalar with an explicit tag."""
+    """Return the value of a scalar with an explicit tag."""
     if tag in (TAG + "str", "!"):
         return text
     value = scalar(text)
     kind: dict[str, Any] = {"int": int, "float": (int, float), "bool": bool, "null": type(None)}
     expected_type = kind.get(tag.removeprefix(TAG)) if tag.startswith(TAG) else None
     if expected_type is None:
-        raise ValueError(f"the tag {tag[:80]} is not supported")
+        raise ValueError(f"unsupported tag {tag[:80]}")
     if not isinstance(value, expected_type) or (isinstance(value, bool) and expected_type is not bool):
         raise ValueError(f"{text[:80]!r} does not fit its tag {tag}")
     return float(value) if tag == TAG + "float" else value
 
 
 def load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed: bool = True) -> Any:
-    """The reference: builds the value from libyaml's event stream, without recursion."""
+    """Build the value from libyaml's event stream, without recursion."""
     loader: Any = yaml.CSafeLoader(text)
     builder = _Builder(text, limits, tags, typed)
     event: Any = None
@@ -43,18 +43,18 @@ def load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed:
         reason = " ".join(filter(None, [error.context, error.problem])) or "not YAML"
         raise yaml_error(reason, mark.line if mark else None) from error
     except yaml.YAMLError as error:
-        raise yaml_error(f"not YAML: {error}", None) from error
+        raise yaml_error(f"invalid YAML: {error}", None) from error
     finally:
         loader.dispose()
     return builder.root[0] if builder.root else None
 
 
 class _Builder:
-    """The value that events make.
+    """Builder of a value from events.
 
-    stack: open collections, outermost first: [value, pending key, is a mapping, weight, what its anchor stands for,
-    tag]. anchors: what each name stands for, (value, weight), empty while its collection is open; the last anchor of a
-    name counts. budget: characters that aliases may still add.
+    stack: open collections, outermost first: [value, pending key, is a mapping, weight, entry of its anchor, tag].
+    anchors: name -> (value, weight), empty while its collection is open; the last anchor of a name wins. budget:
+    characters that aliases may still add.
     """
 
     __slots__ = ("anchors", "budget", "documents", "limits", "nodes", "root", "stack", "tags", "typed")
@@ -68,7 +68,7 @@ class _Builder:
         self.nodes = self.documents = 0
 
     def take(self, event: Any) -> None:
-        """The next event. ValueError where it cannot be stored; TooLarge."""
+        """Process the next event. Raises ValueError if it cannot be stored, or TooLarge."""
         kind = type(event)
         anchor: list[tuple[Any, int]] | None = None
         if kind is yaml.ScalarEvent:
@@ -102,7 +102,7 @@ class _Builder:
         plain = event.implicit[0]
         if top[2] and top[1] is None and (event.tag is None or event.tag == "!"):
             if plain and literal == "<<":
-                raise ValueError("merge keys (<<) are not supported; write the keys out")
+                raise ValueError("merge keys (<<) are not supported: write the keys out")
             return literal
         if event.tag is not None:
             return _tagged_scalar(event.tag, literal)
@@ -115,11 +115,11 @@ class _Builder:
         tag = None
         if event.tag not in (None, "!", TAG + ("map" if is_mapping else "seq")):
             if not event.tag.startswith(self.tags):
-                raise ValueError(f"the tag {event.tag[:80]} is not supported")
+                raise ValueError(f"unsupported tag {event.tag[:80]}")
             tag = event.tag
         stack = self.stack
         if stack[-1][2] and stack[-1][1] is None:
-            raise ValueError("a key must be a text, not a collection")
+            raise ValueError("a key must be a string, not a collection")
         if len(stack) > self.limits.yaml_depth:
             raise ValueError(f"nested deeper than {self.limits.yaml_depth} levels")
         anchor: list[tuple[Any, int]] | None = None
@@ -131,33 +131,33 @@ class _Builder:
         if event.anchor not in self.anchors:
             raise ValueError(f"the alias *{event.anchor[:80]} has no anchor before it")
         if not self.anchors[event.anchor]:
-            raise ValueError(f"the alias *{event.anchor[:80]} stands inside its own anchor")
+            raise ValueError(f"the alias *{event.anchor[:80]} is inside its own anchor")
         value, weight = self.anchors[event.anchor][0]
         self.nodes += 1
         self.budget -= weight
         if self.budget < 0:
-            reason = "the aliases unfold to far more than the file holds"
+            reason = "the aliases expand to far more than the file's content"
             raise yaml_error(reason, event.start_mark.line, TooLarge)
         return value, weight
 
     def _begin_document(self, event: Any) -> None:
         self.documents += 1
         if self.documents > 1:
-            raise ValueError("a second document begins here; only one is read")
+            raise ValueError("only one document is supported, a second one begins here")
         if event.tags and not set(event.tags.values()) <= set(self.tags):
             raise ValueError("%TAG directives are not supported" if not self.tags else "an unknown %TAG directive")
 
     def _add(self, value: Any, weight: int) -> None:
-        """Put a value into the innermost open collection, as a key where one is missing."""
+        """Add a value to the innermost open collection, as key if one is due."""
         top = self.stack[-1]
         top[3] += weight
         if not top[2]:
             top[0].append(value)
         elif top[1] is None:
             if not isinstance(value, str):
-                raise ValueError("a key must be a text")
+                raise ValueError("a key must be a string")
             if value in top[0]:
-                raise ValueError(f"the key {value[:80]!r} stands twice in one mapping")
+                raise ValueError(f"duplicate key {value[:80]!r} in a mapping")
             top[1] = value
         else:
             top[0][top[1]] = value

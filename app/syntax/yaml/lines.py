@@ -1,4 +1,4 @@
-"""The quick way of reading: generated files in plain block layout, each distinct line understood once."""
+"""Fast parser for generated files in plain block layout: parses each distinct line once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from app.syntax.yaml.scalars import CONSTANTS, MAX_NUMBER_CHARACTERS, UNFOLD_FRE
 
 
 class NotSimpleError(Exception):
-    """A line beyond the plain block layout, or an error: the reference decides."""
+    """A line is not in plain block layout, or has an error: the reference parser decides."""
 
 
 _LINE = re.compile(
@@ -33,12 +33,12 @@ _LINE = re.compile(
     """,
     re.VERBOSE,
 )
-"""``- key: value``, each of the three optional. A plain value has no ``:`` and no ``#``, a quoted one no escapes."""
+"""Pattern of ``- key: value``, each part optional. A plain value has no ``:`` or ``#``, a quoted one no escapes."""
 
 _COMMON_LINE = re.compile(
     r"( *)([A-Za-z_]\w{0,200}): (?:(-?[0-9]{1,16}\.[0-9]{1,24})|([A-Za-z_$][\w./$]*))\Z", re.ASCII
 )
-"""Most lines of most files: a key with a number or a word, which need no further look."""
+"""Pattern of most lines of most files: a key with a number or a word, which need no further parsing."""
 
 _BLANK = re.compile(rf" *(?:#[ -~{WIDE}]*)?\Z")
 
@@ -51,12 +51,12 @@ _FLOW_LINE = re.compile(
     (?P<flow>(?!\[\]|\{{\}})[\[{{][ -~{WIDE}]*[\]}}])\Z""",
     re.VERBOSE,
 )
-"""``- [1, 2, {key: value}]`` or ``key: {…}``: a collection in flow style that ends with its line."""
+"""Pattern of a flow collection that ends with its line: ``- [1, 2, {key: value}]`` or ``key: {…}``."""
 
 _NUMBER = r"-?(?:0|[1-9][0-9]{0,15})(?:\.[0-9]{1,24})?"
 _ROW = re.compile(rf"( *)- \[({_NUMBER}), ({_NUMBER}), (.*)\Z", re.ASCII)
 _PLACE = re.compile(rf"({_NUMBER}), (?:([A-Za-z_]\w*)|(?:''|\"\"))\]\Z", re.ASCII)
-"""What most rows begin with, and what many end with."""
+"""Patterns of the start of most rows, and of the end of many."""
 
 _PLAIN_IN_FLOW = rf"(?:[A-Za-z_0-9$/(.~]|[-+](?=[0-9.]))(?:[ \w./$+()*|%@&=^<>;'\-{WIDE}]*(?<!\ ))?"
 _FLOW = re.compile(
@@ -69,27 +69,30 @@ _FLOW = re.compile(
     """,
     re.VERBOSE | re.ASCII,
 )
-"""What stands in a collection in flow style, before ``: `` (a key) or a comma or bracket (a scalar)."""
+"""Pattern of a token in a flow collection, before ``: `` (a key) or a comma or bracket (a scalar)."""
 
 _OPEN = object()
-"""Nothing stands behind the colon or the dash: what it is shows on the next lines."""
+"""Marker for nothing after the colon or the dash: the next lines contain the value."""
 
 
 class _Alias(str):
-    """The name behind a ``*``, as the value of a line."""
+    """Name after a ``*``, as the value of a line."""
 
     __slots__ = ()
 
 
 _Line = tuple[int, str | None, Any, tuple[int, bool, int, str | None]]
-"""Where it goes: for ``key: value`` the column, for ``- key: value`` -10 - the column of the dash, for a blank line -3,
-else -2; key; value; (first column, dash?, column of the key, anchor) for the general case."""
+"""Parsed line: position, key, value, and (first column, dash?, column of the key, anchor) for the general case.
+
+The position is the column of ``key: value``, -10 - the column of the dash of ``- key: value``, -3 for a blank line,
+else -2.
+"""
 
 
 class _FlowParser:
-    """Collections in flow style on one line. Equal mappings at the end of rows are one object, as behind aliases.
+    """Parser of flow collections on one line. Equal mappings at the end of rows become one object, as with aliases.
 
-    nodes: how many were said, shared ones each time; depth: of the deepest collection.
+    nodes: number of nodes, shared ones counted each time. depth: of the deepest collection.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -98,7 +101,7 @@ class _FlowParser:
         self._cache: dict[str, tuple[Any, int, int]] = {}
 
     def row(self, x: str, y: str, tail: str) -> list[Any]:
-        """The value of ``[x, y, tail``, x and y being plain decimals."""
+        """Return the value of ``[x, y, tail``, x and y being plain decimals."""
         out: list[Any] = [float(x) if "." in x else int(x), float(y) if "." in y else int(y)]
         match = _PLACE.match(tail)
         if match:
@@ -112,7 +115,7 @@ class _FlowParser:
         return out
 
     def value(self, flow: str) -> Any:
-        """The value of a collection."""
+        """Return the value of a collection."""
         value, nodes, depth = self._collection(flow, 1, "]" if flow[0] == "[" else "}", 1)
         self._count(nodes, depth)
         return value
@@ -124,14 +127,14 @@ class _FlowParser:
             raise NotSimpleError
 
     def _collection(self, flow: str, at: int, end: str, depth: int) -> tuple[Any, int, int]:
-        """(value, nodes, depth) of the collection whose content begins here and which ends the text."""
+        """Parse a collection from the start of its content to the end of the text: (value, nodes, depth)."""
         value, after, nodes, deepest = self._content(flow, at, end, depth)
         if after != len(flow):
             raise NotSimpleError
         return value, nodes, deepest
 
     def _content(self, flow: str, at: int, end: str, depth: int) -> tuple[Any, int, int, int]:
-        """(value, where it ends, nodes, depth) of a collection whose content begins here; end: its bracket."""
+        """Parse a collection from the start of its content: (value, end, nodes, depth). end: its closing bracket."""
         if depth > self._limits.yaml_depth:
             raise NotSimpleError
         out: Any = [] if end == "]" else {}
@@ -180,7 +183,7 @@ class _FlowParser:
             at += 2
 
     def _inner(self, flow: str, at: int, depth: int) -> tuple[Any, int, int, int]:
-        """As ``_content``, for a collection inside another; a mapping that ends a row is known again."""
+        """Parse a nested collection like ``_content``; share equal mappings at the end of rows."""
         end = "]" if flow[at - 1] == "[" else "}"
         if end == "]" or depth != 2 or flow[-2:] != "}]" or flow.find("}", at) != len(flow) - 2:
             return self._content(flow, at, end, depth)
@@ -195,7 +198,7 @@ class _FlowParser:
 
 
 class _Lines(dict[str, _Line]):
-    """Line -> what it says, understood when first asked for."""
+    """Cache of parsed lines, filled on first access."""
 
     def __init__(self, limits: Limits) -> None:
         super().__init__()
@@ -203,7 +206,7 @@ class _Lines(dict[str, _Line]):
 
     def __missing__(self, line: str) -> _Line:
         row = _ROW.match(line)
-        if row:  # hardly any comes twice: not kept
+        if row:  # rarely repeated: not cached
             first = len(row[1])
             value: Any = self.flows.row(row[2], row[3], row[4])
             return (-2, None, value, (first, True, first + 2, None))
@@ -261,7 +264,7 @@ class _Lines(dict[str, _Line]):
 
 
 def load_lines(text: str, limits: Limits) -> Any:
-    """The value of a document in plain block layout: one key or item a line. NotSimpleError where it is not."""
+    """Parse a document in plain block layout: one key or item per line. Raises NotSimpleError for other layouts."""
     if "\r" in text:
         text = text.replace("\r\n", "\n")
     lines = text.split("\n")
@@ -276,11 +279,11 @@ def load_lines(text: str, limits: Limits) -> Any:
     weights: dict[str, int] = {}
     budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
     current: Any = root  # the innermost collection
-    at = -1  # its column, where it is a mapping and no key waits for its value
-    item = -1  # -10 - the column of the dash, where the mapping is an item of a list and no key waits
+    at = -1  # its column, if it is a mapping and no key is pending
+    item = -1  # -10 - the column of the dash, if the mapping is an item of a list and no key is pending
     waiting = True  # the last key or dash has no value yet
     key: str | None = None
-    anchor: str | None = None  # of what is waited for
+    anchor: str | None = None  # of the pending value
     line_cache = _Lines(limits)
     flows = line_cache.flows
     for position, name, value, layout in map(line_cache.__getitem__, lines):
@@ -332,7 +335,7 @@ def load_lines(text: str, limits: Limits) -> Any:
             raise NotSimpleError
         waiting = value is _OPEN
         if type(value) is _Alias:
-            # An alias below an anchor is left to the reference, so the weights need no care for aliases in aliases.
+            # The reference parses aliases below an anchor, so the weights ignore aliases in aliases.
             if value not in anchors or any(anchored for _, _, anchored in stack):
                 raise NotSimpleError
             if value not in weights:
@@ -362,7 +365,7 @@ def _insert(collection: Any, key: str | None, value: Any) -> None:
 
 
 def _weight(value: Any) -> int:
-    """At least what the reference counts for a value: characters, and 8 for each node."""
+    """Compute a value's weight, not less than the reference parser's: its characters, and 8 for each node."""
     if isinstance(value, dict):
         return 8 + sum(8 + len(k) + _weight(v) for k, v in value.items())
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""YAML texts that readers of YAML 1.1 (PyYAML) and 1.2 (yaml-cpp) take for the same value."""
+"""Write YAML with the same value for readers of YAML 1.1 (PyYAML) and 1.2 (yaml-cpp)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ MAX_KEY_CHARACTERS = 200
 
 
 def text(value: str | float | None) -> str:
-    """A scalar as YAML, on one line. Texts are quoted wherever some reader could take them for something else."""
+    """Format a scalar as YAML on one line. Quotes strings that some reader could resolve to another type."""
     if isinstance(value, str):
-        # What most names look like: no word that means something else ends with a digit.
+        # Most names end with a digit; no word with a special meaning does.
         if value.isascii() and value[-1:].isdigit():
             if value.isidentifier():
                 return value
@@ -38,12 +38,12 @@ def text(value: str | float | None) -> str:
 
 
 def decimal(literal: str) -> str:
-    """A float's shortest text as YAML 1.1 wants it: PyYAML takes ``1e-09`` for a text, ``1.0e-09`` for the number."""
+    """Convert a float's shortest text to YAML 1.1: ``1e-09`` is a string for PyYAML, ``1.0e-09`` a number."""
     return literal.replace("e", ".0e") if "e" in literal and "." not in literal else literal
 
 
 def block(value: Any, column: int) -> str:
-    """What stands behind the colon of a key in this column, with the line break at the end; mappings by sorted keys."""
+    """Format the text after the colon of a key in this column, with the final line break; mappings by sorted keys."""
     if isinstance(value, dict) and value:
         return "\n" + mapping(value, column + 2)
     if isinstance(value, (list, tuple)) and value:
@@ -52,12 +52,12 @@ def block(value: Any, column: int) -> str:
 
 
 def mapping(value: dict[str, Any], column: int) -> str:
-    """A mapping that is not empty, its keys sorted and in this column, with the line break at the end."""
+    """Format a non-empty mapping with sorted keys in this column, with the final line break."""
     pad = " " * column
     out = []
     for key in sorted(value):
         name = text(key)
-        if len(name) > MAX_KEY_CHARACTERS:  # beyond 1024 characters a key must be marked as one
+        if len(name) > MAX_KEY_CHARACTERS:  # a key of more than 1024 characters needs an explicit mark
             out.append(f"{pad}? {name}\n{pad}:{block(value[key], column + 2)}")
         else:
             out.append(f"{pad}{name}:{block(value[key], column)}")

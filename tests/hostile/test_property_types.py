@@ -1,6 +1,6 @@
-"""Words that mean something to us, with values of any type: edits and GeoJSON can bring them, no writer may stumble.
+"""Canonical properties with values of any type, from edits or GeoJSON, make no writer fail.
 
-``FLEETMAP_WORDS=500 pytest tests/hostile/test_words.py`` (a part of ``make fuzz``) looks longer than CI does.
+``FLEETMAP_WORDS=500 pytest tests/hostile/test_property_types.py`` (a part of ``make fuzz``) runs longer than CI does.
 """
 
 # ruff: noqa: E501 - lists of values
@@ -31,7 +31,7 @@ from tests.hostile.corpus import sample_maps
 
 HERE = Datum(50.0, 7.0, heading=30.0)
 SMALLER = 0.1
-"""The samples' streets, some hundred metres long, are drawn smaller: words are tried here, not how many cells a grid has."""
+"""Scale of the samples' streets, some hundred metres long: these tests need no large grids."""
 VALUES: tuple[Any, ...] = (
     None, True, 0, -5, 2**63 - 1, 1.5, -1e300, 1e300, "", "x", "50", "nan", "\u202e\u200b", "a\nb", "\0", "]]>", "<&>", "-->", [], {},
     [None], [[]], [1, 2, 3], ["a"], [{}], [[1.0, 2.0]], {"a": 1}, {"": {}}, {"name": []}, {"type": []}, {"a:b c": "<"}, [["a", "b", "c"]],
@@ -58,37 +58,37 @@ ROUNDS = int(os.environ.get("FLEETMAP_WORDS", "8"))
 FOR_EACH = 6
 
 
-def other(value: Any, dice: random.Random) -> Any:
-    """The value with one place in it changed, taken away or added."""
+def mutated_value(value: Any, dice: random.Random) -> Any:
+    """Change, remove or add one member of a value."""
     if isinstance(value, Mapping):
         out = dict(value)
         key = dice.choice([*out, dice.choice(WORDS)]) if out else dice.choice(WORDS)
         if key in out and dice.random() < 0.15:
             del out[key]
         elif key in out and dice.random() < 0.6:
-            out[key] = other(out[key], dice)
+            out[key] = mutated_value(out[key], dice)
         else:
             out[key] = dice.choice(VALUES)
         return out
     if isinstance(value, list) and value and dice.random() < 0.7:
         rows = list(value)
         at = dice.randrange(len(rows))
-        rows[at] = other(rows[at], dice)
+        rows[at] = mutated_value(rows[at], dice)
         return rows if dice.random() < 0.8 else rows[:at]
     return dice.choice(VALUES)
 
 
-def changed(part: Features, dice: random.Random) -> Features:
-    """One feature, or the document, with something else in it."""
+def mutated_part(part: Features, dice: random.Random) -> Features:
+    """Change one feature or the document."""
     geometry, properties, local = part.geometry.copy(), list(part.properties), part.local.copy()
     document = part.document
     kind = dice.random()
     if kind < 0.2 or not len(part):
-        document = other(document, dice)
+        document = mutated_value(document, dice)
     else:
         k = dice.randrange(len(part))
         if kind < 0.8:
-            properties[k] = other(properties[k], dice)
+            properties[k] = mutated_value(properties[k], dice)
         else:
             geometry[k] = dice.choice(SHAPES)
             local[k] = dice.random() < 0.5
@@ -107,12 +107,12 @@ def bases() -> Iterator[tuple[str, Layers]]:
                 Limits(),
             )
             layers = upload_bundle.layers(HERE)
-            parts = {key: smaller(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
+            parts = {key: scaled_part(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
             yield f"{name}/{min(files)}{f' as {layer}' if layer else ''}", Layers(parts, layers.datum, layers.levels)
 
 
-def smaller(part: Features) -> Features:
-    """The part with everything near HERE that stands in degrees drawn smaller about it."""
+def scaled_part(part: Features) -> Features:
+    """Scale all geometries in degrees near HERE about that point."""
     centre = np.array([HERE.longitude, HERE.latitude])
 
     def nearer(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -125,8 +125,8 @@ def smaller(part: Features) -> Features:
     return Features(part.ids, geometry, part.properties, part.local, part.document)
 
 
-def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
-    """Of writing every format, deriving what it takes: exceptions that nobody could tell a user."""
+def writer_bugs(layers: Layers) -> list[tuple[str, BaseException]]:
+    """Write every format, with derivations. Returns exceptions that are no errors for users."""
     out: list[tuple[str, BaseException]] = []
     stock = AvailableLayers(frozenset(layers.parts), layers.datum is not None)
     for name, fmt in formats.all_formats().items():
@@ -134,7 +134,7 @@ def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
             written = write(fmt, layers, {}, plan_chain(fmt, stock, fmt.write_options()))
         except FleetMapError as error:
             assert error.detail
-        except Exception as error:  # noqa: BLE001  all of them are what is looked for
+        except Exception as error:  # noqa: BLE001  this test looks for any exception
             out.append((name, error))
         else:
             assert all(isinstance(data, bytes) for data in written.files.values())
@@ -142,7 +142,7 @@ def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
 
 
 @pytest.mark.parametrize("layers", [pytest.param(layers, id=name) for name, layers in bases()])
-def test_no_value_of_a_word_breaks_a_writer(layers: Layers) -> None:
+def test_property_values_of_any_type_break_no_writer(layers: Layers) -> None:
     vector = [key for key, part in layers.parts.items() if isinstance(part, Features)]
     if not vector:
         return
@@ -152,8 +152,8 @@ def test_no_value_of_a_word_breaks_a_writer(layers: Layers) -> None:
         parts = dict(layers.parts)
         for _ in range(dice.randint(1, FOR_EACH)):
             key = dice.choice(vector)
-            parts[key] = changed(parts[key], dice)  # type: ignore[arg-type]
-        for name, error in bugs(Layers(parts, layers.datum, layers.levels)):
+            parts[key] = mutated_part(parts[key], dice)  # type: ignore[arg-type]
+        for name, error in writer_bugs(Layers(parts, layers.datum, layers.levels)):
             place = traceback.extract_tb(error.__traceback__)[-1]
             failures.setdefault(f"{name}: {type(error).__name__} {place.filename}:{place.lineno}", f"{error}"[:200])
     assert not failures, "\n".join(f"{place}  {text}" for place, text in sorted(failures.items()))
