@@ -202,7 +202,7 @@ def test_a_world_alone_gives_a_slice(api: Api, shared: Path) -> None:
     assert line["steps"][0]["parameters"]["height"] == 0.18
     assert any(name.endswith("wall.dae") for name in line["sources"])
     dropped = {d["what"]: d["why"] for d in fetch_report(api, "arena")["dropped"]}
-    assert dropped["objects include"] == "nothing in a robot's way", "the ground plane, which is on another server"
+    assert dropped["objects include"] == "not an obstacle for robots", "the ground plane, which is on another server"
     assert api.get("/maps/arena/octomap?resolution=0.2").content.startswith(b"# Octomap")
     problem: Any = api.get("/maps/arena/occupancy_grid?height=20", expect=None)
     assert problem.status_code == 422

@@ -117,7 +117,7 @@ def test_boxes_become_objects_and_cells(folder: Path) -> None:
     assert things["tree"][0].equals(shapely.box(43, 11, 53, 21))
     assert [d.count for d in notes.dropped if d.subject == "things"] == [1]
     # Where the model sees nothing is unknown, so a map of obstacles alone has no free cell.
-    with pytest.raises(CannotConvert, match="nothing that is free"):
+    with pytest.raises(CannotConvert, match="shows no free ground"):
         imagery_to_occupancy(
             content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), DerivationNotes()
         )
@@ -192,7 +192,7 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
             _onnx.find_model(name)
     with pytest.raises(Invalid, match="name one"):
         imagery_to_objects(content(), Parameters(segmentation="model"), DerivationNotes())
-    with pytest.raises(Invalid, match="belongs to segmentation=model"):
+    with pytest.raises(Invalid, match="applies only to segmentation=model"):
         imagery_to_objects(content(), Parameters(model="tiny", segmentation="colour"), DerivationNotes())
     real = importlib.import_module
 

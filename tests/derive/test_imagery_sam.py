@@ -117,7 +117,7 @@ def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict
     assert properties["model"] == "sam"
     assert 0.3 < properties["confidence"] <= 0.95
     assert properties["stability"] > 0.9
-    assert any("3 are told by colour and shape, 1 cannot be and are of kind area" in w.problem for w in notes.warnings)
+    assert any("3 were classified by colour and shape, 1 have kind area" in w.problem for w in notes.warnings)
 
 
 def test_cells_of_what_is_not_known_stay_unknown(folder: Path) -> None:
@@ -198,11 +198,11 @@ def test_what_a_wrong_model_is_told(folder: Path, monkeypatch: pytest.MonkeyPatc
         detect(content(yard()))
     put(folder)
     monkeypatch.setenv(_onnx.LARGEST, "1000")
-    with pytest.raises(TooLarge, match="larger than 1000 bytes: the operator may set FLEETMAP_MODELS_MAX_BYTES"):
+    with pytest.raises(TooLarge, match="larger than 1000 bytes: raise FLEETMAP_MODELS_MAX_BYTES"):
         detect(content(yard()))
     monkeypatch.delenv(_onnx.LARGEST)
     big = Layers({PartKey("imagery", "ground", "satellite"): local(np.zeros((3000, 3000, 3), np.uint8), 0.5)})
-    with pytest.raises(CannotConvert, match="give a coarser resolution than"):
+    with pytest.raises(CannotConvert, match="use a resolution coarser than"):
         detect(big)
     (folder / "sam.decoder.onnx").unlink()
     with pytest.raises(NotFound, match=r"there are: sam\.encoder$"):
@@ -281,16 +281,18 @@ def test_usual_mean_and_wrong_words(folder: Path) -> None:
     image[10:30, 10:30] = (255, 0, 0)
     assert set(detect(content(image), model="pixels")) == {"building"}
     write_model(folder, pixels(), {**PLAIN, "classes": ["building", "field"]})
-    with pytest.raises(CannotConvert, match=r"other than 2 classes: it gives \(1, 3, 32, 32\)"):
+    with pytest.raises(CannotConvert, match=r"does not have 2 classes: it returns \(1, 3, 32, 32\)"):
         detect(content(image), model="pixels")
     for wrong in ({"std": [1, 0, 1]}, {"mean": [1, 2]}, {"mean": "abc"}, {"std": None}):
         write_model(folder, pixels(), {**PLAIN, **wrong})
         with pytest.raises(CannotConvert, match=r"pixels\.json: (std|mean) must be"):
             detect(content(image), model="pixels")
     write_model(folder, pixels(), PLAIN)
-    with pytest.raises(Invalid, match="points: belongs to models of the Segment-Anything family, and pixels is none"):
+    with pytest.raises(
+        Invalid, match="points: applies only to models of the Segment-Anything family, which pixels is not"
+    ):
         detect(content(image), model="pixels", points=8)
-    with pytest.raises(Invalid, match="stability: belongs to segmentation=model"):
+    with pytest.raises(Invalid, match="stability: applies only to segmentation=model"):
         imagery_to_objects(content(image), Parameters(stability=0.5, segmentation="colour"), DerivationNotes())
 
 

@@ -396,7 +396,7 @@ def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
     with pytest.raises(MissingLayer, match=r"known to have a body.*walls\.dae"):
         objects_to_voxels(layers(objects((None, lost))), VoxelParameters(), DerivationNotes())
     content = layers(objects((None, lost)), fence=shapely.box(-9, -9, 9, 9))
-    with pytest.raises(MissingLayer, match=r"a blank grid.*walls\.dae"):
+    with pytest.raises(MissingLayer, match=r"an empty grid.*walls\.dae"):
         location_to_occupancy(content, BlankParameters(), DerivationNotes())
 
 
@@ -432,9 +432,9 @@ def test_bodies_without_files_are_told_apart_from_marks() -> None:
     notes = DerivationNotes()
     grid(layers(objects(*rows)), notes)
     assert {d.subject: d.why for d in notes.dropped} == {
-        "objects light": "nothing in a robot's way",
-        "objects model": "nothing in a robot's way",
-        "objects include": "they say neither shapes nor a size: upload the files of their models with them",
+        "objects light": "not an obstacle for robots",
+        "objects model": "not an obstacle for robots",
+        "objects include": "they have neither shapes nor a size: upload the files of their models too",
     }
 
 
@@ -476,7 +476,7 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
     assert at(grid(content, unknown_radius=2.0), 1.9, 0) == 255
     assert at(grid(content, inflate=0.2), 0, 0) == 255
     (files, poses, points) = [w for w in notes.warnings if "an unknown extent" in w.problem]
-    assert files.problem.startswith("2 objects have an unknown extent (chair, table): they say neither shapes nor")
+    assert files.problem.startswith("2 objects have an unknown extent (chair, table): they have neither shapes nor")
     assert poses.problem.startswith("3 objects have an unknown extent (o2, o3, o5): pose")
     assert points.problem.startswith("1 object has an unknown extent (o6): they are points")
     assert ("unknown_radius", 0.7) in [(t.subject, t.value) for t in notes.template]
@@ -488,7 +488,7 @@ def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
     notes = DerivationNotes()
     g = grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes)
     assert (at(g, 0.6, 0), at(g, 0.8, 0)) == (255, 0)
-    assert any("is free but the ground around objects of unknown extent" in w.problem for w in notes.warnings)
+    assert any("is free except the ground around objects of unknown extent" in w.problem for w in notes.warnings)
     content = layers(objects(chair), fence=FENCE)
     with pytest.raises(MissingLayer, match="upload the files of their models"):
         grid(content)
@@ -498,7 +498,7 @@ def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
     assert "1 object has an unknown extent" in notes.warnings[0].problem
     notes = DerivationNotes()
     assert not grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes, unknown_radius=100.0).counts()["free"]
-    assert "or ask with a smaller unknown_radius" in notes.warnings[-1].problem
+    assert "or set a smaller unknown_radius" in notes.warnings[-1].problem
 
 
 def test_object_without_a_place_is_warned_of() -> None:
@@ -506,7 +506,7 @@ def test_object_without_a_place_is_warned_of() -> None:
     rows: list[Any] = [WALL, (None, {"kind": "building", "name": "barn"}), (None, {"kind": "model"})]
     grid(layers(objects(*rows)), notes)
     (warning,) = notes.warnings
-    assert "2 objects have no known place (barn, o2)" in warning.problem
+    assert "2 objects have no known position (barn, o2)" in warning.problem
 
 
 def test_box_without_a_geometry_stands_at_its_pose() -> None:
@@ -600,7 +600,7 @@ def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> N
     try:
         derived_grid = grid(content, resolution=0.5, doors="closed")
     except CannotConvert as error:
-        expected = ("resolution of at least", "no free ground of the level ground is known, since solids")
+        expected = ("resolution of at least", "no free ground of level ground is known, because solids")
         assert any(text in error.detail for text in expected), "what lies far away makes it large"
     else:
         assert at(derived_grid, 0.5, 0.5) == 100
@@ -619,7 +619,7 @@ def test_parameters_are_checked() -> None:
     content = layers(objects((None, {"kind": "model", "shapes": [BOX]})))
     with pytest.raises(Invalid, match="exclude each other"):
         grid(content, height=1.0, band=(0.0, 1.0))
-    with pytest.raises(Invalid, match="low height comes first"):
+    with pytest.raises(Invalid, match="band must be low,high with low <= high"):
         grid(content, band=(1.0, 0.0))
 
 

@@ -70,7 +70,7 @@ def test_footprints_are_extruded_from_their_base_to_their_top() -> None:
     assert v.bounds() == (0.0, 0.0, 0.0, 7.1, 1.0, 3.0)
     (line,) = notes.template
     assert (line.subject, line.value, line.option) == ("height", 3.0, "extrude")
-    assert line.why == "1 footprints do not say how high they are"
+    assert line.why == "1 footprints state no height"
 
 
 def test_all_levels_stand_in_one_map() -> None:

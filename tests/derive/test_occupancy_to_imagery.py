@@ -111,7 +111,7 @@ def test_places_on_earth_without_a_datum_are_left_out_and_told() -> None:
     layers = Layers({GRID: OccupancyGrid(room(), 0.1), PartKey("objects"): features(house, "wgs84")})
     drawn(layers, notes)
     assert notes.dropped[0].count == 1
-    assert notes.warnings[-1].problem == "the picture is a plan drawn from the map, no photograph"
+    assert notes.warnings[-1].problem == "the image is a plan drawn from the map, not a photograph"
 
 
 def test_several_grids_want_a_name() -> None:

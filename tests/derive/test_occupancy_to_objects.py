@@ -267,10 +267,10 @@ def bad(cells: Any, **values: Any) -> str:
 def test_grids_without_objects_say_what_to_do() -> None:
     assert "no occupied cell (3000 free)" in bad(np.full((50, 60), FREE))
     assert "no occupied cell (3000 unknown)" in bad(np.full((50, 60), UNKNOWN))
-    assert "occupied all over" in bad(np.full((50, 60), OCCUPIED))
+    assert "completely occupied" in bad(np.full((50, 60), OCCUPIED))
     assert "no occupied cell (1 free)" in bad([[FREE]])
     assert "no occupied cell (1 unknown)" in bad([[UNKNOWN]])
-    assert "occupied all over" in bad([[OCCUPIED]])
+    assert "completely occupied" in bad([[OCCUPIED]])
     one = np.full((9, 9), FREE)
     one[4, 4] = OCCUPIED
     assert "1 specks less than 0.1 m" in bad(one)

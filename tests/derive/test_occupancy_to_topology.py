@@ -174,7 +174,7 @@ def test_a_corridor_by_hand() -> None:
     assert {e.properties["width"] for e in long} == {0.7}
     assert rows.min() >= 0.4
     assert rows.max() <= 0.5
-    with pytest.raises(CannotConvert, match=r"farthest that a free cell is from obstacles is 0\.4 m"):
+    with pytest.raises(CannotConvert, match=r"free cells are at most 0\.4 m from obstacles"):
         derived(grid(cells), robot_radius=0.4)
     assert len(derived(grid(cells), robot_radius=0.399, spacing=0.0)) == 2 + 2
 
@@ -369,21 +369,21 @@ def bad(cells: Any, **values: Any) -> str:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_grids_without_ways_say_what_to_do(method: str) -> None:
-    assert "free all over" in bad(np.full((50, 60), FREE), method=method)
+    assert "completely free" in bad(np.full((50, 60), FREE), method=method)
     assert "no free cell (3000 occupied)" in bad(np.full((50, 60), OCCUPIED), method=method)
     unknown = bad(np.full((50, 60), UNKNOWN), method=method)
     assert "no free cell (3000 unknown)" in unknown
     assert "unknown=true" in unknown
-    assert "free all over" in bad(np.full((50, 60), UNKNOWN), method=method, unknown=True)
-    assert "free all over" in bad([[FREE]], method=method)
+    assert "completely free" in bad(np.full((50, 60), UNKNOWN), method=method, unknown=True)
+    assert "completely free" in bad([[FREE]], method=method)
     assert "no free cell" in bad([[OCCUPIED]], method=method)
     assert "no free cell (1 other)" in bad([[50]], method=method)
     large = bad(rooms(), method=method, robot_radius=50.0)
     assert "radius 50 m" in large
-    assert "Give a robot_radius below" in large
+    assert "use a robot_radius below" in large
     spot = np.full((9, 9), OCCUPIED)
     spot[4, 4] = FREE
-    assert "too few for a way" in bad(spot, method=method, robot_radius=0.0)
+    assert "too few for a path" in bad(spot, method=method, robot_radius=0.0)
     assert "'map' of level 'ground'" in bad(spot, method=method, robot_radius=0.0)
     if method != "roadmap":
         assert "give a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
@@ -422,12 +422,12 @@ def test_masks_are_no_maps_unless_named() -> None:
 
 
 def test_parameters_are_checked() -> None:
-    with pytest.raises(Invalid, match="samples: belongs to method=roadmap, not to skeleton"):
+    with pytest.raises(Invalid, match="samples: applies only to method=roadmap, not to skeleton"):
         derived(grid(rooms()), samples=5)
     for method in ("roadmap", "voronoi"):
-        with pytest.raises(Invalid, match=f"detour: belongs to method=skeleton, not to {method}"):
+        with pytest.raises(Invalid, match=f"detour: applies only to method=skeleton, not to {method}"):
             derived(grid(rooms()), method=method, detour=2.0)
-    with pytest.raises(Invalid, match="spacing: belongs to method=skeleton or voronoi, not to roadmap"):
+    with pytest.raises(Invalid, match="spacing: applies only to method=skeleton or voronoi, not to roadmap"):
         derived(grid(rooms()), method="roadmap", spacing=2.0)
     with pytest.raises(Invalid, match="at least 0"):
         parameters.parse(Parameters, {"robot_radius": "-1"})
@@ -541,11 +541,11 @@ def test_no_way_leads_where_the_grey_of_unknown_is_called_free() -> None:
     assert shapely.total_bounds(derived_network.geometry)[2] < 5.6
     (warning,) = [w.problem for w in notes.warnings if "grey 205" in w.problem]
     assert "4546 cells" in warning
-    assert "unknown_grey=free takes them as free" in warning
+    assert "unknown_grey=free keeps them free" in warning
     notes = DerivationNotes()
     derived_network = network(grid, Parameters(unknown_grey="free"), notes, "the map")
     assert shapely.total_bounds(derived_network.geometry)[2] > 8
-    assert "ways may lead where nobody has been" in notes.warnings[0].problem
+    assert "edges may lead through unexplored ground" in notes.warnings[0].problem
 
     written = formats.write(formats.get_format("occupancy_grid"), Layers({key: grid}), WriteContext())
     assert written["map.pgm"] == files["map.pgm"], "the picture keeps its greys"

@@ -168,7 +168,7 @@ def test_what_is_left_out_is_told() -> None:
         "zones outside of the map": 1,
         "parts of zones outside of the map": 1,
     }
-    assert "until they are made anew" in notes.warnings[0].problem
+    assert "until they are derived again" in notes.warnings[0].problem
 
 
 def test_it_says_what_is_missing() -> None:

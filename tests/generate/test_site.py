@@ -202,7 +202,7 @@ def test_sizes_are_told_before_work_starts() -> None:
     site = Site(Layers(), SiteOptions(height=2.9), DerivationNotes())
     site.set_fence(shapely.box(0, 0, 20, 10))
     site.box("kerb", "wall", (10, 7), (4, 2, 1))
-    with pytest.raises(CannotGenerate, match="no stored object stands in a robot's way at 2"):
+    with pytest.raises(CannotGenerate, match="no stored object is an obstacle at 2"):
         site.finish()
 
 
