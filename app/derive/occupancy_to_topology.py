@@ -49,7 +49,7 @@ class Parameters:
 
     method: Literal["skeleton", "roadmap", "voronoi"] = parameter(
         "skeleton",
-        "path finding method; skeleton: centrelines of free space, with straight edges across open space; roadmap: "
+        "method; skeleton: centrelines of free space, with straight edges across open space; roadmap: "
         "random samples joined by collision-free lines; voronoi: lines farthest from all obstacles, also in open space "
         "(generalised Voronoi diagram)",
     )

@@ -36,7 +36,7 @@ def resources_to_imagery(layers: Layers, parameters: Parameters, notes: Derivati
     parts: dict[PartKey, Part] = {}
     for level, name, turn in _drawings(layers):
         if name not in files:
-            notes.warn(f"the drawing {name[:200]!r} is missing; the level has no image of it", where=level)
+            notes.warn(f"the drawing {name[:200]!r} was not uploaded; the level has no image of it", where=level)
             continue
         pixels = _pixels(files[name], name, level, notes)
         if pixels is None:
@@ -94,5 +94,5 @@ def _pixels(data: bytes, name: str, level: str, notes: DerivationNotes) -> NDArr
                 return pixels[..., None] if pixels.ndim == 2 else pixels
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         reason = error
-    notes.warn(f"the drawing {name[:200]!r} is dropped: {str(reason)[:200]}", where=level)
+    notes.warn(f"the drawing {name[:200]!r} cannot be read and is dropped: {str(reason)[:200]}", where=level)
     return None

@@ -168,7 +168,7 @@ def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
     api.upload("sketch", {"a.geojson": json.dumps(drawing).encode()})
     refused: Any = api.get("/maps/sketch/occupancy_grid", expect=None)
     assert refused.status_code == 422
-    assert "stands in a robot's way" in refused.json()["detail"]
+    assert "is an obstacle" in refused.json()["detail"]
 
 
 def test_real_buildings_and_towns(api: Api, shared: Path) -> None:

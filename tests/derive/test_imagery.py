@@ -92,7 +92,7 @@ def test_a_farm_is_told_apart() -> None:
     confidences = [f.properties["confidence"] for f in part if "confidence" in f.properties]
     assert all(0.5 < c <= 1 for c in confidences)
     assert len(confidences) == Counter(f.geometry.geom_type for f in part)["Polygon"]
-    assert any("guessed" in w.problem for w in notes.warnings)
+    assert any("detected automatically" in w.problem for w in notes.warnings)
 
 
 def test_middle_lines_become_a_network() -> None:
@@ -261,17 +261,17 @@ def test_a_turned_plan_lies_where_its_transform_says() -> None:
 @pytest.mark.parametrize(
     ("pixels", "options", "says"),
     [
-        (np.full((50, 50, 3), (120, 130, 140), np.uint8), {}, "of one colour"),
-        (np.full((50, 50, 1), 250, np.uint8), {"segmentation": "plan"}, "one shade"),
+        (np.full((50, 50, 3), (120, 130, 140), np.uint8), {}, "a single colour"),
+        (np.full((50, 50, 1), 250, np.uint8), {"segmentation": "plan"}, "a single shade"),
         (np.full((50, 50, 1), 100, np.uint8), {}, "no colours"),
-        (np.zeros((50, 50, 4), np.uint8), {}, "shows nothing"),
+        (np.zeros((50, 50, 4), np.uint8), {}, "is empty"),
         (
             np.full((50, 50, 3), (160, 120, 110), np.uint8),
             {"segmentation": "index"},
             "no vegetation, the vegetation index is at most",
         ),
         (farm()[:, :, :], {"resolution": 0.001}, "coarser resolution"),
-        (np.full((1, 1, 3), 7, np.uint8), {}, "of one colour"),
+        (np.full((1, 1, 3), 7, np.uint8), {}, "a single colour"),
     ],
 )
 def test_what_shows_nothing_is_no_map(pixels: Any, options: dict[str, Any], says: str) -> None:
@@ -344,7 +344,7 @@ def test_drawings_that_cannot_be_read() -> None:
         ({}, "was not uploaded"),
         ({"plan.png": b"GIF89a"}, "cannot be read"),
         ({"plan.png": png(plan())[:200]}, "cannot be read"),
-        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "too many"),
+        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "the maximum is"),
     ):
         notes = DerivationNotes()
         with pytest.raises(MissingLayer, match="floor plan"):

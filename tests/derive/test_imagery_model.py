@@ -176,7 +176,7 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(NotFound, match="there are: none"):
         detect(content())
     put(folder, model(ROWS), ("building", "tree", None, None, None))
-    with pytest.raises(CannotConvert, match="other than 5 classes"):
+    with pytest.raises(CannotConvert, match="does not have 5 classes"):
         detect(content())
     put(folder, model(ROWS), ("building", "castle", None))
     with pytest.raises(CannotConvert, match="must be null or one of"):
@@ -188,9 +188,9 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(CannotConvert, match="finds nothing"):
         detect(content(), confidence=0.95)
     for name in ("../tiny", "other", "tiny.onnx"):
-        with pytest.raises(NotFound, match="there are: tiny"):
+        with pytest.raises(NotFound, match="available: tiny"):
             _onnx.find_model(name)
-    with pytest.raises(Invalid, match="name one"):
+    with pytest.raises(Invalid, match="name a model"):
         imagery_to_objects(content(), Parameters(segmentation="model"), DerivationNotes())
     with pytest.raises(Invalid, match="applies only to segmentation=model"):
         imagery_to_objects(content(), Parameters(model="tiny", segmentation="colour"), DerivationNotes())

@@ -168,7 +168,7 @@ def test_grey_pictures_have_no_kinds(folder: Path) -> None:
     notes = DerivationNotes()
     grey = cv2.cvtColor(yard(), cv2.COLOR_RGB2GRAY)
     assert set(detect(content(grey), notes)) == {"area"}
-    assert any("0 are told" in w.problem for w in notes.warnings)
+    assert any("0 were classified" in w.problem for w in notes.warnings)
 
 
 def test_the_same_model_gives_the_same(folder: Path) -> None:

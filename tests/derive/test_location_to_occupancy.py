@@ -34,7 +34,7 @@ def test_free_inside_unknown_outside() -> None:
     g = blank(shapely.Polygon([(-1, -1), (3, -1), (-1, 3)]), notes=notes, resolution=0.1)
     assert (g.origin, g.width, g.height, g.resolution) == ((-1, -1, 0), 40, 40, 0.1)
     assert g.counts() == {"occupied": 0, "free": 780, "unknown": 820, "other": 0}
-    assert "blank" in notes.warnings[0].problem
+    assert "empty" in notes.warnings[0].problem
 
 
 def test_a_fence_on_earth() -> None:

@@ -324,7 +324,7 @@ def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
     ],
 )
 def test_nothing_in_the_way_is_a_clear_problem(rows: list[Any]) -> None:
-    with pytest.raises(MissingLayer, match="stands in a robot's way"):
+    with pytest.raises(MissingLayer, match="no stored object is an obstacle"):
         grid(layers(objects(*rows)))
 
 

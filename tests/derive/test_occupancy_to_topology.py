@@ -218,7 +218,7 @@ def test_what_is_left_out_is_said() -> None:
     assert not notes.warnings
     notes = DerivationNotes()
     occupancy_to_topology(layers, Parameters(island=0.0), notes)
-    assert [w.problem[:26] for w in notes.warnings] == ["the network is in 2 pieces"]
+    assert [w.problem[:26] for w in notes.warnings] == ["the network has 2 disconnected pieces"]
     assert not notes.dropped
     occupancy_to_topology(layers, Parameters(island=6.0, method="roadmap"), notes)
     assert {d.subject for d in notes.dropped} == {"places", "samples"}
@@ -604,7 +604,7 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     assert (full_grid.cells[55:58, 55:58] != UNKNOWN).all()
     assert (full_grid.cells[5:15, 5:15] == UNKNOWN).all(), "nothing near it was seen"
     assert (full_grid.cells[grey & (cells == FREE)] == FREE).all()
-    assert "nothing is learned from them" in notes.warnings[-1].problem
+    assert "they are not learned from" in notes.warnings[-1].problem
 
     fmt = formats.get_format("occupancy_grid")
     for values in ({"resolution": 0.1}, {"resolution": 0.025}, {"normalize": True}):

@@ -58,7 +58,7 @@ def test_free_as_wide_as_the_edges_are() -> None:
     assert g.counts()["free"] * 0.01 == pytest.approx(shapely.union_all([
         shapely.LineString([(0, 0), (10, 0)]).buffer(2), shapely.LineString([(10, 0), (10, 9)]).buffer(0.5)
     ]).area, rel=0.02)  # fmt: skip
-    assert notes.template[0].why.startswith("1 edges do not say")
+    assert notes.template[0].why.startswith("1 edges state no width")
     assert at(grid(network, edge_width=3.0), 11.4, 6) == FREE
     assert at(grid(network, edge_width=3.0), 5, 2.2) == UNKNOWN, "what an edge says is its own"
 

@@ -199,9 +199,9 @@ def test_one_way_aisles_go_there_and_back() -> None:
         ("orchard", {"colour": "red"}, "no such parameter of orchard"),
         ("orchard", {"robot_radius": 1.7}, r"row_spacing: 3.60 m .* at least 3.91 m are needed"),
         ("orchard", {"headland": 1.5, "robot_radius": 0.8}, "headland: 1.5 m are too few to turn"),
-        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "no thinner than its trunk"),
+        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "must be at least trunk_radius"),
         ("orchard", {"rows": 500, "row_length": 1000, "tree_spacing": 0.5, "resolution": 1}, "row_spacing|trees"),
-        ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* ask for a coarser"),
+        ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* use a coarser"),
         ("orchard", {"docks": 20, "row_length": 10}, "docks: the lane of 15"),
         ("orchard", {"datum": "95,0"}, "datum latitude must be between"),
         ("crop_rows", {"aisle": 0.5}, "aisle: 1.30 m from row to row"),
@@ -254,10 +254,13 @@ def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
 
 def test_a_fence_that_holds_nothing_is_told() -> None:
     key = PartKey("location", GROUND, "site")
-    for size, why in (((9, 9), "yard: the fence has no lane"), ((4, 60), "holds no field|no lane")):
+    for size, why in (
+        ((9, 9), "yard: the fence has no room for a lane"),
+        ((4, 60), "too small for a field|no room for a lane"),
+    ):
         small = features([("f", shapely.box(0, 0, *size), {"kind": "fence"})], "local")
         for name in SMALL:
-            with pytest.raises(CannotGenerate, match=f"{why}|the fence holds no row"):
+            with pytest.raises(CannotGenerate, match=f"{why}|the fence has no room for a row"):
                 generate.run(name, 1, {}, Layers({key: small}, HERE), looks.DerivationNotes())
 
 

@@ -156,7 +156,7 @@ def test_one_that_works_on_a_layer_replaces_it(ingest: Ingest, store: Store) -> 
 
 
 def test_wrong_orders_are_told_before_any_work(ingest: Ingest) -> None:
-    with pytest.raises(NotFound, match=r"known ones: .*some_posts"):
+    with pytest.raises(NotFound, match=r"available: .*some_posts"):
         ingest.generate("here", order("no_such"), message="", author="a")
     with pytest.raises(Invalid, match="count"):
         ingest.generate("here", order(count=101), message="", author="a")
@@ -164,5 +164,5 @@ def test_wrong_orders_are_told_before_any_work(ingest: Ingest) -> None:
         ingest.generate("here", order(size=1), message="", author="a")
     with pytest.raises(Invalid, match="seed"):
         ingest.generate("here", order(seed=-1), message="", author="a")
-    with pytest.raises(CannotGenerate, match="made nothing"):
+    with pytest.raises(CannotGenerate, match="generated nothing"):
         ingest.generate("here", order(count=0, fence=False), message="", author="a")

@@ -216,7 +216,7 @@ def test_edges_that_an_obstacle_crosses(edges: str) -> None:
         assert part.ids == lanes.ids
     else:
         assert all(p["source"] in node_ids and p["target"] in node_ids for p in part.properties if p["kind"] == "edge")
-    warnings = [w for w in notes.warnings if "an obstacle now stands there" in w.problem]
+    warnings = [w for w in notes.warnings if "because of new obstacles" in w.problem]
     assert warnings
     assert warnings[0].where == "ground/network"
 
@@ -285,19 +285,19 @@ def test_what_cannot_be_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
         disturbed(before, level="attic")
     with pytest.raises(CannotGenerate, match="there are: map"):
         disturbed(before, grid="attic")
-    with pytest.raises(CannotGenerate, match="ground: it has neither objects that stand in the way nor a grid"):
+    with pytest.raises(CannotGenerate, match="ground: it has neither obstacles nor a grid"):
         disturbed(Layers({PartKey("topology", "ground", "network"): lane(1.0)}))
     with pytest.raises(CannotGenerate, match="severity"):
         disturbed(before, severity=0.0)
-    with pytest.raises(CannotGenerate, match="nothing is disturbed"):
+    with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(before, **ALONE)
-    with pytest.raises(Invalid, match="least comes first"):
+    with pytest.raises(Invalid, match="the smaller value must come first"):
         disturbed(before, obstacle_size=(2.0, 1.0))
     for wrong in ({"missing": 2.0}, {"shift": -1.0}, {"obstacles": 10**9}, {"edges": "bend"}, {"largest": "nan"}):
         with pytest.raises(Invalid):
             disturbed(before, **wrong)
     full = Layers({PartKey("occupancy"): room(np.full((9, 9), OCCUPIED, np.uint8))})
-    with pytest.raises(CannotGenerate, match="nothing is disturbed"):
+    with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(full, **{**ALONE, "obstacles": 3})
     monkeypatch.setattr("app.generate.perturbation.MAX_CELLS", 1000)
     with pytest.raises(CannotGenerate, match="at most 1000"):
@@ -311,7 +311,7 @@ def test_small_and_blank_grids_are_no_trouble(shape: tuple[int, int], value: int
     try:
         after, _, _ = disturbed(before, severity=10.0)
     except CannotGenerate as error:
-        assert "nothing is disturbed" in error.detail
+        assert "these parameters disturb nothing" in error.detail
     else:
         assert grid(after).cells.shape == shape
 

@@ -64,8 +64,8 @@ def test_inside_a_fence() -> None:
     [
         ({"rules": "axiom: F; F -> FFFFFFFFFFFFFFFFFFFF", "iterations": 40}, "more than 100000 symbols after 3 of 40"),
         ({"rules": "axiom: A; A -> B; B -> A"}, "draws no branch"),
-        ({"rules": "axiom: Q"}, "no rule says what becomes of Q"),
-        ({"rules": " "}, "there are none"),
+        ({"rules": "axiom: Q"}, "no rule for Q"),
+        ({"rules": " "}, "missing"),
         ({"species": "oak"}, "must be one of apple, vine, bush, pine"),
         ({"rows": 0}, "at least 1"),
         ({"columns": 10**9}, "at most 200"),

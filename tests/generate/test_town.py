@@ -81,15 +81,15 @@ def test_chance_by_weights_and_seed() -> None:
     ("rules", "why"),
     [
         ("", "there are 0 rules"),
-        ("town", "is no rule"),
+        ("town", "is not a rule"),
         ("town -> explode(3) a", "no action 'explode'"),
-        ("town -> house", "no rule says what becomes of 'house'"),
-        ("town -> ring(5)", "takes 1 values and makes 1 shapes"),
+        ("town -> house", "no rule for 'house'"),
+        ("town -> ring(5)", "takes 1 values and 1 shapes"),
         ("town -> cut(0.5) a b", "takes 2 values"),
         ("town -> ring(__import__) town", "nothing is called"),
-        ("town : -> park", "a condition is missing"),
+        ("town : -> park", "missing condition"),
         ("town -> park extra", "no action 'park'"),
-        ("T O W N -> park", "is no rule"),
+        ("T O W N -> park", "is not a rule"),
         ("town -> park\n" * 201, "1 to 200"),
     ],
 )
@@ -101,14 +101,14 @@ def test_rules_that_cannot_be_read(rules: str, why: str) -> None:
 @pytest.mark.parametrize(
     ("rules", "why"),
     [
-        ("a -> a", "more than 48 deep"),
-        ("a -> inset(0) a", "more than 48 deep"),
+        ("a -> a", "more than 48 levels deep"),
+        ("a -> inset(0) a", "more than 48 levels deep"),
         ("a -> ring(90) a", "no room for a ring of 90 m"),
-        ("a -> cut(5, 0) a a", "a share is from"),
+        ("a -> cut(5, 0) a a", "a share must be from"),
         ("a -> cut(0.5, 900) a a", "1 to 200 m wide"),
-        ("a -> inset(0 - 1) a", "not negative"),
+        ("a -> inset(0 - 1) a", "must not be negative"),
         ("a -> flat(0)", "1 to 100 storeys"),
-        ("a -> cut(0.5, 0) b b; b -> cut(0.5, 6) b b", "what has been cut into lots"),
+        ("a -> cut(0.5, 0) b b; b -> cut(0.5, 6) b b", "land that has been cut into lots"),
         ("a -> cut(1 / 0, 6) a a", "cannot be computed"),
         ("a @ 0 -> park; a @ 0 -> garden", "weights"),
     ],
@@ -121,7 +121,7 @@ def test_rules_that_lead_nowhere(rules: str, why: str) -> None:
 def test_a_grammar_that_explodes_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _blocks.MAX_SHAPES == 30_000
     monkeypatch.setattr(_blocks, "MAX_SHAPES", 500)
-    with pytest.raises(CannotGenerate, match="the rules make more than 500 shapes"):
+    with pytest.raises(CannotGenerate, match="the rules create more than 500 shapes"):
         grown("a -> cut(0.5, 0) a a", shapely.box(0, 0, 3000, 3000))
 
 
@@ -180,7 +180,7 @@ def test_the_boundary_is_given_or_the_fence() -> None:
     layers, _ = looks.make("town", given=given, resolution=0.2)
     for part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
         assert shapely.contains(shapely.buffer(ring, 1e-6), part.geometry).all()
-    with pytest.raises(CannotGenerate, match="boundary: reaches beyond the fence"):
+    with pytest.raises(CannotGenerate, match="boundary: extends beyond the fence"):
         looks.make("town", given=given, boundary="0,0,500,0,500,500")
 
 
@@ -189,7 +189,7 @@ def test_the_boundary_is_given_or_the_fence() -> None:
     [
         ({"boundary": "0,0,10,0"}, "3 to 1000 corners"),
         ({"boundary": "0,0,10,0,20,0"}, "no polygon|area of 0"),
-        ({"boundary": "0,0,10,10,10,0,0,10"}, "is no polygon: Self-intersection"),
+        ({"boundary": "0,0,10,10,10,0,0,10"}, "is not a valid polygon: Self-intersection"),
         ({"boundary": "0,0,1,0,1,1"}, r"an area of 0\.5 m²"),
         ({"boundary": "0,0,1e9,0,1e9,1e9"}, "within a million metres"),
         ({"boundary": "0,0,9e5,0,9e5,9e5"}, "km² are more than 25"),
@@ -197,8 +197,8 @@ def test_the_boundary_is_given_or_the_fence() -> None:
         ({"width": 0}, "at least 30"),
         ({"width": 1e9}, "at most 5000"),
         ({"width": 5000, "depth": 5000, "resolution": 0.1}, "coarser resolution"),
-        ({"rules": "town -> park"}, "the rules make no street"),
-        ({"rules": "town -> nothing"}, "no rule says what becomes of 'nothing'"),
+        ({"rules": "town -> park"}, "the rules create no street"),
+        ({"rules": "town -> nothing"}, "no rule for 'nothing'"),
         ({"sidewalk": 1, "robot_radius": 0.6}, "too narrow for the robot"),
         ({"main": 100, "width": 60, "depth": 60}, "no room for a ring of 100 m"),
     ],
