@@ -73,7 +73,7 @@ def test_samples_have_both_outcomes(monkeypatch: pytest.MonkeyPatch) -> None:
     }
 
 
-def test_trial_does_without_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trial_does_not_compute_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> Any:
         raise AssertionError("the whole result is made")
 
@@ -84,7 +84,7 @@ def test_trial_does_without_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
         derive.try_steps((derive.all_derivations()[name].step(),), layers)
 
 
-def test_steps_before_the_last_are_carried_out() -> None:
+def test_steps_before_the_last_are_executed() -> None:
     layers = Layers({PartKey("occupancy"): grid(UNKNOWN)})
     steps = tuple(derive.all_derivations()[name].step() for name in ("occupancy_to_objects", "occupancy_to_voxels"))
     with pytest.raises(CannotDerive) as caught:

@@ -108,7 +108,7 @@ def check(things: dict[str, list[tuple[Any, dict[str, Any]]]], height: int = 64)
     ],
     ids=["export", "several masks", "large masks", "mobile, preprocessing", "free size", "sam 2"],
 )
-def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict[str, Any]]) -> None:
+def test_masks_become_objects_classified_by_colour(folder: Path, how: dict[str, dict[str, Any]]) -> None:
     put(folder, tiny_sam.encoder(SIDE, **how.get("encoder", {})), tiny_sam.decoder(SIDE, **how.get("decoder", {})))
     notes = DerivationNotes()
     things = detect(content(yard()), notes, stability=0.7)
@@ -120,7 +120,7 @@ def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict
     assert any("3 were classified by colour and shape, 1 have kind area" in w.problem for w in notes.warnings)
 
 
-def test_cells_of_what_is_not_known_stay_unknown(folder: Path) -> None:
+def test_cells_of_unclassified_masks_stay_unknown(folder: Path) -> None:
     put(folder)
     how = GridParameters(segmentation="model", model="sam", resolution=0.5, minimum_area=5.0)
     (grid,) = imagery_to_occupancy(content(yard()), how, DerivationNotes()).parts.values()
@@ -129,7 +129,7 @@ def test_cells_of_what_is_not_known_stay_unknown(folder: Path) -> None:
     assert [cells[14, 16], cells[TREE[1], TREE[0]], cells[44, 42], cells[60, 4]] == [OCCUPIED, OCCUPIED, UNKNOWN, FREE]
 
 
-def test_large_pictures_are_cut_into_tiles_and_seen_as_a_whole(folder: Path) -> None:
+def test_large_images_are_processed_in_tiles_and_as_a_whole(folder: Path) -> None:
     """Wide: a whole picture made half as large, and tiles from 0, 128 and 160 on; none cuts what it has from there."""
     put(folder, tiny_sam.encoder(160), tiny_sam.decoder(160))
     image = np.full((64, 320, 3), GRASS, np.uint8)
@@ -147,7 +147,7 @@ def test_large_pictures_are_cut_into_tiles_and_seen_as_a_whole(folder: Path) -> 
     assert road[1]["width"] == pytest.approx(4, abs=0.3)
 
 
-def test_what_the_model_is_not_sure_of_is_left_out(folder: Path) -> None:
+def test_masks_below_thresholds_are_dropped(folder: Path) -> None:
     put(folder, decoder=tiny_sam.decoder(SIDE, iou=0.6))
     with pytest.raises(CannotConvert, match=r"confidence of 0\.88 and a stability of 0\.95"):
         detect(content(yard()))
@@ -158,12 +158,12 @@ def test_what_the_model_is_not_sure_of_is_left_out(folder: Path) -> None:
     assert detect(content(yard()), stability=0.0)
 
 
-def test_one_point_finds_one_thing(folder: Path) -> None:
+def test_single_prompt_finds_one_object(folder: Path) -> None:
     put(folder)
     assert set(detect(content(yard()), points=1)) == {"field"}
 
 
-def test_grey_pictures_have_no_kinds(folder: Path) -> None:
+def test_masks_of_grey_image_have_kind_area(folder: Path) -> None:
     put(folder)
     notes = DerivationNotes()
     grey = cv2.cvtColor(yard(), cv2.COLOR_RGB2GRAY)
@@ -171,12 +171,12 @@ def test_grey_pictures_have_no_kinds(folder: Path) -> None:
     assert any("0 were classified" in w.problem for w in notes.warnings)
 
 
-def test_the_same_model_gives_the_same(folder: Path) -> None:
+def test_sam_model_is_repeatable(folder: Path) -> None:
     put(folder)
     assert str(detect(content(yard(150, 90)))) == str(detect(content(yard(150, 90))))
 
 
-def test_what_a_wrong_model_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = r"image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size"
     put(folder, decoder=tiny_sam.encoder(SIDE))
     with pytest.raises(CannotConvert, match=expected + r".*sam\.decoder\.onnx\) is \(x \[batch, 3, 128, 128\]\)"):
@@ -209,7 +209,7 @@ def test_what_a_wrong_model_is_told(folder: Path, monkeypatch: pytest.MonkeyPatc
         detect(content(yard()))
 
 
-def test_names_of_the_two_files(folder: Path) -> None:
+def test_model_file_names_are_paired(folder: Path) -> None:
     for name in ("vit_b_encoder", "vit_b_decoder", "m.Encoder", "m.decoder", "yolo", "lone.decoder"):
         (folder / f"{name}.onnx").write_bytes(b"?")
     with pytest.raises(NotFound, match=r"there are: lone\.decoder, m, vit_b, yolo$"):
@@ -250,7 +250,7 @@ def write_model(folder: Path, data: bytes, metadata: Any) -> None:
     (folder / "pixels.json").write_text(json.dumps(metadata))
 
 
-def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
+def test_pixel_classes_are_continuous_across_tiles(folder: Path) -> None:
     """Red is a building, green a field, blue nothing; a red band runs through three tiles without a seam."""
     write_model(folder, pixels(), PLAIN)
     image = np.full((80, 150, 3), (0, 255, 0), np.uint8)
@@ -267,7 +267,7 @@ def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
         detect(content(np.full((80, 80, 3), 128, np.uint8)), model="pixels")  # a third each
 
 
-def test_classes_that_are_ways_have_a_width(folder: Path) -> None:
+def test_path_classes_have_width(folder: Path) -> None:
     write_model(folder, pixels(), {**PLAIN, "classes": ["path", "field", None]})
     image = np.full((64, 64, 3), (0, 255, 0), np.uint8)
     image[30:36] = (255, 0, 0)
@@ -275,7 +275,7 @@ def test_classes_that_are_ways_have_a_width(folder: Path) -> None:
     assert things["path"][0][1]["width"] == pytest.approx(3, abs=0.5)
 
 
-def test_usual_mean_and_wrong_words(folder: Path) -> None:
+def test_pixel_model_uses_default_mean_and_rejects_wrong_metadata(folder: Path) -> None:
     write_model(folder, pixels(None), ["building", "field", None])
     image = np.full((64, 64, 3), (124, 116, 104), np.uint8)  # ImageNet's mean: nothing is more likely than the rest
     image[10:30, 10:30] = (255, 0, 0)
@@ -296,7 +296,7 @@ def test_usual_mean_and_wrong_words(folder: Path) -> None:
         imagery_to_objects(content(image), Parameters(stability=0.5, segmentation="colour"), DerivationNotes())
 
 
-def test_through_the_server(folder: Path, tmp_path: Path) -> None:
+def test_sam_model_works_through_server(folder: Path, tmp_path: Path) -> None:
     """In a confined worker, with its limit of memory."""
     put(folder)
     ok, png = cv2.imencode(".png", yard()[..., ::-1])

@@ -79,7 +79,7 @@ def middles(grid: OccupancyGrid) -> Any:
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_a_slice_covers_the_map_that_a_robot_made_there(shared: Path, pair: str) -> None:
+def test_world_slice_covers_robot_map(shared: Path, pair: str) -> None:
     from scipy.spatial import cKDTree
 
     data = shared / "data"
@@ -129,7 +129,7 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
     assert length == pytest.approx(facts["slice_total_length_m"], rel=0.01)
 
 
-def test_the_warehouse_as_voxels(shared: Path) -> None:
+def test_warehouse_world_gives_voxels(shared: Path) -> None:
     content = world(shared / "data", "aws_small_warehouse")
     voxels = objects_to_voxels(content, VoxelParameters(), DerivationNotes()).parts[PartKey("voxels", "ground", MAP)]
     assert isinstance(voxels, VoxelMap)
@@ -150,7 +150,7 @@ def test_the_warehouse_as_voxels(shared: Path) -> None:
     assert differ.sum() < 0.01 * (grid.cells == 100).sum(), "a layer of the octree is a band of the world"
 
 
-def test_of_several_worlds_one_is_cut(shared: Path) -> None:
+def test_one_of_several_worlds_is_cut(shared: Path) -> None:
     root = shared / "data/gazebo_sdf/aws_small_warehouse"
     files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
     content = read({p.relative_to(root).as_posix(): p.read_bytes() for p in files})
@@ -183,7 +183,7 @@ def of_the_robot(folder: Path) -> OccupancyGrid:
         ("turtlebot3_world", "occupancy_grid/nav2_tb3_sandbox", (0.05, 0.0), 1.0),
     ],
 )
-def test_a_robots_map_is_laid_onto_its_world(
+def test_robot_map_is_aligned_to_its_world(
     shared: Path, pair: str, maps: str, shift: tuple[float, float], degrees: float
 ) -> None:
     """The known shifts (a map's places less the world's) are found again to a cell, and from any turn."""

@@ -53,7 +53,7 @@ def pieces(free: Bool) -> int:
     return int(cv2.connectedComponents(free.astype(np.uint8), connectivity=4)[0]) - 1
 
 
-def test_conways_glider_flies() -> None:
+def test_conway_glider_moves() -> None:
     glider = picture(".#......", "..#.....", "###.....", "........", "........", "........")
     later = picture("........", "..#.....", "...#....", ".###....", "........", "........")
     assert (_automata.run_automaton(glider, *LIFE, 4, outside=False) == later).all()
@@ -64,21 +64,21 @@ def test_conways_glider_flies() -> None:
 
 @pytest.mark.parametrize("outside", [False, True])
 @pytest.mark.parametrize(("born", "stays"), [("5678", "45678"), ("", "012345678"), ("012345678", ""), ("08", "08")])
-def test_rules_are_kept_as_by_hand(outside: bool, born: str, stays: str) -> None:
+def test_rules_give_hand_computed_cells(outside: bool, born: str, stays: str) -> None:
     alive = np.random.default_rng(3).random((23, 31)) < 0.45
     b, s = ({int(c) for c in digits} for digits in (born, stays))
     expected = by_hand(by_hand(alive, b, s, outside), b, s, outside)
     assert (_automata.run_automaton(alive, b, s, 2, outside=outside) == expected).all()
 
 
-def test_many_rows_are_worked_on_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_rows_are_processed_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
     alive = np.random.default_rng(4).random((50, 40)) < 0.45
     expected = _automata.run_automaton(alive, *LIFE, 3, outside=True)
     monkeypatch.setattr(_automata, "STRIP", 40 * 7)
     assert (_automata.run_automaton(alive, *LIFE, 3, outside=True) == expected).all()
 
 
-def test_a_step_costs_no_more_than_twice_what_numpy_needs_for_the_sums_alone() -> None:
+def test_step_takes_at_most_twice_the_numpy_sums() -> None:
     alive = np.random.default_rng(5).random((2000, 2000)) < 0.5
     padded = np.pad(alive.astype(np.uint8), 1)
 
@@ -105,7 +105,7 @@ def shortest_time(work: Any) -> float:
     return min(times)
 
 
-def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
+def test_rooms_are_joined_and_holes_are_filled() -> None:
     rock = np.ones((40, 60), bool)
     for y, x, h, w in ((3, 3, 12, 12), (20, 4, 14, 10), (5, 40, 10, 15), (25, 40, 9, 9)):
         rock[y : y + h, x : x + w] = False
@@ -128,7 +128,7 @@ def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
 
 
 @pytest.mark.parametrize("name", list(SMALL))
-def test_a_whole_site(name: str, tmp_path: Path) -> None:
+def test_automaton_site_is_consistent(name: str, tmp_path: Path) -> None:
     site, _ = looks.make(name, **SMALL[name])
     looks.agrees_with_itself(site, 0.3)
     looks.serves(site)
@@ -139,7 +139,7 @@ def test_a_whole_site(name: str, tmp_path: Path) -> None:
     assert hashlib.sha256(site.grids()[GRID].cells.tobytes()).hexdigest()[:16] == HASHES[name]
 
 
-def test_trees_have_trunks_to_run_into_and_crowns_to_see() -> None:
+def test_forest_trees_have_solid_trunks_and_visual_crowns() -> None:
     site, _ = looks.make("forest", **SMALL["forest"])
     (trees,) = site.vector("objects").values()
     assert len(trees) > 20
@@ -157,7 +157,7 @@ def test_trees_have_trunks_to_run_into_and_crowns_to_see() -> None:
     assert len(next(iter(dense.vector("objects").values()))) == 12 * 10
 
 
-def test_inside_a_fence() -> None:
+def test_automaton_site_stays_inside_fence() -> None:
     fence = shapely.Polygon([(-7, -3), (9, -5), (12, 8), (-2, 11)])
     given = Layers(
         {PartKey("location", name="site"): features([("fence", fence, {"kind": "fence"})], "local")}, Datum(52.0, 5.0)
@@ -193,14 +193,14 @@ def test_inside_a_fence() -> None:
         ("forest", {"density": 0.0}, "no tree is left"),
     ],
 )
-def test_what_cannot_grow_is_told(name: str, values: dict[str, Any], why: str) -> None:
+def test_invalid_automaton_parameters_raise(name: str, values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make(name, **values)
     assert time.process_time() - started < 3.0
 
 
-def test_over_http(api: Api) -> None:
+def test_automaton_site_is_generated_over_http(api: Api) -> None:
     for name, values in SMALL.items():
         looks.make(name, **values)  # so that native code is there, which takes a minute on a busy machine
         version = looks.over_http(api, name, ("occupancy_grid", "tmap2", "gazebo"), **values)
@@ -210,7 +210,7 @@ def test_over_http(api: Api) -> None:
     assert "B5678/S45678" in problem["detail"]
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_automaton_site_is_generated_on_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, values in SMALL.items():
         out = tmp_path / f"{name}.zip"
         options = [word for key, value in values.items() for word in ("-O", f"{key}={value}")]

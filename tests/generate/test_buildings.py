@@ -29,7 +29,7 @@ def office() -> Layers:
     return looks.make("office", length=14)[0]
 
 
-def test_an_office_agrees_with_itself_and_every_format_serves_from_it(office: Layers, tmp_path: Path) -> None:
+def test_office_is_consistent_in_every_format(office: Layers, tmp_path: Path) -> None:
     assert office.levels == (Level(), Level("L2", 3.4))
     looks.agrees_with_itself(office, 0.3)
     looks.sound_sdf(office, tmp_path)
@@ -37,7 +37,7 @@ def test_an_office_agrees_with_itself_and_every_format_serves_from_it(office: La
     assert looks.digest(office) == DIGESTS["office"]
 
 
-def test_a_ward_agrees_with_itself() -> None:
+def test_ward_is_consistent() -> None:
     layers, _ = looks.make("hospital", length=16)
     looks.agrees_with_itself(layers, 0.3)
     assert looks.digest(layers) == DIGESTS["hospital"]
@@ -49,7 +49,7 @@ def test_a_ward_agrees_with_itself() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_wards_above_each_other(seed: int) -> None:
+def test_stacked_wards_are_consistent(seed: int) -> None:
     layers, _ = looks.make("hospital", seed, levels=2, length=24, robot_radius=0.45)
     looks.agrees_with_itself(layers, 0.45)
 
@@ -81,7 +81,7 @@ def test_open_rmf_reads_walls_doors_and_the_lift(office: Layers) -> None:
         assert shapely.hausdorff_distance(*(shapely.union_all(f.geometry) for f in (walls, again))) < 1e-6
 
 
-def test_fleets_learn_which_lanes_lead_through_doors_and_into_the_lift(office: Layers) -> None:
+def test_open_rmf_lanes_name_doors_and_lift(office: Layers) -> None:
     graph = yaml.safe_load(write_layers(office, "rmf_nav_graph", {}, looks.CAME).files["0.yaml"])
     assert set(graph["levels"]) == {"ground", "L2"}
     for name, level in graph["levels"].items():
@@ -92,7 +92,7 @@ def test_fleets_learn_which_lanes_lead_through_doors_and_into_the_lift(office: L
     assert set(graph["lifts"]) == {"lift_1"}
 
 
-def test_inside_a_fence() -> None:
+def test_building_stays_inside_fence() -> None:
     ring = shapely.Polygon([(100, 50), (140, 90), (115, 115), (75, 75)])
     fence = features([("f", ring, {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
@@ -124,12 +124,12 @@ def test_inside_a_fence() -> None:
         ({"length": 500, "depth": 50, "resolution": 0.01}, "coarser resolution"),
     ],
 )
-def test_what_cannot_be_built_is_told(values: dict[str, Any], why: str) -> None:
+def test_invalid_building_parameters_raise(values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make("office", **values)
 
 
-def test_over_http(api: Api) -> None:
+def test_building_is_generated_over_http(api: Api) -> None:
     format_names = ("openrmf", "rmf_nav_graph", "tmap2", "gazebo", "kml")
     version = looks.over_http(api, "office", format_names, length=16)
     assert version["information"]["topology"] == "generated"

@@ -125,7 +125,7 @@ def measured(grid: OccupancyGrid, seed: int = 3) -> Measure:
 
 
 @pytest.mark.parametrize("name", FAST)
-def test_holes_in_real_grids_get_no_false_free_cells_and_straight_walls_back(shared: Path, name: str) -> None:
+def test_holes_in_real_grids_get_walls_back_and_no_false_free_cells(shared: Path, name: str) -> None:
     measure = measured(grid_of(shared / "data" / name))
     assert measure.free_right >= 0.98 * measure.free
     assert measure.free >= 0.15 * measure.cells, "better unknown than wrong, but not nothing"
@@ -147,7 +147,7 @@ def complete(cells: NDArray[np.uint8], notes: DerivationNotes | None = None, **v
     return generate.run("complete_grid", 7, values, given, notes or DerivationNotes()).grids()[KEY].cells
 
 
-def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
+def test_wall_is_continued_and_cells_beyond_stay_unknown() -> None:
     cells = room()
     hole = np.s_[30:70, 50:90]
     cells[hole] = UNKNOWN
@@ -163,7 +163,7 @@ def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
     assert "confidence of 0.98" in left.why
 
 
-def test_more_confidence_fills_less() -> None:
+def test_higher_confidence_fills_fewer_cells() -> None:
     cells = room()
     cells[30:70, 20:60] = UNKNOWN
     filled = [int((complete(cells, confidence=c) != UNKNOWN).sum()) for c in (0.0, 0.5, 0.98)]

@@ -66,7 +66,7 @@ def network(layers: Layers) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
-def test_a_site_agrees_with_itself_and_every_format_serves_from_it(name: str, tmp_path: Path) -> None:
+def test_field_is_consistent_in_every_format(name: str, tmp_path: Path) -> None:
     layers, notes = looks.make(name, **SMALL[name])
     assert not notes.dropped
     assert [t.subject for t in notes.template] == ["datum"]
@@ -104,7 +104,7 @@ def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str
             assert math.sin(math.atan2(q.y - p.y, q.x - p.x) - along) == pytest.approx(0, abs=0.01)
 
 
-def test_the_network_is_called_as_in_real_polytunnels() -> None:
+def test_network_names_match_real_polytunnels() -> None:
     layers, _ = looks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
     nodes, edges = network(layers)
     aisles = {n.rpartition("-")[0] for n in nodes if n.startswith("r")}
@@ -135,7 +135,7 @@ def test_the_network_is_called_as_in_real_polytunnels() -> None:
     assert {i for i in zones.ids if i.startswith("row")} == {f"row{k}" for k in range(1, 11)}
 
 
-def test_trees_stand_where_they_were_asked_for() -> None:
+def test_orchard_trees_follow_parameters() -> None:
     parameters = {"rows": 3, "row_length": 18, "row_spacing": 5.0, "tree_spacing": 3.0, "jitter": 0.2}
     layers, _ = looks.make("orchard", **parameters)
     part = layers.parts[OBJECTS]
@@ -160,7 +160,7 @@ def test_trees_stand_where_they_were_asked_for() -> None:
     assert np.diff(x) == pytest.approx(3.0)
 
 
-def test_the_crown_is_a_closed_ball() -> None:
+def test_crown_mesh_is_closed_ball() -> None:
     vertices, faces = load_mesh(_trees.crown_mesh(), "crown.stl")
     corners = vertices[faces]
     assert len(faces) == 80
@@ -169,7 +169,7 @@ def test_the_crown_is_a_closed_ball() -> None:
     assert 3.6 < volume < 4 / 3 * math.pi, "its sides look outwards"
 
 
-def test_one_way_aisles_go_there_and_back() -> None:
+def test_one_way_aisles_alternate_directions() -> None:
     values = {**SMALL["warehouse"], "racks": 4}
     plain, _ = looks.make("warehouse", **values)
     layers, _ = looks.make("warehouse", one_way=True, **values)
@@ -218,13 +218,13 @@ def test_one_way_aisles_go_there_and_back() -> None:
         ("warehouse", {"robot_radius": 1.5}, "aisle: 4.80 m from row to row"),
     ],
 )
-def test_what_cannot_be_made_is_told_before_any_work(name: str, values: dict[str, Any], why: str) -> None:
+def test_invalid_field_parameters_raise_before_work(name: str, values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make(name, **values)
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
-def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
+def test_random_fences_give_site_or_error(name: str) -> None:
     chance = random.Random(f"fences for {name}")
     key = PartKey("location", GROUND, "site")
     site_count = 0
@@ -252,7 +252,7 @@ def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
     assert site_count >= 3
 
 
-def test_a_fence_that_holds_nothing_is_told() -> None:
+def test_too_small_fence_raises_cannot_generate() -> None:
     key = PartKey("location", GROUND, "site")
     for size, why in (
         ((9, 9), "yard: the fence has no room for a lane"),
@@ -264,7 +264,7 @@ def test_a_fence_that_holds_nothing_is_told() -> None:
                 generate.run(name, 1, {}, Layers({key: small}, HERE), looks.DerivationNotes())
 
 
-def test_large_fields_take_cells_that_still_show_the_ways() -> None:
+def test_large_fields_use_cells_that_show_the_paths() -> None:
     big = features([("f", shapely.box(0, 0, 120, 100), {"kind": "fence"})], "local")
     layers, notes = looks.make(
         "vineyard", given=Layers({PartKey("location", GROUND, "site"): big}, HERE), vine_spacing=6
@@ -274,7 +274,7 @@ def test_large_fields_take_cells_that_still_show_the_ways() -> None:
     assert [t.subject for t in notes.template] == ["resolution"]
 
 
-def test_over_http_and_edits(api: Api) -> None:
+def test_field_is_generated_over_http_and_edited(api: Api) -> None:
     format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "satellite", "openrmf")
     version = looks.over_http(api, "polytunnels", format_names, **SMALL["polytunnels"])
     assert set(version["information"].values()) >= {"generated"}

@@ -84,7 +84,7 @@ def order(name: str = "some_posts", seed: int = 7, replace: bool = False, **valu
     return GenerationRequest(name, seed, values, replace)
 
 
-def test_streams_are_the_same_everywhere_and_independent() -> None:
+def test_random_streams_are_portable_and_independent() -> None:
     first = RandomSource(7, "orchard").stream("trees").random(3)
     assert first.tolist() == RandomSource(7, "orchard").stream("trees").random(3).tolist()
     assert RandomSource(7, "orchard").stream("trees").integers(0, 2**32, 2).tolist() == NUMBERS
@@ -92,7 +92,7 @@ def test_streams_are_the_same_everywhere_and_independent() -> None:
         assert other.random(3).tolist() != first.tolist()
 
 
-def test_what_is_made_is_a_version_that_says_how(ingest: Ingest, store: Store) -> None:
+def test_generation_commits_version_with_provenance(ingest: Ingest, store: Store) -> None:
     result = ingest.generate("here", order(count=5), message="", author="a")
     assert result.status == "created"
     assert result.version is not None
@@ -119,7 +119,7 @@ def test_what_is_made_is_a_version_that_says_how(ingest: Ingest, store: Store) -
     assert other.version.root != result.version.root
 
 
-def test_a_new_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(ingest: Ingest, store: Store) -> None:
+def test_new_site_replaces_only_an_earlier_site(ingest: Ingest, store: Store) -> None:
     ingest.generate("here", order(), message="", author="a")
     version = ingest.generate("here", order(fence=False), message="", author="a").version
     assert version is not None
@@ -133,7 +133,7 @@ def test_a_new_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(ingest
     assert ingest.generate("here", order(replace=True), message="", author="a").status == "created"
 
 
-def test_whose_the_datum_is(ingest: Ingest, store: Store) -> None:
+def test_generated_datum_is_kept_unless_environment_has_one(ingest: Ingest, store: Store) -> None:
     ingest.generate("here", order(fence=False), message="", author="a")
     assert store.versions.get("here").information["location"] == "generated"
     ingest.set_datum("here", Datum(53.0, 6.0), author="a")
@@ -144,7 +144,7 @@ def test_whose_the_datum_is(ingest: Ingest, store: Store) -> None:
     assert version.information["location"] == "raw"
 
 
-def test_one_that_works_on_a_layer_replaces_it(ingest: Ingest, store: Store) -> None:
+def test_generator_that_needs_a_layer_replaces_it(ingest: Ingest, store: Store) -> None:
     with pytest.raises(MissingLayer, match="fewer works on objects"):
         ingest.generate("here", order("fewer", count=1), message="", author="a")
     ingest.generate("here", order(), message="", author="a")
@@ -155,7 +155,7 @@ def test_one_that_works_on_a_layer_replaces_it(ingest: Ingest, store: Store) -> 
     assert step["given"][0]["layer"] == "objects"
 
 
-def test_wrong_orders_are_told_before_any_work(ingest: Ingest) -> None:
+def test_invalid_requests_raise_before_work(ingest: Ingest) -> None:
     with pytest.raises(NotFound, match=r"available: .*some_posts"):
         ingest.generate("here", order("no_such"), message="", author="a")
     with pytest.raises(Invalid, match="count"):

@@ -89,7 +89,7 @@ def edges_are_free(layers: Layers, radius: float = 0.3) -> None:
         assert _reach.passable(grid, lines, radius).all()
 
 
-def test_the_grid_follows_the_objects_and_the_network_both() -> None:
+def test_grid_and_network_follow_moved_objects() -> None:
     before = orchard()
     after, new_layers, notes = disturbed(before, **STILL, missing=0.2, obstacles=6)
     then, now = places(objects(before)), places(objects(after))
@@ -110,7 +110,7 @@ def test_the_grid_follows_the_objects_and_the_network_both() -> None:
 
 
 @pytest.mark.parametrize("site", ["hospital", "warehouse", "cluttered_hall"])
-def test_made_up_sites_still_agree(site: str) -> None:
+def test_perturbed_sites_stay_consistent(site: str) -> None:
     before, _ = make(site)
     after, _, _ = disturbed(before, **STILL, obstacles=12)
     world(after, 0.2)
@@ -119,14 +119,14 @@ def test_made_up_sites_still_agree(site: str) -> None:
     edges_are_free(noisy)  # there is no noise where robots drive
 
 
-def test_the_same_seed_gives_the_same_and_another_one_not() -> None:
+def test_perturbation_is_repeatable_and_seeded() -> None:
     before = orchard()
     a, b, c = (digest(disturbed(before, seed)[1]) for seed in (7, 7, 8))
     assert a == b != c
     assert a == "58a976ef664b428f950c07b955da2b4b221b8b067aede79d9bec9e4767b554ba"
 
 
-def test_rows_move_as_rows() -> None:
+def test_rows_move_as_a_whole() -> None:
     before = orchard()
     after, _, notes = disturbed(before, **{**ALONE, "row_shift": 0.3})
     then, now = places(objects(before)), places(objects(after))
@@ -137,7 +137,7 @@ def test_rows_move_as_rows() -> None:
     assert any("36 things moved (4 rows)" in w.problem for w in notes.warnings)
 
 
-def test_turned_things_keep_their_shape_and_do_not_run_into_each_other() -> None:
+def test_turned_objects_keep_shape_and_do_not_collide() -> None:
     pieces = []
     for k in range(6):
         size = {"type": "box", "size": [1.0, 0.4, 1.0], "pose": [0, 0, 0.5, 0, 0, 0]}
@@ -179,7 +179,7 @@ def lane(*ys: float) -> Features:
     return features(rows, "local")
 
 
-def test_a_grid_alone_has_its_pieces_moved() -> None:
+def test_grid_without_objects_has_its_pieces_moved() -> None:
     before = Layers({PartKey("occupancy"): room()})
     after, new_layers, notes = disturbed(before, **{**ALONE, "shift": 0.6})
     assert {k.layer for k in new_layers.parts} == {"occupancy"}
@@ -195,7 +195,7 @@ def test_a_grid_alone_has_its_pieces_moved() -> None:
 
 
 @pytest.mark.parametrize("edges", ["remove", "block"])
-def test_edges_that_an_obstacle_crosses(edges: str) -> None:
+def test_edges_crossed_by_obstacle_are_removed_or_blocked(edges: str) -> None:
     lanes = lane(*(0.5 + 0.5 * k for k in range(1, 14)))
     before = Layers({PartKey("occupancy"): room(), PartKey("topology", "ground", "network"): lanes})
     after, _, notes = disturbed(before, **{**ALONE, "obstacles": 4}, edges=edges)
@@ -221,7 +221,7 @@ def test_edges_that_an_obstacle_crosses(edges: str) -> None:
     assert warnings[0].where == "ground/network"
 
 
-def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
+def test_noise_grows_with_distance_and_spares_paths() -> None:
     cells = np.zeros((400, 400), np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = OCCUPIED
     line = shapely.LineString([(1, 10), (19, 10)])
@@ -251,7 +251,7 @@ def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
     assert ((grid(strong).cells == OCCUPIED) & (cells != OCCUPIED)).sum() == pytest.approx(wrong.sum() / 2, rel=0.1)
 
 
-def test_a_grid_that_lies_askew_follows_too() -> None:
+def test_rotated_grid_follows_objects() -> None:
     """Turned by 30 degrees and coarser: the cells of the objects' places change, no others."""
     post = {"type": "cylinder", "radius": 0.4, "length": 1.0, "pose": [0, 0, 0.5, 0, 0, 0]}
     properties = {"kind": "post", "pose": [5.0, 3.0, 0.0, 0, 0, 0], "shapes": [post]}
@@ -277,7 +277,7 @@ def test_a_grid_that_lies_askew_follows_too() -> None:
     assert occupied.sum() == pytest.approx((cells == OCCUPIED).sum(), rel=0.4)
 
 
-def test_what_cannot_be_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_perturbations_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MissingLayer, match="objects or occupancy or topology"):
         disturbed(Layers())
     before = Layers({PartKey("occupancy"): room()})
@@ -306,7 +306,7 @@ def test_what_cannot_be_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (7, 3)])
 @pytest.mark.parametrize("value", [FREE, OCCUPIED, UNKNOWN])
-def test_small_and_blank_grids_are_no_trouble(shape: tuple[int, int], value: int) -> None:
+def test_small_and_empty_grids_are_accepted(shape: tuple[int, int], value: int) -> None:
     before = Layers({PartKey("occupancy"): room(np.full(shape, value, np.uint8))})
     try:
         after, _, _ = disturbed(before, severity=10.0)
@@ -316,7 +316,7 @@ def test_small_and_blank_grids_are_no_trouble(shape: tuple[int, int], value: int
         assert grid(after).cells.shape == shape
 
 
-def test_masks_are_left_alone_unless_named() -> None:
+def test_masks_are_unchanged_unless_named() -> None:
     mask = OccupancyGrid(room().cells.copy(), 0.05)
     before = Layers({PartKey("occupancy"): room(), PartKey("occupancy", "ground", "keepout"): mask})
     _, new_layers, _ = disturbed(before)
@@ -325,7 +325,7 @@ def test_masks_are_left_alone_unless_named() -> None:
     assert [k.name for k in new_layers.parts] == ["keepout"]
 
 
-def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
+def test_grey_205_cells_are_unchanged() -> None:
     """Nothing new stands on ground that nobody has seen, and no noise frees its edge."""
     cells = room().cells.copy()
     grey = np.zeros(cells.shape, bool)
@@ -341,7 +341,7 @@ def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
     assert (grid(after).cells[[0, -1], 130:-2] == OCCUPIED).all()
 
 
-def test_again_and_again() -> None:
+def test_repeated_perturbation_stays_consistent() -> None:
     """A second perturbation works on what the first has made, and keeps its obstacles."""
     one, _, _ = disturbed(orchard(), **STILL)
     two, _, _ = disturbed(one, 8, **STILL, missing=0.0)
@@ -361,7 +361,7 @@ def counts(api: Api, env: str, version: int | str) -> dict[str, int]:
     return cell_counts
 
 
-def test_the_strawberry_farm_disturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
+def test_strawberry_farm_is_perturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
     root = shared / "data" / STRAWBERRY
     env = fresh()
     api.post("environments", {"name": env})
@@ -393,7 +393,7 @@ def test_the_strawberry_farm_disturbed(api: Api, fresh: Callable[[], str], share
     assert step["steps"][-1]["parameters"]["obstacles"] == 5
 
 
-def test_a_building_disturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
+def test_building_is_perturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
     """It has no grid: the derived one shows the new obstacles, and no lane leads through them."""
     env = fresh()
     api.post("environments", {"name": env})

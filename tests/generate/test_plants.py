@@ -19,7 +19,7 @@ from tests.generate import looks
 DIGEST = "87eeff483ded9d36ca488e3f8bf9f2aadc1dce9c523b322939c9189a799e715d"
 
 
-def test_a_stand_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
+def test_plant_stand_is_consistent_in_every_format(tmp_path: Path) -> None:
     layers, _ = looks.make("plants", variants=2, columns=4)
     looks.agrees_with_itself(layers, 0.3)
     looks.sound_sdf(layers, tmp_path)
@@ -29,7 +29,7 @@ def test_a_stand_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Pa
 
 
 @pytest.mark.parametrize("species", ["vine", "bush", "pine"])
-def test_each_species(species: str) -> None:
+def test_each_species_gives_a_stand(species: str) -> None:
     layers, _ = looks.make("plants", species=species, rows=2, columns=2, variants=1)
     looks.agrees_with_itself(layers, 0.3)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
@@ -38,7 +38,7 @@ def test_each_species(species: str) -> None:
     assert {f for f in files if f.endswith(".obj")} == set(layers.resources()), "the meshes go along"
 
 
-def test_rules_of_ones_own() -> None:
+def test_custom_rules_give_a_stand() -> None:
     rules = "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.3 -> F(l) [ +(30) A(l * 0.7) ] [ -(30) A(l * 0.7) ] L(0.2)"
     layers, _ = looks.make("plants", rules=rules, rows=1, columns=2, variants=1, body="crown", jitter=0)
     looks.agrees_with_itself(layers, 0.3)
@@ -48,7 +48,7 @@ def test_rules_of_ones_own() -> None:
     assert first["shapes"][0]["radius"] > 0.3, "a crown, not the trunk of 0.05 m"
 
 
-def test_inside_a_fence() -> None:
+def test_plant_stand_stays_inside_fence() -> None:
     fence = features([("f", shapely.Polygon([(0, 0), (60, 60), (40, 80), (-20, 20)]), {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
     layers, _ = looks.make("plants", given=given, rows=3, columns=4, variants=1)
@@ -74,12 +74,12 @@ def test_inside_a_fence() -> None:
         ({"rows": 200, "columns": 200, "spacing": 100, "row_spacing": 100, "resolution": 0.01}, "coarser resolution"),
     ],
 )
-def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+def test_invalid_plant_parameters_raise(values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make("plants", **values)
 
 
-def test_over_http(api: Api) -> None:
+def test_plant_stand_is_generated_over_http(api: Api) -> None:
     format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "geojson", "octomap")
     version = looks.over_http(api, "plants", format_names, rows=2, columns=3, variants=1)
     assert version["information"]["objects"] == "generated"

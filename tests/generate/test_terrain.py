@@ -94,7 +94,7 @@ def simplex(p: tuple[float, ...], t: NDArray[np.uint8]) -> float:
 
 
 @pytest.mark.parametrize(("kernel", "reference"), [("perlin", perlin), ("simplex", simplex)])
-def test_noise_is_what_its_definition_says(kernel: str, reference: Any) -> None:
+def test_noise_matches_its_definition(kernel: str, reference: Any) -> None:
     t = table()
     x, y, z = (np.random.default_rng(k).random(9) * 40 - 20 for k in range(3))
     flat, deep = np.zeros((9, 9)), np.full((9, 9, 9), 0.25)
@@ -122,7 +122,7 @@ def test_octaves_stay_in_range_and_are_smooth(kind: Any) -> None:
     assert np.abs(deep[0] - deep[2]).max() > 0.1
 
 
-def test_the_same_seed_gives_the_same_noise_everywhere() -> None:
+def test_noise_of_same_seed_is_equal() -> None:
     out = hashlib.sha256()
     x = np.linspace(-9.0, 11.0, 64)
     for kind in ("perlin", "simplex"):
@@ -147,7 +147,7 @@ def numpys(x: Array, y: Array, t: NDArray[np.uint8]) -> Array:
     return np.asarray(math.sqrt(2) * (low + w * (high - low)))
 
 
-def test_noise_takes_no_longer_than_numpys_own_passes() -> None:
+def test_noise_is_no_slower_than_numpy_passes() -> None:
     x, y, t = np.linspace(0, 37.3, 1000), np.linspace(0, 31.1, 1000), table()
     out = np.zeros((1000, 1000))
     _kernels_noise.perlin2(x, y, t, 1.0, out)
@@ -170,7 +170,7 @@ def without_costs(site: Layers) -> Layers:
     return Layers({k: p for k, p in site.parts.items() if k.name not in ("costs", "speed")}, site.datum, site.levels)
 
 
-def test_whole_ground(tmp_path: Path) -> None:
+def test_terrain_site_is_consistent(tmp_path: Path) -> None:
     site, notes = looks.make("terrain", **SMALL)
     looks.agrees_with_itself(without_costs(site), 0.3)
     looks.serves(site)
@@ -185,7 +185,7 @@ def test_whole_ground(tmp_path: Path) -> None:
     assert any(name.endswith("heightmaps/terrain.png") for name in world)
 
 
-def test_the_height_map_lies_below_the_floor_and_trees_stand_on_it() -> None:
+def test_height_map_is_below_floor_with_trees_on_it() -> None:
     site, _ = looks.make("terrain", relief=2.0, **SMALL)
     (objects,) = site.vector("objects").values()
     files = site.resources()
@@ -208,7 +208,7 @@ def test_the_height_map_lies_below_the_floor_and_trees_stand_on_it() -> None:
         assert z + trunk["length"] > 2.9, "it is met above the floor"
 
 
-def test_slopes_cost_and_steep_ground_is_no_way() -> None:
+def test_slopes_cost_and_steep_ground_is_blocked() -> None:
     site, _ = looks.make("terrain", relief=3.0, climb=20, **SMALL)
     grid, costs = site.grids()[GRID], site.grids()[COSTS]
     assert costs.mode == "raw"
@@ -232,7 +232,7 @@ def test_slopes_cost_and_steep_ground_is_no_way() -> None:
     assert np.abs(costs.cells[cell] - np.minimum(share[r, c], 1.0) * 99)[free].max() < 12
 
 
-def test_a_speed_mask_instead() -> None:
+def test_terrain_speed_mask_replaces_costs() -> None:
     site, _ = looks.make("terrain", rough="speed", **SMALL)
     mask = site.grids()[PartKey("occupancy", name="speed")]
     assert mask.cells.min() >= 10
@@ -243,7 +243,7 @@ def test_a_speed_mask_instead() -> None:
     assert set(plain.grids()) == {GRID}
 
 
-def test_time_changes_the_ground_a_little() -> None:
+def test_time_changes_terrain_slightly() -> None:
     def ground(epoch: float) -> Array:
         site, _ = looks.make("terrain", epoch=epoch, vegetation=0, **SMALL)
         with Image.open(io.BytesIO(site.resources()["heightmaps/terrain.png"])) as picture:
@@ -268,7 +268,7 @@ def test_bare_ground_has_posts_at_its_corners() -> None:
     assert any(t.subject == "posts" for t in notes.template)
 
 
-def test_inside_a_fence() -> None:
+def test_terrain_stays_inside_fence() -> None:
     fence = shapely.Polygon([(-7, -3), (9, -5), (12, 8), (-2, 11)])
     given = Layers(
         {PartKey("location", name="site"): features([("fence", fence, {"kind": "fence"})], "local")}, Datum(52.0, 5.0)
@@ -291,14 +291,14 @@ def test_inside_a_fence() -> None:
         ({"feature": 10_000, "octaves": 1, "persistence": 0, "width": 2, "depth": 2, "relief": -1}, "at least 0.01"),
     ],
 )
-def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+def test_invalid_terrain_parameters_raise(values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make("terrain", **values)
     assert time.process_time() - started < 5.0
 
 
-def test_over_http(api: Api) -> None:
+def test_terrain_is_generated_over_http(api: Api) -> None:
     looks.make("terrain", **SMALL)  # so that native code is there, which takes a minute on a busy machine
     version = looks.over_http(api, "terrain", ("occupancy_grid", "gazebo", "tmap2"), **SMALL)
     assert version["information"]["occupancy"] == "generated"
@@ -307,7 +307,7 @@ def test_over_http(api: Api) -> None:
     assert "octaves" in problem["detail"]
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_terrain_is_generated_on_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "world.zip"
     options = [word for key, value in SMALL.items() for word in ("-O", f"{key}={value}")]
     status = run(["generate", "terrain", "--seed", "7", "--to", "gazebo", "-o", str(out), *options])

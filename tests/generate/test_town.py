@@ -27,7 +27,7 @@ def grown(rules: str, area: Any = SQUARE, seed: int = 7, **constants: float) -> 
     return _blocks.grow(_blocks.parse(rules, constants), area, RandomSource(seed, "town").stream("rules"))
 
 
-def test_a_town_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
+def test_town_is_consistent_in_every_format(tmp_path: Path) -> None:
     layers, _ = looks.make("town", width=110, depth=80, block=2500, resolution=0.2)
     looks.agrees_with_itself(layers, 0.3)
     looks.sound_sdf(layers, tmp_path)
@@ -35,7 +35,7 @@ def test_a_town_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Pat
     assert looks.digest(layers) == DIGEST
 
 
-def test_rules_worked_out_by_hand() -> None:
+def test_rules_give_hand_computed_shapes() -> None:
     """100 × 60 m with a ring of 10 m: 80 × 40 m in it, cut in the middle by a street of 6 m: two blocks of 37 × 40."""
     town = grown(
         """
@@ -60,7 +60,7 @@ def test_rules_worked_out_by_hand() -> None:
     ]
 
 
-def test_frontage_is_the_edge_on_a_street() -> None:
+def test_frontage_is_edge_on_street() -> None:
     """Three lots in a row of 60 × 20 m: the middle one has 2 × 20 m of street, the others 20 + 2 × 20 m."""
     row = shapely.box(0, 0, 60, 20)
     rules = "a -> cut(0.3333333333, 0) end b; b -> cut(0.5, 0) mid end; mid : frontage > 39 & frontage < 41 -> flat(1)"
@@ -68,7 +68,7 @@ def test_frontage_is_the_edge_on_a_street() -> None:
     assert Counter(lot.use for lot in town.lots) == {"flat": 1, "gable": 2}
 
 
-def test_chance_by_weights_and_seed() -> None:
+def test_random_rules_follow_weights_and_seed() -> None:
     rules = "a : area > 4 -> cut(0.5, 0) a a; a : area <= 4 @ 3 -> flat(1); a : area <= 4 @ 1 -> park; x -> a"
     town = grown(rules, shapely.box(0, 0, 40, 40))
     uses = Counter(lot.use for lot in town.lots)
@@ -93,7 +93,7 @@ def test_chance_by_weights_and_seed() -> None:
         ("town -> park\n" * 201, "1 to 200"),
     ],
 )
-def test_rules_that_cannot_be_read(rules: str, why: str) -> None:
+def test_invalid_town_rules_raise(rules: str, why: str) -> None:
     with pytest.raises(Invalid, match=why):
         _blocks.parse(rules, {})
 
@@ -113,19 +113,19 @@ def test_rules_that_cannot_be_read(rules: str, why: str) -> None:
         ("a @ 0 -> park; a @ 0 -> garden", "weights"),
     ],
 )
-def test_rules_that_lead_nowhere(rules: str, why: str) -> None:
+def test_rules_without_result_raise(rules: str, why: str) -> None:
     with pytest.raises(CannotGenerate, match=why):
         grown(rules)
 
 
-def test_a_grammar_that_explodes_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exploding_grammar_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _blocks.MAX_SHAPES == 30_000
     monkeypatch.setattr(_blocks, "MAX_SHAPES", 500)
     with pytest.raises(CannotGenerate, match="the rules create more than 500 shapes"):
         grown("a -> cut(0.5, 0) a a", shapely.box(0, 0, 3000, 3000))
 
 
-def test_streets_that_cross_and_end_make_lanes_to_the_right() -> None:
+def test_crossing_streets_have_lanes_on_the_right() -> None:
     """A cross of two streets of 12 m: four links, four lanes in, four out, and no lane turns round at the middle."""
     lines = [shapely.LineString([(0, 50), (100, 50)]), shapely.LineString([(50, 0), (50, 100)])]
     streets = _streets.build_streets([_blocks.Street(line, 12.0) for line in lines], 2.0)
@@ -140,7 +140,7 @@ def test_streets_that_cross_and_end_make_lanes_to_the_right() -> None:
     assert at.tolist() == [[3, 48], [41.5, 48]], "on the right, 4 + 2 + 0.5 + 2 m before the junction"
 
 
-def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
+def test_town_has_lanes_sidewalks_and_crossings() -> None:
     layers, notes = looks.make("town", width=160, depth=120, trees=False, resolution=0.2)
     network = layers.vector("topology")[PartKey("topology", GROUND, "network")]
     edges = [p for p in network.properties if p["kind"] == "edge"]
@@ -167,7 +167,7 @@ def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
     assert b'k="roof:shape"' in write_layers(layers, "osm", {}, looks.CAME).files["map.osm"]
 
 
-def test_the_boundary_is_given_or_the_fence() -> None:
+def test_boundary_is_parameter_or_fence() -> None:
     ring = shapely.Polygon([(0, 0), (120, 20), (100, 110), (10, 90)])
     boundary = ",".join(f"{v:g}" for point in ring.exterior.coords[:-1] for v in point)
     layers, _ = looks.make("town", boundary=boundary, resolution=0.2)
@@ -203,12 +203,12 @@ def test_the_boundary_is_given_or_the_fence() -> None:
         ({"main": 100, "width": 60, "depth": 60}, "no room for a ring of 100 m"),
     ],
 )
-def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+def test_invalid_town_parameters_raise(values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make("town", **values)
 
 
-def test_rules_of_ones_own_may_leave_streets_open() -> None:
+def test_custom_rules_may_leave_streets_open() -> None:
     rules = "town -> cut(0.5, street) half half; half -> cut(0.5, street) use use; use -> inset(setback) house"
     rules += "; house -> hip(2)"
     layers, _ = looks.make("town", width=80, depth=60, rules=rules, resolution=0.1)
@@ -219,7 +219,7 @@ def test_rules_of_ones_own_may_leave_streets_open() -> None:
     assert np.isfinite(shapely.bounds(objects.geometry)).all()
 
 
-def test_over_http(api: Api) -> None:
+def test_town_is_generated_over_http(api: Api) -> None:
     format_names = ("osm", "gazebo", "tmap2", "geojson", "occupancy_grid")
     version = looks.over_http(api, "town", format_names, width=70, depth=60, trees=False, resolution=0.2)
     assert version["information"]["objects"] == "generated"

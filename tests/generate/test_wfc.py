@@ -68,7 +68,7 @@ def rooms() -> U8:
     return out
 
 
-def test_a_board_of_two_colours_has_two_patterns() -> None:
+def test_board_of_two_colours_has_two_patterns() -> None:
     model = _wfc.learn(board(), tile=1, pattern=2, symmetry="all", wrap=True)
     assert model.patterns.tolist() == [[[0, 1], [1, 0]], [[1, 0], [0, 1]]]
     assert model.weights[0] == model.weights[1]
@@ -78,7 +78,7 @@ def test_a_board_of_two_colours_has_two_patterns() -> None:
         assert windows(out, 2) == windows(board(), 2)
 
 
-def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
+def test_adjacent_tiles_occur_in_sample() -> None:
     sample = SAMPLES["warehouse"].cells(0.05)
     model = _wfc.learn(sample, tile=4, pattern=1, symmetry="none")
     tiles = _wfc.collapse_model(model, (30, 40), np.full((30, 40), -1), DRAW)
@@ -98,7 +98,7 @@ def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
 
 @pytest.mark.parametrize("scan", [True, False])
 @pytest.mark.parametrize("symmetry", ["none", "mirror", "rotate", "all"])
-def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
+def test_every_window_occurs_in_sample(scan: bool, symmetry: Any) -> None:
     sample = SAMPLES["office"].cells(0.1)
     sample[5:9, 40] = OCCUPIED
     sample_windows = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.symmetries(sample, symmetry)))
@@ -108,7 +108,7 @@ def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
     assert windows(np.pad(wide, ((0, 2), (0, 2)), mode="wrap"), 3) <= sample_windows
 
 
-def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
+def test_ten_metre_site_keeps_sample_shares_and_time_limit() -> None:
     sample = SAMPLES["warehouse"].cells(0.05)
     looks.make(NAME, width=3, depth=3)  # compiled, or loaded
     expected, sample_windows = pairs(sample), windows(sample, 5)
@@ -121,13 +121,13 @@ def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
         assert windows(out, 5) <= sample_windows
 
 
-def test_pillars_stand_within_walls() -> None:
+def test_pillars_are_within_walls() -> None:
     layers, _ = looks.make(NAME, sample="pillars", width=6, depth=6)
     kinds = {i.split("/")[0] for part in layers.vector("objects").values() for i in part.ids}
     assert kinds == {"pillar", "wall"}
 
 
-def test_what_is_fixed_stays() -> None:
+def test_fixed_cells_stay() -> None:
     sample = SAMPLES["pillars"].cells(0.1)
     fixed = np.full((50, 50), -1)
     fixed[10, 10:14] = 1
@@ -141,7 +141,7 @@ def test_what_is_fixed_stays() -> None:
         collapse(sample, 50, 3, fixed=fixed)
 
 
-def test_free_space_is_joined_where_that_is_asked() -> None:
+def test_free_space_is_joined_when_requested() -> None:
     def free_pieces(out: U8) -> int:
         return int(cv2.connectedComponents((out == FREE).astype(np.uint8), connectivity=4)[0]) - 1
 
@@ -156,7 +156,7 @@ def test_free_space_is_joined_where_that_is_asked() -> None:
     assert max(counts) > 1
 
 
-def test_a_sample_that_contradicts_itself_is_told() -> None:
+def test_contradictory_sample_raises_cannot_generate() -> None:
     collapse(board(), 4, 2)  # compiled, or loaded
     started = time.process_time()
     with pytest.raises(CannotGenerate, match="contradict the sample"):
@@ -167,7 +167,7 @@ def test_a_sample_that_contradicts_itself_is_told() -> None:
     assert time.process_time() - started < 5.0
 
 
-def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
+def test_wfc_of_same_seed_gives_same_cells() -> None:
     out = collapse(SAMPLES["warehouse"].cells(0.1), 60, 4, RandomSource(7, "hash").stream, joined=True)
     free = collapse(rooms(), 40, 3, RandomSource(7, "hash").stream, scan=False)
     assert hashlib.sha256(out.tobytes() + free.tobytes()).hexdigest()[:16] == CELLS
@@ -192,14 +192,14 @@ def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
         ({"pattern": 9}, "at most 8"),
     ],
 )
-def test_what_cannot_be_made_is_told_before_work(values: dict[str, Any], why: str) -> None:
+def test_invalid_wfc_parameters_raise_before_work(values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make(NAME, **values)
     assert time.process_time() - started < 3.0
 
 
-def test_a_whole_site(tmp_path: Path) -> None:
+def test_wfc_site_is_consistent(tmp_path: Path) -> None:
     site, notes = looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))
     looks.agrees_with_itself(site, 0.3)
     grid = site.grids()[GRID]
@@ -220,12 +220,12 @@ def test_a_whole_site(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("border", ["open", "periodic"])
-def test_other_borders_and_tiles(border: str) -> None:
+def test_wfc_supports_other_borders_and_tiles(border: str) -> None:
     site, _ = looks.make(NAME, border=border, width=6, depth=6, model="tiled", order="entropy", symmetry="mirror")
     looks.agrees_with_itself(site, 0.3)
 
 
-def test_a_grid_of_the_environment_as_sample_inside_its_fence() -> None:
+def test_environment_grid_serves_as_sample_inside_its_fence() -> None:
     first, _ = looks.make(NAME, width=6, depth=6)
     plan = {GRID: first.grids()[GRID], **{k: p for k, p in first.parts.items() if k.layer == "location"}}
     site, _ = looks.make(NAME, given=Layers(plan, first.datum), sample="map", pattern=3, symmetry="all")
@@ -253,7 +253,7 @@ def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, DerivationNo
 
 
 @pytest.mark.parametrize("order", ["rows", "entropy"])
-def test_an_unknown_part_is_made_of_what_is_known(order: str) -> None:
+def test_unknown_part_is_completed_from_known_part(order: str) -> None:
     complete, cells = holed()
     out, notes = completed(cells, reach=0, confidence=0, order=order, symmetry="none")
     assert (out == cells)[cells != UNKNOWN].all()
@@ -267,7 +267,7 @@ def test_an_unknown_part_is_made_of_what_is_known(order: str) -> None:
     assert not filled[46:64, 56:84].any(), "what is farther than the reach stays unknown"
 
 
-def test_completing_is_the_same_everywhere() -> None:
+def test_completion_is_repeatable() -> None:
     cells = np.full((20, 20), UNKNOWN, np.uint8)
     cells[:8] = board()[0, 0]
     cells[3:5, 4:16] = OCCUPIED
@@ -276,7 +276,7 @@ def test_completing_is_the_same_everywhere() -> None:
     assert out.tobytes() == completed(cells, reach=0.3, confidence=0)[0].tobytes()
 
 
-def test_known_cells_that_fit_no_pattern_are_gone_around(shared: Path) -> None:
+def test_known_cells_without_pattern_are_skipped(shared: Path) -> None:
     with Image.open(shared / "data" / "occupancy_grid" / "nav2_tb3_sandbox" / "tb3_sandbox.pgm") as picture:
         grey = np.asarray(picture.convert("L"))[::-1]
     cells = np.where(grey < 90, OCCUPIED, np.where(grey > 220, FREE, UNKNOWN)).astype(np.uint8)
@@ -297,17 +297,17 @@ def test_known_cells_that_fit_no_pattern_are_gone_around(shared: Path) -> None:
         (np.zeros((9, 9), np.uint8), {"pattern": 4}, "at most 3"),
     ],
 )
-def test_what_cannot_be_completed_is_told(cells: U8, values: dict[str, Any], why: str) -> None:
+def test_invalid_completions_raise(cells: U8, values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         completed(cells, **values)
 
 
-def test_without_a_grid_there_is_nothing_to_complete() -> None:
+def test_completion_without_grid_raises_missing_layer() -> None:
     with pytest.raises(MissingLayer, match="complete_grid works on occupancy"):
         generate.run("complete_grid", 7, {}, Layers(), DerivationNotes())
 
 
-def test_over_http(api: Api) -> None:
+def test_wfc_site_is_generated_over_http(api: Api) -> None:
     version = looks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
     assert version["information"] | {"occupancy": "generated", "topology": "generated"} == version["information"]
     env = f"environments/made-{NAME}/generations"
@@ -317,7 +317,7 @@ def test_over_http(api: Api) -> None:
     assert "no unknown cell" in problem["detail"]
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wfc_site_is_generated_on_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "map.zip"
     status = run(
         ["generate", NAME, "--seed", "7", "--to", "occupancy_grid", "-o", str(out), "-O", "width=4", "-O", "depth=4"]
