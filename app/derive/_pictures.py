@@ -128,7 +128,7 @@ def infrared_band(picture: GeoImage, number: int | None, name: str) -> int | Non
     count = picture.pixels.shape[2]
     if number is not None:
         if number > count:
-            raise CannotConvert(f"{name} has {count} bands, not {number}: correct near_infrared")
+            raise CannotConvert(f"{name} has {count} bands, no band {number}: correct near_infrared")
         if picture.colours[number - 1] in CLEAR:
             raise CannotConvert(f"band {number} of {name} is its {picture.colours[number - 1]}: correct near_infrared")
         return number - 1

@@ -160,7 +160,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
         band = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
         unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
         if unreadable:
-            raise unreadable_error(unreadable, f"no readable obstacle {band}{extra}")
+            raise unreadable_error(unreadable, f"no readable object is an obstacle {band}{extra}")
         extra += "".join(
             f"; {one.count} {one.subject}: {one.why}" for one in notes.dropped if one.why != NOT_AN_OBSTACLE
         )

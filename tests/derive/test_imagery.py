@@ -1,4 +1,4 @@
-"""Pictures as objects and as grids: what is in a picture that we drew, and in the plans of real buildings."""
+"""Objects and grids from images: drawn images with known content, and plans of real buildings."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_vegetation_by_index() -> None:
 
 
 def test_near_infrared_band_gives_ndvi() -> None:
-    """Painted turf is green and does not grow: only near infrared tells."""
+    """Painted turf is green but no vegetation: only near infrared shows that."""
     rgb = farm()
     nir = np.where(rgb[..., 1] > rgb[..., 0] + 15, 220, 60).astype(np.uint8)
     nir[:, 300:] = 60
@@ -259,7 +259,7 @@ def test_rotated_plan_follows_its_transform() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "options", "says"),
+    ("pixels", "options", "expected"),
     [
         (np.full((50, 50, 3), (120, 130, 140), np.uint8), {}, "a single colour"),
         (np.full((50, 50, 1), 250, np.uint8), {"segmentation": "plan"}, "a single shade"),
@@ -274,10 +274,10 @@ def test_rotated_plan_follows_its_transform() -> None:
         (np.full((1, 1, 3), 7, np.uint8), {}, "a single colour"),
     ],
 )
-def test_empty_image_raises_cannot_convert(pixels: Any, options: dict[str, Any], says: str) -> None:
+def test_empty_image_raises_cannot_convert(pixels: Any, options: dict[str, Any], expected: str) -> None:
     content = layers(local(pixels))
     for make in (grid, objects):
-        with pytest.raises(CannotConvert, match=says):
+        with pytest.raises(CannotConvert, match=expected):
             make(content, **options)
 
 
@@ -303,7 +303,7 @@ def test_image_selection_and_parameters_of_another_method() -> None:
 
 
 def test_planner_prefers_other_layers_to_images() -> None:
-    """Whatever else is stored goes before a picture; a picture before a blank grid."""
+    """Other stored layers are preferred to an image; an image is preferred to an empty grid."""
     for better in ("objects", "voxels"):
         plan = derive.plan(frozenset({"imagery", better}), frozenset({"occupancy"}))
         assert plan is not None
@@ -340,7 +340,7 @@ def test_building_drawing_gives_image() -> None:
 
 
 def test_unreadable_drawings_are_warned_of() -> None:
-    for files, says in (
+    for files, expected in (
         ({}, "was not uploaded"),
         ({"plan.png": b"GIF89a"}, "cannot be read"),
         ({"plan.png": png(plan())[:200]}, "cannot be read"),
@@ -349,7 +349,7 @@ def test_unreadable_drawings_are_warned_of() -> None:
         notes = DerivationNotes()
         with pytest.raises(MissingLayer, match="floor plan"):
             resources_to_imagery(building(files), Drawings(), notes)
-        assert says in notes.warnings[0].problem
+        assert expected in notes.warnings[0].problem
 
 
 def covered(walls: list[Any], g: OccupancyGrid, reach: float = 0.2) -> float:
@@ -369,7 +369,7 @@ def covered(walls: list[Any], g: OccupancyGrid, reach: float = 0.2) -> float:
 def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> None:
     """Walls as people drew them over the plan: at least nine tenths of their length are ink within 20 cm."""
     if not (DATA / "openrmf_building" / folder).is_dir():
-        pytest.skip("the real maps are not here")
+        pytest.skip("the real maps are missing")
     content = real(folder)
     derived_layers = resources_to_imagery(content, Drawings(), DerivationNotes())
     assert len(derived_layers.parts) == levels
@@ -383,7 +383,7 @@ def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> N
         if folder in ("hotel", "office"):
             free = np.argwhere(g.cells == FREE)[::97, ::-1] * g.resolution + g.origin[:2] + g.resolution / 2
             within = shapely.contains_xy(floors.buffer(0.5), free[:, 0], free[:, 1]).mean()
-            # What the office's lines of measure enclose counts as inside, too.
+            # ground enclosed by the office's dimension lines counts as inside, too
             assert within >= (0.95 if folder == "hotel" else 0.8)
 
 
@@ -397,7 +397,7 @@ def test_plan_of_robot_map_agrees_with_the_map() -> None:
     """robast_sim: the plan is an older picture of the same storey as the ROS map, here compared cell by cell."""
     folder = DATA / "openrmf_building" / "robast_sim"
     if not folder.is_dir():
-        pytest.skip("the real maps are not here")
+        pytest.skip("the real maps are missing")
     files = {p.name: p.read_bytes() for p in (folder / "ros_map").iterdir()}
     map_layers = upload_reader.read(files, UploadHints(format="occupancy_grid"), EnvironmentContext(), Limits()).layers(
         None
@@ -429,10 +429,10 @@ def test_plan_of_robot_map_agrees_with_the_map() -> None:
 
 
 def test_strawberry_farm_image_gives_objects() -> None:
-    """Its large white hall is a building; a picture is placed by the corners that its upload tells."""
+    """The large white hall is a building; the image is placed by the corners given with its upload."""
     file = DATA / "environment_template/riseholme_park_farm_strawberry_polytunnels/config/location/satellite-auto.png"
     if not file.is_file():
-        pytest.skip("the real maps are not here")
+        pytest.skip("the real maps are missing")
     hints = UploadHints(
         format="satellite", options={"corners": "53.2694,-0.5262,53.2682,-0.5224", "picture": "satellite"}
     )

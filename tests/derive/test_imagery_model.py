@@ -1,4 +1,4 @@
-"""Models of the YOLO family: tiny ONNX models made here, whose answers are known."""
+"""Models of the YOLO family: tiny ONNX models with known outputs."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def put(folder: Path, data: bytes, classes: Any = ("building", "tree", None)) ->
 
 
 def content(width: int = SIDE, height: int = SIDE, red: Any = None) -> Layers:
-    """A picture of 1 m pixels, all red unless told where."""
+    """Return an image with pixels of 1 m, red in the window ``red``, by default everywhere."""
     pixels = np.zeros((height, width, 3), np.uint8)
     pixels[..., 0] = 255 if red is None else 0
     if red is not None:
@@ -163,7 +163,7 @@ def test_class_names_are_read_from_model_metadata(folder: Path) -> None:
     put(folder, model(ROWS, names="{0: 'building', 1: 'tree', 2: 'car'}"), None)
     assert set(detect(content())) == {"building", "tree"}
     put(folder, model(ROWS), None)
-    with pytest.raises(CannotConvert, match=r"put tiny\.json beside it"):
+    with pytest.raises(CannotConvert, match=r"add tiny\.json beside it"):
         detect(content())
 
 
@@ -173,7 +173,7 @@ def test_yolo_model_is_repeatable(folder: Path) -> None:
 
 
 def test_unusable_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(NotFound, match="there are: none"):
+    with pytest.raises(NotFound, match="available: none"):
         detect(content())
     put(folder, model(ROWS), ("building", "tree", None, None, None))
     with pytest.raises(CannotConvert, match="does not have 5 classes"):

@@ -1,4 +1,4 @@
-"""Models of the Segment-Anything family, and such as tell pixels: tiny ONNX models whose answers are known."""
+"""Models of the Segment-Anything family and pixel classification models: tiny ONNX models with known outputs."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def alike(a: Any, b: Any) -> float:
 
 
 def check(things: dict[str, list[tuple[Any, dict[str, Any]]]], height: int = 64) -> None:
-    """What the yard holds, each thing once."""
+    """Objects of the yard, each once."""
     assert {kind: len(of) for kind, of in things.items()} == {"building": 1, "tree": 1, "field": 1, "area": 1}
     assert alike(things["building"][0][0], box(BUILDING, height)) > 0.85
     crown = shapely.Point((TREE[0] + 0.5) / 2, (height - TREE[1] - 0.5) / 2).buffer(TREE[2] / 2)
@@ -130,7 +130,7 @@ def test_cells_of_unclassified_masks_stay_unknown(folder: Path) -> None:
 
 
 def test_large_images_are_processed_in_tiles_and_as_a_whole(folder: Path) -> None:
-    """Wide: a whole picture made half as large, and tiles from 0, 128 and 160 on; none cuts what it has from there."""
+    """Wide image: as a whole at half size, and tiles from 0, 128 and 160 on; none cuts objects that begin there."""
     put(folder, tiny_sam.encoder(160), tiny_sam.decoder(160))
     image = np.full((64, 320, 3), GRASS, np.uint8)
     houses = [(64, 8, 80, 24), (152, 8, 168, 24)]  # the second is cut by the first tile
@@ -149,7 +149,7 @@ def test_large_images_are_processed_in_tiles_and_as_a_whole(folder: Path) -> Non
 
 def test_masks_below_thresholds_are_dropped(folder: Path) -> None:
     put(folder, decoder=tiny_sam.decoder(SIDE, iou=0.6))
-    with pytest.raises(CannotConvert, match=r"confidence of 0\.88 and a stability of 0\.95"):
+    with pytest.raises(CannotConvert, match=r"confidence of at least 0\.88 and a stability of at least 0\.95"):
         detect(content(yard()))
     assert detect(content(yard()), confidence=0.55)["tree"][0][1]["confidence"] <= 0.6
     put(folder, decoder=tiny_sam.decoder(SIDE, steep=0.5))  # its logits are all near the threshold
@@ -179,10 +179,12 @@ def test_sam_model_is_repeatable(folder: Path) -> None:
 def test_wrong_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = r"image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size"
     put(folder, decoder=tiny_sam.encoder(SIDE))
-    with pytest.raises(CannotConvert, match=expected + r".*sam\.decoder\.onnx\) is \(x \[batch, 3, 128, 128\]\)"):
+    with pytest.raises(
+        CannotConvert, match=expected + r".*sam\.decoder\.onnx\) has the signature \(x \[batch, 3, 128, 128\]\)"
+    ):
         detect(content(yard()))
     put(folder, encoder=tiny_sam.decoder(SIDE))
-    with pytest.raises(CannotConvert, match=expected + r".*sam\.encoder\.onnx\) is"):
+    with pytest.raises(CannotConvert, match=expected + r".*sam\.encoder\.onnx\) has the signature"):
         detect(content(yard()))
     put(folder, decoder=tiny_sam.decoder(SIDE, second=True))
     with pytest.raises(CannotConvert, match="high_res_feats"):
@@ -194,7 +196,7 @@ def test_wrong_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(CannotConvert, match=r"cannot be loaded: sam\.encoder\.onnx"):
         detect(content(yard()))
     put(folder, encoder=tiny_sam.encoder(64))  # an embedding that the decoder does not take
-    with pytest.raises(CannotConvert, match=r"the model sam \(sam\.decoder\.onnx\) fails"):
+    with pytest.raises(CannotConvert, match=r"the model sam \(sam\.decoder\.onnx\) failed"):
         detect(content(yard()))
     put(folder)
     monkeypatch.setenv(_onnx.LARGEST, "1000")
@@ -212,12 +214,12 @@ def test_wrong_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch
 def test_model_file_names_are_paired(folder: Path) -> None:
     for name in ("vit_b_encoder", "vit_b_decoder", "m.Encoder", "m.decoder", "yolo", "lone.decoder"):
         (folder / f"{name}.onnx").write_bytes(b"?")
-    with pytest.raises(NotFound, match=r"there are: lone\.decoder, m, vit_b, yolo$"):
+    with pytest.raises(NotFound, match=r"available: lone\.decoder, m, vit_b, yolo$"):
         _onnx.find_model("x")
     assert [f.name for f in _onnx.find_model("vit_b").files] == ["vit_b_encoder.onnx", "vit_b_decoder.onnx"]
 
 
-# --- models that tell pixels ------------------------------------------------------------------------------------------
+# --- pixel classification models ---------------------------------------------------------------------------------
 def pixels(side: int | None = 64, count: int = 3, coarse: int = 2) -> bytes:
     """[1, 3, side, side] -> logits [1, 3, side / coarse, …]: 8 times each normalised colour (of ``count`` of them)."""
     make, dtype = onnx.helper, onnx.TensorProto.FLOAT
@@ -320,4 +322,4 @@ def test_sam_model_works_through_server(folder: Path, tmp_path: Path) -> None:
         wrong = api.problem(
             "POST", path, 422, json={"method": "imagery_to_objects", "parameters": {**parameters, "points": 9}}
         )
-        assert "expected are an encoder" in wrong["detail"]
+        assert "expected an encoder" in wrong["detail"]

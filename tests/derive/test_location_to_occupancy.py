@@ -1,4 +1,4 @@
-"""A fence as a blank grid."""
+"""Empty grid of a fence."""
 
 from __future__ import annotations
 

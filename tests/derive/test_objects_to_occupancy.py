@@ -1,4 +1,4 @@
-"""Objects as a grid: what stands in the way at a height, what is free, and what it says when there is nothing."""
+"""Grids from objects: obstacles at a height, free ground, and errors if there is nothing."""
 
 from __future__ import annotations
 
@@ -324,12 +324,12 @@ def test_town_gets_coarser_cells_up_to_a_limit() -> None:
     ],
 )
 def test_site_without_obstacles_raises_missing_layer(rows: list[Any]) -> None:
-    with pytest.raises(MissingLayer, match="no stored object is an obstacle"):
+    with pytest.raises(MissingLayer, match="object is an obstacle"):
         grid(layers(objects(*rows)))
 
 
 def test_unenclosed_ground_is_unknown() -> None:
-    """Without floor and fence only what walls close off from the border is free."""
+    """Without floor and fence only ground that walls separate from the border is free."""
     ring = [[[-3, -3], [3, -3], [3, 3], [-3, 3]], [[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]]
     room = (None, {"kind": "model", "shapes": [{"type": "polyline", "points": ring, "height": 2}]})
     notes = DerivationNotes()
@@ -339,9 +339,7 @@ def test_unenclosed_ground_is_unknown() -> None:
     assert not notes.warnings
     alone = grid(layers(objects((None, {"kind": "model", "shapes": [BOX]}))), notes, outside_free=False)
     assert not alone.counts()["free"]
-    assert (
-        "no cell of the level ground is free: nothing encloses any ground; upload a fence" in notes.warnings[0].problem
-    )
+    assert "no cell of level ground is free: nothing encloses any ground; upload a fence" in notes.warnings[0].problem
     fenced = layers(objects((None, {"kind": "model", "shapes": [BOX]})), fence=shapely.box(-5, -5, 5, 5))
     assert at(grid(fenced, outside_free=False), 3, 3) == 0
     floor = (shapely.box(-5, -5, 5, 5), {"kind": "floor"})
@@ -373,7 +371,7 @@ def test_ground_around_unreadable_solid_is_unknown(lost: dict[str, Any]) -> None
     notes = DerivationNotes()
     g = grid(layers(objects(*rows), fence=fence, files=files), notes)
     assert (at(g, 10, 0), at(g, 13, 0), at(g, 13, 4.9), at(g, 13, 5.2)) == (100, 255, 255, 0)
-    assert (at(g, 30, 9.8), at(g, 30, 10.2)) == (255, 0), "what an object says of its size counts"
+    assert (at(g, 30, 9.8), at(g, 30, 10.2)) == (255, 0), "an object's own size counts"
     (warning,) = notes.warnings
     assert "2 objects have a solid that cannot be read (shed, barn): " in warning.problem
     assert str(lost.get("file") or lost.get("uri")) in warning.problem
@@ -401,7 +399,7 @@ def test_unreadable_solids_without_known_ground_raise_missing_layer() -> None:
 
 
 def test_voxels_of_objects_give_no_grid() -> None:
-    """The way round by voxels would give what the slice refuses: nothing but obstacles."""
+    """A chain through voxels must not give what the slice refuses: only obstacles."""
     plan = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}), frozenset({"objects_to_occupancy"}))
     assert plan is None or "objects_to_voxels" not in [step.name for step in plan.steps]
 
@@ -470,9 +468,9 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
     g = grid(content, notes, surroundings=2.0)
     for x in (0, 5, -5):
         assert (at(g, x, 0), at(g, x + 0.65, 0), at(g, x + 0.8, 0)) == (255, 255, 0)
-    assert (at(g, 3.5, -5), at(g, 3.7, -5)) == (255, 0), "half the diagonal of what it says of its size"
+    assert (at(g, 3.5, -5), at(g, 3.7, -5)) == (255, 0), "half the diagonal of its stated size"
     assert (at(g, 11.9, -5), at(g, 12.1, -5), at(g, -5, -5), at(g, -5, -5.8)) == (255, 0, 255, 0)
-    assert (at(g, -10, -5), at(g, -9.4, -5), at(g, -9.4, 0)) == (100, 255, 0), "of a point only the middle is known"
+    assert (at(g, -10, -5), at(g, -9.4, -5), at(g, -9.4, 0)) == (100, 255, 0), "only the centre of a point is known"
     assert at(grid(content, unknown_radius=2.0), 1.9, 0) == 255
     assert at(grid(content, inflate=0.2), 0, 0) == 255
     (files, poses, points) = [w for w in notes.warnings if "an unknown extent" in w.problem]
@@ -483,7 +481,7 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
 
 
 def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
-    """Also where they are all that there is, on a floor and on the blank grid of a fence."""
+    """Even if they are the only objects, on a floor and on the empty grid of a fence."""
     chair = (shapely.Point(0, 0), {"kind": "model"})
     notes = DerivationNotes()
     g = grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes)
@@ -595,13 +593,13 @@ PLACES = st.sampled_from(
 @given(st.lists(st.tuples(PLACES, SAID), min_size=1, max_size=3))
 @settings(max_examples=300, deadline=None)
 def test_random_objects_give_grid_or_error(rows: list[Any]) -> None:
-    """What is wrong with one object is told, and the others are there all the same."""
+    """Problems of one object are reported, and the others are drawn."""
     content = layers(objects(*rows, (shapely.box(0, 0, 1, 1), {"kind": "building"})), files={"a.stl": stl()})
     try:
         derived_grid = grid(content, resolution=0.5, doors="closed")
     except CannotConvert as error:
         expected = ("resolution of at least", "no free ground of level ground is known, because solids")
-        assert any(text in error.detail for text in expected), "what lies far away makes it large"
+        assert any(text in error.detail for text in expected), "distant objects make it large"
     else:
         assert at(derived_grid, 0.5, 0.5) == 100
     try:
@@ -728,4 +726,4 @@ def test_lifts_without_door_positions_have_no_walls(door: Any) -> None:
     good = {"x": 1.0, "y": 0.0, "motion_axis_orientation": 1.57, "width": 1.0}
     lift["openrmf"] = {"says": {"doors": {"d": good}}}
     assert obstacles.object_body(lift, shapely.Point(4, 4)) is not None
-    assert obstacles.object_body(lift, shapely.Point()) is None, "nothing says where it is"
+    assert obstacles.object_body(lift, shapely.Point()) is None, "it has no position"

@@ -1,4 +1,4 @@
-"""The derivation: which lines count, on which level, and what it says when there are none."""
+"""Derivation of networks from objects: which lines count, on which level, and the error without any."""
 
 from __future__ import annotations
 

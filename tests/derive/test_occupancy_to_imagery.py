@@ -1,4 +1,4 @@
-"""Occupancy -> imagery: where things lie on the plan, which colours they have, and what it says of itself."""
+"""Occupancy -> imagery: positions and colours on the plan, and its warnings."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_each_cell_becomes_a_pixel_at_its_position(yaw: float) -> None:
     assert picture.pixels.shape == (20, 40, 4)
     assert (picture.pixels[::-1][cells == FREE] == (*plan.PAPER, 255)).all()
     assert (picture.pixels[::-1][cells == OCCUPIED] == (*plan.INK, 255)).all()
-    assert (picture.pixels[::-1][cells == UNKNOWN][:, 3] == 0).all(), "what nobody knows is transparent"
+    assert (picture.pixels[::-1][cells == UNKNOWN][:, 3] == 0).all(), "unknown cells are transparent"
     # The middle of the cell in column 5, row 2 by the grid's own rule, and of its pixel by the picture's.
     u, v, c, s = 0.55, 0.25, math.cos(yaw), math.sin(yaw)
     (xy,) = pixel_positions(picture.transform, np.array([5.5]), np.array([20 - 2.5]))
@@ -129,7 +129,7 @@ def test_drawn_plan_is_no_source_of_other_layers() -> None:
 
 
 def test_stored_plan_is_no_source_of_other_layers() -> None:
-    """Neither what was drawn from a grid nor a blank grid is a source of other layers; an edited one is."""
+    """Neither a plan drawn from a grid nor an empty grid is a source of other layers; an edited one is."""
     now = datetime.fromtimestamp(0, UTC)
 
     def version(information: Any, edited: bool = False) -> Version:

@@ -1,4 +1,4 @@
-"""Grids become objects: known discs, walls and boxes are found where they are, all of them, and nothing else is."""
+"""Grids become objects: known discs, walls and boxes are found at their positions, and nothing else."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_grid_origin_and_yaw_move_all_objects(origin: tuple[float, float, float]
 
 
 def test_solids_match_outlines() -> None:
-    """A cylinder or box by its pose covers what the footprint covers, and is as high."""
+    """A cylinder or box at its pose covers the footprint, and has its height."""
     f = find_objects(scene(), height=2.0)
     reader = solids.Solids({})
     for item in f:
@@ -350,7 +350,7 @@ def load(folder: Path) -> Layers:
 
 
 def test_turtlebot3_world_gives_nine_pillars(shared: Path) -> None:
-    """The map that a robot made: its round pieces are the world's cylinders, as the model file tells them."""
+    """Map recorded by a robot: its round pieces are the world's cylinders, as in the model file."""
     root = shared / "data/gazebo_sdf/turtlebot3_world"
     model = etree.parse(str(root / "models/turtlebot3_world/model.sdf"))
     pillars = []
@@ -389,7 +389,7 @@ def test_objects_of_real_maps_cover_occupied_cells(shared: Path, folder: str) ->
         return np.asarray((np.column_stack([columns, rows]) + 0.5) * one.resolution + one.origin[:2])
 
     a, b = occupied(g), occupied(again)
-    # What is not covered are specks.
+    # only specks are not covered
     assert (cKDTree(b).query(a)[0] <= 1.5 * g.resolution).mean() > 0.95
     assert (cKDTree(a).query(b)[0] <= 1.5 * g.resolution).mean() > 0.95
 
@@ -417,7 +417,7 @@ def test_grid_alone_gives_gazebo_world_of_its_cells() -> None:
     key = PartKey("occupancy")
     chain = recipe.plan_chain(gazebo, recipe.AvailableLayers(frozenset({key}), datum=False), gazebo.write_options())
     assert chain == recipe.DerivationChain((), (key,))
-    # Objects that were made of it stand for it, unless it is named.
+    # objects derived from it replace it, unless it is named
     both = [PartKey("objects", "ground", NAME), key]
     assert gazebo.selection.choose(both, gazebo.write_options()) == both[:1]
     assert gazebo.selection.choose(both, gazebo.write_options(grid=MAP)) == both

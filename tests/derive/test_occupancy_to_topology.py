@@ -100,7 +100,7 @@ def cells_at(g: OccupancyGrid, xy: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def distances(g: OccupancyGrid) -> NDArray[np.float64]:
-    """Metres from cell centre to the nearest obstacle's centre, what is beyond the grid being one; by scipy."""
+    """Metres from cell centre to the nearest obstacle's centre, with obstacles beyond the grid; by scipy."""
     free = np.pad(g.cells == FREE, 1)
     return np.asarray(ndimage.distance_transform_edt(free))[1:-1, 1:-1] * g.resolution
 
@@ -130,9 +130,9 @@ def check(g: OccupancyGrid, f: Features, radius: float) -> nx.DiGraph:
     for piece in pieces:
         at = cells_at(g, np.array([network.nodes[n]["at"] for n in piece]))
         inside = set(place[at[:, 0], at[:, 1]].tolist())
-        assert len(inside) == 1, "edges join what free space does not"
+        assert len(inside) == 1, "edges join unconnected free space"
         labels += inside
-    assert len(set(labels)) == len(labels), "free space joins what the network does not"
+    assert len(set(labels)) == len(labels), "connected free space has separate networks"
     sizes = np.bincount(place.ravel())[1:]
     assert int(np.argmax(sizes)) + 1 in labels
     return network
@@ -386,7 +386,7 @@ def test_grids_without_paths_raise_cannot_convert(method: str) -> None:
     assert "too few for a path" in bad(spot, method=method, robot_radius=0.0)
     assert "'map' of level 'ground'" in bad(spot, method=method, robot_radius=0.0)
     if method != "roadmap":
-        assert "give a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
+        assert "use a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
 
 
 def test_thresholds_in_between_are_not_free() -> None:
@@ -522,7 +522,7 @@ def test_strawberry_map_network_matches_hand_drawn_one(
 
 
 def seen_in_part(free_thresh: float) -> dict[str, bytes]:
-    """A map as map_saver writes it: a seen room (254), its walls (0), and what nobody has seen (205) on the right."""
+    """A map as written by map_saver: a seen room (254), its walls (0), and unseen cells (205) on the right."""
     pixels = np.full((60, 120), 205, np.uint8)
     pixels[5:55, 5:55] = 254
     pixels[[4, 55], 4:56] = 0
@@ -535,7 +535,7 @@ def seen_in_part(free_thresh: float) -> dict[str, bytes]:
 def test_grey_205_cells_have_no_edges_by_default() -> None:
     files = seen_in_part(0.25)
     ((key, grid),) = formats.read(formats.group(files)[0][0], ReadContext()).grids().items()
-    assert int((grid.cells == FREE).sum()) == 7200 - 154, "what Nav2 makes of the file stays"
+    assert int((grid.cells == FREE).sum()) == 7200 - 154, "the file is unchanged for Nav2"
     notes = DerivationNotes()
     derived_network = network(grid, Parameters(), notes, "the map")
     assert shapely.total_bounds(derived_network.geometry)[2] < 5.6

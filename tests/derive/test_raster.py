@@ -39,7 +39,7 @@ def shape(**members: Any) -> Any:
 
 
 def clipped(triangle: Any, low: float, high: float) -> Any:
-    """A triangle between two heights seen from above, by an independent way: half planes on a finely known polygon."""
+    """A triangle between two heights seen from above, computed independently: half planes on a fine polygon."""
     out = [tuple(p) for p in triangle]
     for sign, bound in ((1.0, low - 1e-9), (-1.0, -high - 1e-9)):
         corners = []
@@ -63,7 +63,7 @@ def test_surface_paints_touched_cells(seed: int, slice_: bool) -> None:
     high = low if slice_ else float(random.uniform(low, 2.2))
     mask = cells(raster.surfaces(triangles, FRAME, np.array([[low, high]])))[0]
     pieces = [clipped(t, low, high) for t in triangles]
-    # A micrometre against the normal moves the cut of a nearly level triangle by more: only what is grazed may differ.
+    # a micrometre along the normal moves the cut of a nearly level triangle by more: only grazed cells may differ
     near = np.logical_or.reduce([shapely.distance(boxes(), p) < 1e-3 for p in pieces])
     sure = np.logical_or.reduce([shapely.intersects(shapely.buffer(boxes(), -1e-3), p) for p in pieces])
     assert not (mask & ~near).any()

@@ -48,7 +48,7 @@ def same_topology(skeleton: Mask, mask: Mask) -> None:
 
 
 def one_cell_wide(skeleton: Mask) -> None:
-    """No cell but an end can go without changing pieces or holes: told cell by cell with the library."""
+    """No cell except ends can be deleted without changing pieces or holes: checked cell by cell with the library."""
     padded = np.pad(skeleton, 1)
     for y, x in np.argwhere(padded):
         assert needed(padded[y - 1 : y + 2, x - 1 : x + 2].tobytes()), (y, x)
@@ -62,7 +62,7 @@ def needed(window: bytes) -> bool:
         return True
     around[1, 1] = False
     cut = label(around, connectivity=2).max() > 1
-    # A cell whose four sides are all set encloses nothing when it stays and a hole when it goes.
+    # a cell whose four sides are all set encloses nothing when it stays, and a hole when it is deleted
     opened = label(~np.pad(around, 1), connectivity=1).max() > 1
     return bool(cut or opened)
 
@@ -227,7 +227,7 @@ def test_clear_lines_visit_every_touched_cell() -> None:
 
 
 def test_narrowest_cell_of_line_is_exact() -> None:
-    """Against all cells that the line touches, told by shapely, and scipy's distances."""
+    """Compared with all cells that the line touches, by shapely, and scipy's distances."""
     import shapely
 
     random = np.random.default_rng(6)

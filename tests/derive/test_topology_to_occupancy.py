@@ -60,7 +60,7 @@ def test_free_space_is_as_wide_as_edges() -> None:
     ]).area, rel=0.02)  # fmt: skip
     assert notes.template[0].why.startswith("1 edges state no width")
     assert at(grid(network, edge_width=3.0), 11.4, 6) == FREE
-    assert at(grid(network, edge_width=3.0), 5, 2.2) == UNKNOWN, "what an edge says is its own"
+    assert at(grid(network, edge_width=3.0), 5, 2.2) == UNKNOWN, "an edge keeps its own width"
 
 
 def test_edge_narrower_than_cell_has_no_gaps() -> None:

@@ -1,4 +1,4 @@
-"""Zones -> costmap filter masks: which cells, what they mean, and how a robot gets them over HTTP."""
+"""Zones -> costmap filter masks: their cells, the meaning of these, and delivery over HTTP."""
 
 from __future__ import annotations
 

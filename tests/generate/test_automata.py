@@ -21,7 +21,7 @@ from app.model.frame import Datum
 from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 Bool = NDArray[np.bool_]
 GRID = PartKey("occupancy")
@@ -129,18 +129,18 @@ def test_rooms_are_joined_and_holes_are_filled() -> None:
 
 @pytest.mark.parametrize("name", list(SMALL))
 def test_automaton_site_is_consistent(name: str, tmp_path: Path) -> None:
-    site, _ = looks.make(name, **SMALL[name])
-    looks.agrees_with_itself(site, 0.3)
-    looks.serves(site)
-    looks.sound_sdf(site, tmp_path)
+    site, _ = site_checks.make(name, **SMALL[name])
+    site_checks.agrees_with_itself(site, 0.3)
+    site_checks.serves(site)
+    site_checks.sound_sdf(site, tmp_path)
     assert "topology" in site.layers
-    assert looks.digest(site) == looks.digest(looks.make(name, **SMALL[name])[0])
-    assert looks.digest(site) != looks.digest(looks.make(name, seed=8, **SMALL[name])[0])
+    assert site_checks.digest(site) == site_checks.digest(site_checks.make(name, **SMALL[name])[0])
+    assert site_checks.digest(site) != site_checks.digest(site_checks.make(name, seed=8, **SMALL[name])[0])
     assert hashlib.sha256(site.grids()[GRID].cells.tobytes()).hexdigest()[:16] == HASHES[name]
 
 
 def test_forest_trees_have_solid_trunks_and_visual_crowns() -> None:
-    site, _ = looks.make("forest", **SMALL["forest"])
+    site, _ = site_checks.make("forest", **SMALL["forest"])
     (trees,) = site.vector("objects").values()
     assert len(trees) > 20
     for properties in trees.properties:
@@ -153,7 +153,7 @@ def test_forest_trees_have_solid_trunks_and_visual_crowns() -> None:
     at = shapely.get_coordinates(trees.geometry)
     apart = np.sqrt(((at[:, None] - at[None]) ** 2).sum(axis=2)) + 1e9 * np.eye(len(at))
     assert apart.min() >= 2.5 * 0.4 - 0.01
-    dense, _ = looks.make("forest", density=1.0, **SMALL["forest"])
+    dense, _ = site_checks.make("forest", density=1.0, **SMALL["forest"])
     assert len(next(iter(dense.vector("objects").values()))) == 12 * 10
 
 
@@ -163,8 +163,8 @@ def test_automaton_site_stays_inside_fence() -> None:
         {PartKey("location", name="site"): features([("fence", fence, {"kind": "fence"})], "local")}, Datum(52.0, 5.0)
     )
     for name in SMALL:
-        site, _ = looks.make(name, given=given)
-        looks.agrees_with_itself(Layers({**given.parts, **site.parts}, given.datum), 0.3)
+        site, _ = site_checks.make(name, given=given)
+        site_checks.agrees_with_itself(Layers({**given.parts, **site.parts}, given.datum), 0.3)
         grid = site.grids()[GRID]
         row, column = np.nonzero(grid.cells == FREE)
         x, y = (column + 0.5) * grid.resolution + grid.origin[0], (row + 0.5) * grid.resolution + grid.origin[1]
@@ -178,7 +178,7 @@ def test_automaton_site_stays_inside_fence() -> None:
         ("cave", {"width": 0}, "at least 1"),
         ("cave", {"width": 1e9}, "at most 5000"),
         ("cave", {"width": 5000, "depth": 5000, "resolution": 0.05}, "more than 67108864 cells"),
-        ("cave", {"width": 1000, "depth": 1000, "iterations": 1000}, "give fewer"),
+        ("cave", {"width": 1000, "depth": 1000, "iterations": 1000}, "use fewer"),
         ("cave", {"rule": "B9/S1"}, "neighbours from 0 to 8"),
         ("cave", {"rule": "nonsense"}, "neighbours from 0 to 8"),
         ("cave", {"rule": "B012345678/S012345678"}, "no free space is left"),
@@ -196,14 +196,14 @@ def test_automaton_site_stays_inside_fence() -> None:
 def test_invalid_automaton_parameters_raise(name: str, values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make(name, **values)
+        site_checks.make(name, **values)
     assert time.process_time() - started < 3.0
 
 
 def test_automaton_site_is_generated_over_http(api: Api) -> None:
     for name, values in SMALL.items():
-        looks.make(name, **values)  # so that native code is there, which takes a minute on a busy machine
-        version = looks.over_http(api, name, ("occupancy_grid", "tmap2", "gazebo"), **values)
+        site_checks.make(name, **values)  # so that native code is there, which takes a minute on a busy machine
+        version = site_checks.over_http(api, name, ("occupancy_grid", "tmap2", "gazebo"), **values)
         assert version["information"]["objects"] == "generated"
     env = "environments/made-cave/generations"
     problem = api.problem("POST", env, 422, json={"generator": "cave", "seed": 1, "parameters": {"rule": "x"}})

@@ -1,4 +1,4 @@
-"""Holes of 2 m × 2 m cut into real grids: what complete_grid calls free is free, and straight walls go on.
+"""Holes of 2 m × 2 m cut into real grids: cells that complete_grid frees are free, and straight walls continue.
 
 ``python -m tests.generate.test_completion`` measures all grids, for the figures in docs/how-to/generate-sites.md.
 """
@@ -49,7 +49,7 @@ def grid_of(path: Path) -> OccupancyGrid:
 
 
 def holes(valid: Bool, side: int, centres: Sequence[int]) -> Bool:
-    """Squares around known cells that do not touch, most of whose cells are known."""
+    """Yield squares around known cells that do not touch, with mostly known cells."""
     out = np.zeros(valid.shape, bool)
     count = 0
     for middle in centres:
@@ -134,7 +134,7 @@ def test_holes_in_real_grids_get_walls_back_and_no_false_free_cells(shared: Path
 
 
 def room() -> NDArray[np.uint8]:
-    """A room of 6 m × 4 m with a wall in the middle, and nothing known beyond its walls."""
+    """A room of 6 m × 4 m with a wall in the middle, and unknown cells beyond its walls."""
     cells = np.full((100, 140), UNKNOWN, np.uint8)
     cells[10:90, 10:130] = FREE
     cells[10:90, [10, 11, 69, 70, 128, 129]] = OCCUPIED

@@ -24,7 +24,7 @@ from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
 from app.model.meshes import load_mesh
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 NETWORK = PartKey("topology", GROUND, "network")
 OBJECTS = PartKey("objects", GROUND, "generated")
@@ -67,24 +67,24 @@ def network(layers: Layers) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
 
 @pytest.mark.parametrize("name", sorted(SMALL))
 def test_field_is_consistent_in_every_format(name: str, tmp_path: Path) -> None:
-    layers, notes = looks.make(name, **SMALL[name])
+    layers, notes = site_checks.make(name, **SMALL[name])
     assert not notes.dropped
     assert [t.subject for t in notes.template] == ["datum"]
-    looks.agrees_with_itself(layers, 0.3)
-    looks.sound_sdf(layers, tmp_path)
-    looks.serves(layers)
-    assert looks.digest(layers) == DIGESTS[name]
-    other, _ = looks.make(name, 8, **SMALL[name])
-    assert looks.digest(other) != DIGESTS[name]
+    site_checks.agrees_with_itself(layers, 0.3)
+    site_checks.sound_sdf(layers, tmp_path)
+    site_checks.serves(layers)
+    assert site_checks.digest(layers) == DIGESTS[name]
+    other, _ = site_checks.make(name, 8, **SMALL[name])
+    assert site_checks.digest(other) != DIGESTS[name]
     assert network(other)[1].keys() == network(layers)[1].keys(), "chance moves plants, not ways"
 
 
 @pytest.mark.parametrize(("name", "fence"), list(zip(sorted(SMALL), itertools.cycle(FENCES), strict=False)))
 def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str) -> None:
     given = fenced(fence)
-    layers, _ = looks.make(name, given=given)
+    layers, _ = site_checks.make(name, given=given)
     assert layers.datum == HERE
-    looks.agrees_with_itself(Layers({**given.parts, **layers.parts}, layers.datum, layers.levels), 0.3)
+    site_checks.agrees_with_itself(Layers({**given.parts, **layers.parts}, layers.datum, layers.levels), 0.3)
     polygon = shapely.Polygon(FENCES[fence]).buffer(0.002)
     for part in (
         *layers.vector("objects").values(),
@@ -105,7 +105,7 @@ def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str
 
 
 def test_network_names_match_real_polytunnels() -> None:
-    layers, _ = looks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
+    layers, _ = site_checks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
     nodes, edges = network(layers)
     aisles = {n.rpartition("-")[0] for n in nodes if n.startswith("r")}
     between = ["r0.7", "r1.5", "r2.5", "r3.5", "r4.5", "r5.3", "r5.7", "r6.5", "r7.5", "r8.5", "r9.5", "r10.3"]
@@ -137,7 +137,7 @@ def test_network_names_match_real_polytunnels() -> None:
 
 def test_orchard_trees_follow_parameters() -> None:
     parameters = {"rows": 3, "row_length": 18, "row_spacing": 5.0, "tree_spacing": 3.0, "jitter": 0.2}
-    layers, _ = looks.make("orchard", **parameters)
+    layers, _ = site_checks.make("orchard", **parameters)
     part = layers.parts[OBJECTS]
     assert isinstance(part, Features)
     trees = [f for f in part if f.properties["kind"] == "tree"]
@@ -153,7 +153,7 @@ def test_orchard_trees_follow_parameters() -> None:
     for tree in trees:
         x, y = tree.properties["pose"][:2]
         assert grid.cells[int((y - grid.origin[1]) / 0.05), int((x - grid.origin[0]) / 0.05)] == OCCUPIED
-    still, _ = looks.make("orchard", **{**parameters, "jitter": 0})
+    still, _ = site_checks.make("orchard", **{**parameters, "jitter": 0})
     rows = still.parts[OBJECTS]
     assert isinstance(rows, Features)
     x = [f.geometry.x for f in rows if f.id.startswith("tree1-")]
@@ -171,9 +171,9 @@ def test_crown_mesh_is_closed_ball() -> None:
 
 def test_one_way_aisles_alternate_directions() -> None:
     values = {**SMALL["warehouse"], "racks": 4}
-    plain, _ = looks.make("warehouse", **values)
-    layers, _ = looks.make("warehouse", one_way=True, **values)
-    looks.agrees_with_itself(layers, 0.3)
+    plain, _ = site_checks.make("warehouse", **values)
+    layers, _ = site_checks.make("warehouse", one_way=True, **values)
+    site_checks.agrees_with_itself(layers, 0.3)
     edges = network(layers)[1]
     assert {f"A{k}-ca_A{k}-cb" in edges for k in (1, 3)} == {True}
     assert "A1-cb_A1-ca" not in edges
@@ -220,7 +220,7 @@ def test_one_way_aisles_alternate_directions() -> None:
 )
 def test_invalid_field_parameters_raise_before_work(name: str, values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make(name, **values)
+        site_checks.make(name, **values)
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
@@ -242,7 +242,7 @@ def test_random_fences_give_site_or_error(name: str) -> None:
         part = features([("f", fence, {"kind": "fence"})], "local")
         values = {"robot_radius": chance.choice((0.2, 0.25)), "headland": chance.choice((3, 5))}
         try:
-            layers, _ = looks.make(name, number, Layers({key: part}, HERE), resolution=0.1, **values)
+            layers, _ = site_checks.make(name, number, Layers({key: part}, HERE), resolution=0.1, **values)
         except CannotGenerate as error:
             assert error.problems[0].where in {"yard", "docks", "headland", "rows_per_tunnel"}, error.detail
             continue
@@ -261,12 +261,12 @@ def test_too_small_fence_raises_cannot_generate() -> None:
         small = features([("f", shapely.box(0, 0, *size), {"kind": "fence"})], "local")
         for name in SMALL:
             with pytest.raises(CannotGenerate, match=f"{why}|the fence has no room for a row"):
-                generate.run(name, 1, {}, Layers({key: small}, HERE), looks.DerivationNotes())
+                generate.run(name, 1, {}, Layers({key: small}, HERE), site_checks.DerivationNotes())
 
 
 def test_large_fields_use_cells_that_show_the_paths() -> None:
     big = features([("f", shapely.box(0, 0, 120, 100), {"kind": "fence"})], "local")
-    layers, notes = looks.make(
+    layers, notes = site_checks.make(
         "vineyard", given=Layers({PartKey("location", GROUND, "site"): big}, HERE), vine_spacing=6
     )
     (grid,) = layers.grids().values()
@@ -276,7 +276,7 @@ def test_large_fields_use_cells_that_show_the_paths() -> None:
 
 def test_field_is_generated_over_http_and_edited(api: Api) -> None:
     format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "satellite", "openrmf")
-    version = looks.over_http(api, "polytunnels", format_names, **SMALL["polytunnels"])
+    version = site_checks.over_http(api, "polytunnels", format_names, **SMALL["polytunnels"])
     assert set(version["information"].values()) >= {"generated"}
     env = "environments/made-polytunnels"
     before = api.get(f"{env}/versions/latest/layers/location").json()

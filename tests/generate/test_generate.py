@@ -1,4 +1,4 @@
-"""What all generators share: declared parameters, seeded chance, what may be replaced, and what history says."""
+"""Rules of all generators: declared parameters, seeded randomness, replaced layers, and provenance."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_generated_datum_is_kept_unless_environment_has_one(ingest: Ingest, stor
 
 
 def test_generator_that_needs_a_layer_replaces_it(ingest: Ingest, store: Store) -> None:
-    with pytest.raises(MissingLayer, match="fewer works on objects"):
+    with pytest.raises(MissingLayer, match="fewer needs objects"):
         ingest.generate("here", order("fewer", count=1), message="", author="a")
     ingest.generate("here", order(), message="", author="a")
     version = ingest.generate("here", order("fewer", count=1), message="", author="a").version

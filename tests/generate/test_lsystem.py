@@ -1,4 +1,4 @@
-"""L-systems: the classic ones by hand, the turtle's turns, and what explodes, lies or is misspelt."""
+"""L-systems: classic ones computed by hand, the turtle's turns, and exploding or invalid rules."""
 
 from __future__ import annotations
 

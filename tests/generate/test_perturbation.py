@@ -1,4 +1,4 @@
-"""Perturbation: what moves, goes and comes, and that objects, grids and networks still agree."""
+"""Perturbation: objects moved, removed and added; objects, grids and networks still agree."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from app.model.features import Features, features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, pack_cells, unknown_grey
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate.looks import digest, make, world
+from tests.generate.site_checks import digest, make, world
 
 STILL = {"speckle": 0.0, "erode": 0.0, "dilate": 0.0, "dropped": 0}
 """No noise."""
@@ -34,7 +34,7 @@ ALONE = {**STILL, "shift": 0.0, "turn": 0.0, "row_shift": 0.0, "missing": 0.0, "
 
 
 def disturbed(given: Layers, seed: int = 7, **values: Any) -> tuple[Layers, Layers, DerivationNotes]:
-    """(the environment after it, what was made, what was said)"""
+    """(the environment after it, the changed parts, the notes)"""
     notes = DerivationNotes()
     new_layers = generate.run("perturbation", seed, values, given, notes)
     return Layers({**given.parts, **new_layers.parts}, new_layers.datum, new_layers.levels), new_layers, notes
@@ -95,7 +95,7 @@ def test_grid_and_network_follow_moved_objects() -> None:
     then, now = places(objects(before)), places(objects(after))
     assert 0 < len(then) - len(now) < 20
     assert set(now) < set(then)
-    assert (now["shed"] == then["shed"]).all(), "what is built stays"
+    assert (now["shed"] == then["shed"]).all(), "built objects stay"
     away = [float(np.hypot(*(now[i] - then[i])[:2])) for i in now if i != "shed"]
     assert 0 < max(away) <= 0.1 + 0.15 + 1e-3
     new = objects(after, "perturbation")
@@ -152,14 +152,14 @@ def test_turned_objects_keep_shape_and_do_not_collide() -> None:
         c, s = math.cos(p["pose"][5]), math.sin(p["pose"][5])
         turn = np.array([[c, -s], [s, c]])
         seen = shapely.transform(ring, lambda at, t=turn, p=p: at @ t.T + p["pose"][:2])
-        assert shapely.hausdorff_distance(seen, g) < 0.01, "pose and outline tell the same"
+        assert shapely.hausdorff_distance(seen, g) < 0.01, "pose and outline agree"
     for k, a in enumerate(part.geometry):
         assert not any(a.intersects(b) for b in part.geometry[k + 1 :])
     assert any(d.subject == "shifts" for d in notes.dropped)
 
 
 def room(cells: Any = None, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyGrid:
-    """Twelve by eight metres with walls, three boxes and a corner nobody has seen."""
+    """Twelve by eight metres with walls, three boxes and an unseen corner."""
     if cells is None:
         cells = np.zeros((160, 240), np.uint8)
         cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = OCCUPIED
@@ -326,7 +326,7 @@ def test_masks_are_unchanged_unless_named() -> None:
 
 
 def test_grey_205_cells_are_unchanged() -> None:
-    """Nothing new stands on ground that nobody has seen, and no noise frees its edge."""
+    """No new obstacle is on unseen ground, and no noise frees its edge."""
     cells = room().cells.copy()
     grey = np.zeros(cells.shape, bool)
     grey[:, 121:] = cells[:, 121:] == FREE
@@ -342,7 +342,7 @@ def test_grey_205_cells_are_unchanged() -> None:
 
 
 def test_repeated_perturbation_stays_consistent() -> None:
-    """A second perturbation works on what the first has made, and keeps its obstacles."""
+    """A second perturbation works on the result of the first, and keeps its obstacles."""
     one, _, _ = disturbed(orchard(), **STILL)
     two, _, _ = disturbed(one, 8, **STILL, missing=0.0)
     assert set(objects(one, "perturbation").ids) < set(objects(two, "perturbation").ids)

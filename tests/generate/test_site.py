@@ -1,4 +1,4 @@
-"""What all sites share: one world, of which the grid, the network, the zones and the picture are told."""
+"""Rules of all sites: grid, network, zones and image agree with one world."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_solids_outside_the_slice_are_skipped() -> None:
         assert all(_site._reaches(shape, z, reader, {}) for z in np.linspace(low, high, 9))
         assert not _site._reaches(shape, -1.0, reader, {})
         assert not _site._reaches(shape, 3.0, reader, {})
-    assert _site._reaches({"type": "sphere", "radius": 1.0}, 99.0, solids.Solids({}), {}), "others are always looked at"
+    assert _site._reaches({"type": "sphere", "radius": 1.0}, 99.0, solids.Solids({}), {}), "others are always read"
 
 
 def test_free_space_is_one_piece_and_the_rest_is_noted() -> None:

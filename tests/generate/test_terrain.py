@@ -1,4 +1,4 @@
-"""Gradient noise against its definitions, and natural ground whose height map, trees, grid and costs agree."""
+"""Gradient noise against its definitions, and terrain whose height map, trees, grid and costs agree."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from app.model.frame import Datum
 from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 Array = NDArray[np.float64]
 GRID = PartKey("occupancy")
@@ -171,22 +171,22 @@ def without_costs(site: Layers) -> Layers:
 
 
 def test_terrain_site_is_consistent(tmp_path: Path) -> None:
-    site, notes = looks.make("terrain", **SMALL)
-    looks.agrees_with_itself(without_costs(site), 0.3)
-    looks.serves(site)
-    looks.sound_sdf(site, tmp_path)
+    site, notes = site_checks.make("terrain", **SMALL)
+    site_checks.agrees_with_itself(without_costs(site), 0.3)
+    site_checks.serves(site)
+    site_checks.sound_sdf(site, tmp_path)
     assert not notes.warnings
-    assert looks.digest(site) == looks.digest(looks.make("terrain", **SMALL)[0])
-    assert looks.digest(site) != looks.digest(looks.make("terrain", seed=8, **SMALL)[0])
-    assert looks.digest(site)[:16] == GROUND
-    world = write_layers(site, "gazebo", {}, looks.CAME).files
-    assert b"ground_plane" not in world["world.sdf"], "nothing lies over the hills"
+    assert site_checks.digest(site) == site_checks.digest(site_checks.make("terrain", **SMALL)[0])
+    assert site_checks.digest(site) != site_checks.digest(site_checks.make("terrain", seed=8, **SMALL)[0])
+    assert site_checks.digest(site)[:16] == GROUND
+    world = write_layers(site, "gazebo", {}, site_checks.CAME).files
+    assert b"ground_plane" not in world["world.sdf"], "nothing is above the hills"
     assert b"walls_" not in world["world.sdf"], "costs are no walls"
     assert any(name.endswith("heightmaps/terrain.png") for name in world)
 
 
 def test_height_map_is_below_floor_with_trees_on_it() -> None:
-    site, _ = looks.make("terrain", relief=2.0, **SMALL)
+    site, _ = site_checks.make("terrain", relief=2.0, **SMALL)
     (objects,) = site.vector("objects").values()
     files = site.resources()
     with Image.open(io.BytesIO(files["heightmaps/terrain.png"])) as picture:
@@ -209,7 +209,7 @@ def test_height_map_is_below_floor_with_trees_on_it() -> None:
 
 
 def test_slopes_cost_and_steep_ground_is_blocked() -> None:
-    site, _ = looks.make("terrain", relief=3.0, climb=20, **SMALL)
+    site, _ = site_checks.make("terrain", relief=3.0, climb=20, **SMALL)
     grid, costs = site.grids()[GRID], site.grids()[COSTS]
     assert costs.mode == "raw"
     assert len(np.unique(costs.cells)) > 50
@@ -233,19 +233,19 @@ def test_slopes_cost_and_steep_ground_is_blocked() -> None:
 
 
 def test_terrain_speed_mask_replaces_costs() -> None:
-    site, _ = looks.make("terrain", rough="speed", **SMALL)
+    site, _ = site_checks.make("terrain", rough="speed", **SMALL)
     mask = site.grids()[PartKey("occupancy", name="speed")]
     assert mask.cells.min() >= 10
     assert mask.cells.max() <= 100
-    files = write_layers(site, "occupancy_grid", {"grid": "speed"}, looks.CAME).files
+    files = write_layers(site, "occupancy_grid", {"grid": "speed"}, site_checks.CAME).files
     assert any(name.endswith("_filter_info.yaml") for name in files)
-    plain, _ = looks.make("terrain", rough="none", **SMALL)
+    plain, _ = site_checks.make("terrain", rough="none", **SMALL)
     assert set(plain.grids()) == {GRID}
 
 
 def test_time_changes_terrain_slightly() -> None:
     def ground(epoch: float) -> Array:
-        site, _ = looks.make("terrain", epoch=epoch, vegetation=0, **SMALL)
+        site, _ = site_checks.make("terrain", epoch=epoch, vegetation=0, **SMALL)
         with Image.open(io.BytesIO(site.resources()["heightmaps/terrain.png"])) as picture:
             return np.asarray(picture, float)
 
@@ -253,7 +253,7 @@ def test_time_changes_terrain_slightly() -> None:
     assert 0 < np.abs(now - soon).mean() < 0.25 * np.abs(now - later).mean()
 
     def woods(epoch: float) -> set[tuple[float, float]]:
-        site, _ = looks.make("terrain", epoch=epoch, **SMALL)
+        site, _ = site_checks.make("terrain", epoch=epoch, **SMALL)
         (objects,) = site.vector("objects").values()
         return {tuple(p["pose"][:2]) for p in objects.properties if p["kind"] == "tree"}
 
@@ -261,8 +261,8 @@ def test_time_changes_terrain_slightly() -> None:
 
 
 def test_bare_ground_has_posts_at_its_corners() -> None:
-    site, notes = looks.make("terrain", vegetation=0, **SMALL)
-    looks.agrees_with_itself(without_costs(site), 0.3)
+    site, notes = site_checks.make("terrain", vegetation=0, **SMALL)
+    site_checks.agrees_with_itself(without_costs(site), 0.3)
     (objects,) = site.vector("objects").values()
     assert [p["kind"] for p in objects.properties].count("post") == 4
     assert any(t.subject == "posts" for t in notes.template)
@@ -273,8 +273,8 @@ def test_terrain_stays_inside_fence() -> None:
     given = Layers(
         {PartKey("location", name="site"): features([("fence", fence, {"kind": "fence"})], "local")}, Datum(52.0, 5.0)
     )
-    site, _ = looks.make("terrain", given=given, vegetation=0.6, detail="65")
-    looks.agrees_with_itself(without_costs(Layers({**given.parts, **site.parts}, given.datum)), 0.3)
+    site, _ = site_checks.make("terrain", given=given, vegetation=0.6, detail="65")
+    site_checks.agrees_with_itself(without_costs(Layers({**given.parts, **site.parts}, given.datum)), 0.3)
 
 
 @pytest.mark.parametrize(
@@ -294,13 +294,13 @@ def test_terrain_stays_inside_fence() -> None:
 def test_invalid_terrain_parameters_raise(values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make("terrain", **values)
+        site_checks.make("terrain", **values)
     assert time.process_time() - started < 5.0
 
 
 def test_terrain_is_generated_over_http(api: Api) -> None:
-    looks.make("terrain", **SMALL)  # so that native code is there, which takes a minute on a busy machine
-    version = looks.over_http(api, "terrain", ("occupancy_grid", "gazebo", "tmap2"), **SMALL)
+    site_checks.make("terrain", **SMALL)  # so that native code is there, which takes a minute on a busy machine
+    version = site_checks.over_http(api, "terrain", ("occupancy_grid", "gazebo", "tmap2"), **SMALL)
     assert version["information"]["occupancy"] == "generated"
     env = "environments/made-terrain/generations"
     problem = api.problem("POST", env, 422, json={"generator": "terrain", "seed": 1, "parameters": {"octaves": 99}})

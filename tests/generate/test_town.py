@@ -1,4 +1,4 @@
-"""Towns by a grammar: rules, streets and lanes, buildings, and what cannot be made."""
+"""Towns by a grammar: rules, streets and lanes, buildings, and impossible requests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from app.model.features import features
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 DIGEST = "4661eac93fc20d758d5ef2fd36e3e9ea1a91f56766f932c27a9853edf9130c35"
 SQUARE = shapely.box(0, 0, 100, 60)
@@ -28,11 +28,11 @@ def grown(rules: str, area: Any = SQUARE, seed: int = 7, **constants: float) -> 
 
 
 def test_town_is_consistent_in_every_format(tmp_path: Path) -> None:
-    layers, _ = looks.make("town", width=110, depth=80, block=2500, resolution=0.2)
-    looks.agrees_with_itself(layers, 0.3)
-    looks.sound_sdf(layers, tmp_path)
-    looks.serves(layers)
-    assert looks.digest(layers) == DIGEST
+    layers, _ = site_checks.make("town", width=110, depth=80, block=2500, resolution=0.2)
+    site_checks.agrees_with_itself(layers, 0.3)
+    site_checks.sound_sdf(layers, tmp_path)
+    site_checks.serves(layers)
+    assert site_checks.digest(layers) == DIGEST
 
 
 def test_rules_give_hand_computed_shapes() -> None:
@@ -82,13 +82,13 @@ def test_random_rules_follow_weights_and_seed() -> None:
     [
         ("", "there are 0 rules"),
         ("town", "is not a rule"),
-        ("town -> explode(3) a", "no action 'explode'"),
+        ("town -> explode(3) a", "unknown action 'explode'"),
         ("town -> house", "no rule for 'house'"),
         ("town -> ring(5)", "takes 1 values and 1 shapes"),
         ("town -> cut(0.5) a b", "takes 2 values"),
         ("town -> ring(__import__) town", "nothing is called"),
         ("town : -> park", "missing condition"),
-        ("town -> park extra", "no action 'park'"),
+        ("town -> park extra", "unknown action 'park'"),
         ("T O W N -> park", "is not a rule"),
         ("town -> park\n" * 201, "1 to 200"),
     ],
@@ -141,7 +141,7 @@ def test_crossing_streets_have_lanes_on_the_right() -> None:
 
 
 def test_town_has_lanes_sidewalks_and_crossings() -> None:
-    layers, notes = looks.make("town", width=160, depth=120, trees=False, resolution=0.2)
+    layers, notes = site_checks.make("town", width=160, depth=120, trees=False, resolution=0.2)
     network = layers.vector("topology")[PartKey("topology", GROUND, "network")]
     edges = [p for p in network.properties if p["kind"] == "edge"]
     pairs = {(p["source"], p["target"]) for p in edges}
@@ -164,31 +164,31 @@ def test_town_has_lanes_sidewalks_and_crossings() -> None:
         assert p["osm"]["tags"]["building:levels"] == str(p["levels"])
     lamps = objects.select_kinds("pole")
     assert len(lamps) > 5
-    assert b'k="roof:shape"' in write_layers(layers, "osm", {}, looks.CAME).files["map.osm"]
+    assert b'k="roof:shape"' in write_layers(layers, "osm", {}, site_checks.CAME).files["map.osm"]
 
 
 def test_boundary_is_parameter_or_fence() -> None:
     ring = shapely.Polygon([(0, 0), (120, 20), (100, 110), (10, 90)])
     boundary = ",".join(f"{v:g}" for point in ring.exterior.coords[:-1] for v in point)
-    layers, _ = looks.make("town", boundary=boundary, resolution=0.2)
-    looks.agrees_with_itself(layers, 0.3)
+    layers, _ = site_checks.make("town", boundary=boundary, resolution=0.2)
+    site_checks.agrees_with_itself(layers, 0.3)
     buildings = layers.vector("objects")[PartKey("objects", GROUND, "generated")].select_kinds("building")
     assert len(buildings) > 4
     assert shapely.contains(ring, buildings.geometry).all()
     fence = features([("f", ring, {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
-    layers, _ = looks.make("town", given=given, resolution=0.2)
+    layers, _ = site_checks.make("town", given=given, resolution=0.2)
     for part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
         assert shapely.contains(shapely.buffer(ring, 1e-6), part.geometry).all()
     with pytest.raises(CannotGenerate, match="boundary: extends beyond the fence"):
-        looks.make("town", given=given, boundary="0,0,500,0,500,500")
+        site_checks.make("town", given=given, boundary="0,0,500,0,500,500")
 
 
 @pytest.mark.parametrize(
     ("values", "why"),
     [
         ({"boundary": "0,0,10,0"}, "3 to 1000 corners"),
-        ({"boundary": "0,0,10,0,20,0"}, "no polygon|area of 0"),
+        ({"boundary": "0,0,10,0,20,0"}, "not a valid polygon|area of 0"),
         ({"boundary": "0,0,10,10,10,0,0,10"}, "is not a valid polygon: Self-intersection"),
         ({"boundary": "0,0,1,0,1,1"}, r"an area of 0\.5 m²"),
         ({"boundary": "0,0,1e9,0,1e9,1e9"}, "within a million metres"),
@@ -205,14 +205,14 @@ def test_boundary_is_parameter_or_fence() -> None:
 )
 def test_invalid_town_parameters_raise(values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make("town", **values)
+        site_checks.make("town", **values)
 
 
 def test_custom_rules_may_leave_streets_open() -> None:
     rules = "town -> cut(0.5, street) half half; half -> cut(0.5, street) use use; use -> inset(setback) house"
     rules += "; house -> hip(2)"
-    layers, _ = looks.make("town", width=80, depth=60, rules=rules, resolution=0.1)
-    looks.agrees_with_itself(layers, 0.3)
+    layers, _ = site_checks.make("town", width=80, depth=60, rules=rules, resolution=0.1)
+    site_checks.agrees_with_itself(layers, 0.3)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     assert Counter(p["kind"] for p in objects.properties)["building"] == 4
     assert {p["roof"] for p in objects.select_kinds("building").properties} == {"hip"}
@@ -221,5 +221,5 @@ def test_custom_rules_may_leave_streets_open() -> None:
 
 def test_town_is_generated_over_http(api: Api) -> None:
     format_names = ("osm", "gazebo", "tmap2", "geojson", "occupancy_grid")
-    version = looks.over_http(api, "town", format_names, width=70, depth=60, trees=False, resolution=0.2)
+    version = site_checks.over_http(api, "town", format_names, width=70, depth=60, trees=False, resolution=0.2)
     assert version["information"]["objects"] == "generated"

@@ -1,4 +1,4 @@
-"""Wave-function collapse: every window stands in the sample, in its shares, whatever is fixed; grids are completed."""
+"""Wave-function collapse: windows and shares as in the sample, fixed cells kept; grids completed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from app.generate.wave_function_collapse import SAMPLES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 NAME = "wave_function_collapse"
 GRID = PartKey("occupancy")
@@ -42,7 +42,7 @@ def windows(cells: U8, n: int) -> set[bytes]:
 
 
 def collapse(sample: U8, size: int, pattern: int, draw: Any = DRAW, symmetry: Any = "none", **more: Any) -> U8:
-    """A grid of so many cells a side from a sample."""
+    """Generate a square grid from a sample."""
     model = _wfc.learn(sample, tile=1, pattern=pattern, symmetry=symmetry, wrap=more.pop("wrap", False))
     fixed = more.pop("fixed", np.full((size, size), -1))
     return _wfc.render(model, _wfc.collapse_model(model, (size, size), fixed, draw, **more))
@@ -60,7 +60,7 @@ def board() -> U8:
 
 
 def rooms() -> U8:
-    """A room with two doors: what is made of it falls apart here and there unless that is forbidden."""
+    """A room with two doors: without a connectivity rule its results are sometimes in several pieces."""
     out = np.zeros((16, 16), np.uint8)
     out[3:12, 3:12] = OCCUPIED
     out[4:11, 4:11] = FREE
@@ -72,7 +72,7 @@ def test_board_of_two_colours_has_two_patterns() -> None:
     model = _wfc.learn(board(), tile=1, pattern=2, symmetry="all", wrap=True)
     assert model.patterns.tolist() == [[[0, 1], [1, 0]], [[1, 0], [0, 1]]]
     assert model.weights[0] == model.weights[1]
-    assert model.allowed[:, :, 0].tolist() == [[2, 1]] * 4  # beside the one stands the other, in each direction
+    assert model.allowed[:, :, 0].tolist() == [[2, 1]] * 4  # the tiles alternate in each direction
     for border in (False, True):
         out = collapse(board(), 10, 2, wrap=True, periodic=border)
         assert windows(out, 2) == windows(board(), 2)
@@ -110,7 +110,7 @@ def test_every_window_occurs_in_sample(scan: bool, symmetry: Any) -> None:
 
 def test_ten_metre_site_keeps_sample_shares_and_time_limit() -> None:
     sample = SAMPLES["warehouse"].cells(0.05)
-    looks.make(NAME, width=3, depth=3)  # compiled, or loaded
+    site_checks.make(NAME, width=3, depth=3)  # compiled, or loaded
     expected, sample_windows = pairs(sample), windows(sample, 5)
     for seed in range(4):
         started = time.process_time()
@@ -122,7 +122,7 @@ def test_ten_metre_site_keeps_sample_shares_and_time_limit() -> None:
 
 
 def test_pillars_are_within_walls() -> None:
-    layers, _ = looks.make(NAME, sample="pillars", width=6, depth=6)
+    layers, _ = site_checks.make(NAME, sample="pillars", width=6, depth=6)
     kinds = {i.split("/")[0] for part in layers.vector("objects").values() for i in part.ids}
     assert kinds == {"pillar", "wall"}
 
@@ -195,13 +195,13 @@ def test_wfc_of_same_seed_gives_same_cells() -> None:
 def test_invalid_wfc_parameters_raise_before_work(values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make(NAME, **values)
+        site_checks.make(NAME, **values)
     assert time.process_time() - started < 3.0
 
 
 def test_wfc_site_is_consistent(tmp_path: Path) -> None:
-    site, notes = looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))
-    looks.agrees_with_itself(site, 0.3)
+    site, notes = site_checks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))
+    site_checks.agrees_with_itself(site, 0.3)
     grid = site.grids()[GRID]
     assert (grid.width, grid.height, grid.resolution, grid.origin) == (160, 120, 0.05, (0.0, 0.0, 0.0))
     assert grid.cells[60, 80] == FREE
@@ -211,28 +211,28 @@ def test_wfc_site_is_consistent(tmp_path: Path) -> None:
     kinds = {p["kind"] for part in site.vector("objects").values() for p in part.properties}
     assert kinds == {"wall", "rack"}
     assert not notes.warnings
-    looks.serves(site)
-    looks.sound_sdf(site, tmp_path)
-    assert looks.digest(site) == looks.digest(
-        looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))[0]
+    site_checks.serves(site)
+    site_checks.sound_sdf(site, tmp_path)
+    assert site_checks.digest(site) == site_checks.digest(
+        site_checks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))[0]
     )
-    assert looks.digest(site) != looks.digest(looks.make(NAME, seed=8, width=8, depth=6)[0])
+    assert site_checks.digest(site) != site_checks.digest(site_checks.make(NAME, seed=8, width=8, depth=6)[0])
 
 
 @pytest.mark.parametrize("border", ["open", "periodic"])
 def test_wfc_supports_other_borders_and_tiles(border: str) -> None:
-    site, _ = looks.make(NAME, border=border, width=6, depth=6, model="tiled", order="entropy", symmetry="mirror")
-    looks.agrees_with_itself(site, 0.3)
+    site, _ = site_checks.make(NAME, border=border, width=6, depth=6, model="tiled", order="entropy", symmetry="mirror")
+    site_checks.agrees_with_itself(site, 0.3)
 
 
 def test_environment_grid_serves_as_sample_inside_its_fence() -> None:
-    first, _ = looks.make(NAME, width=6, depth=6)
+    first, _ = site_checks.make(NAME, width=6, depth=6)
     plan = {GRID: first.grids()[GRID], **{k: p for k, p in first.parts.items() if k.layer == "location"}}
-    site, _ = looks.make(NAME, given=Layers(plan, first.datum), sample="map", pattern=3, symmetry="all")
-    looks.agrees_with_itself(Layers({**plan, **site.parts}, site.datum), 0.3)
+    site, _ = site_checks.make(NAME, given=Layers(plan, first.datum), sample="map", pattern=3, symmetry="all")
+    site_checks.agrees_with_itself(Layers({**plan, **site.parts}, site.datum), 0.3)
     assert site.grids()[GRID].cells.shape == first.grids()[GRID].cells.shape
     with pytest.raises(CannotGenerate, match=r"is the sample's, 0\.05 m"):
-        looks.make(NAME, given=Layers(plan, first.datum), sample="map", resolution=0.1)
+        site_checks.make(NAME, given=Layers(plan, first.datum), sample="map", resolution=0.1)
 
 
 def holed() -> tuple[U8, U8]:
@@ -264,7 +264,7 @@ def test_unknown_part_is_completed_from_known_part(order: str) -> None:
     near, _ = completed(cells, reach=0.25, confidence=0, order=order)
     filled = (near != UNKNOWN) & (cells == UNKNOWN)
     assert 0 < filled.sum() < (cells == UNKNOWN).sum()
-    assert not filled[46:64, 56:84].any(), "what is farther than the reach stays unknown"
+    assert not filled[46:64, 56:84].any(), "cells beyond the reach stay unknown"
 
 
 def test_completion_is_repeatable() -> None:
@@ -303,12 +303,12 @@ def test_invalid_completions_raise(cells: U8, values: dict[str, Any], why: str) 
 
 
 def test_completion_without_grid_raises_missing_layer() -> None:
-    with pytest.raises(MissingLayer, match="complete_grid works on occupancy"):
+    with pytest.raises(MissingLayer, match="complete_grid needs occupancy"):
         generate.run("complete_grid", 7, {}, Layers(), DerivationNotes())
 
 
 def test_wfc_site_is_generated_over_http(api: Api) -> None:
-    version = looks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
+    version = site_checks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
     assert version["information"] | {"occupancy": "generated", "topology": "generated"} == version["information"]
     env = f"environments/made-{NAME}/generations"
     problem = api.problem("POST", env, 422, json={"generator": NAME, "seed": 1, "parameters": {"width": 0}})
