@@ -44,7 +44,7 @@ class CaveOptions(SiteOptions):
     cell: float = parameter(
         0.25, "size of the automaton's cells; a multiple of the grid's", minimum=0.01, maximum=50.0, unit="m"
     )
-    rule: str = parameter("B5678/S45678", "rule: numbers of neighbours with which a cell is born (B) and survives (S)")
+    rule: str = parameter("B5678/S45678", "numbers of neighbours with which a cell is born (B) and survives (S)")
     iterations: int = parameter(6, "number of times that the rule is applied", minimum=0, maximum=1000)
     density: float = parameter(0.49, "share of living cells at the start", minimum=0.0, maximum=1.0)
     passage: float | None = parameter(
@@ -68,7 +68,7 @@ class HallOptions(CaveOptions):
     cell: float = parameter(
         0.4, "size of the automaton's cells; a multiple of the grid's", minimum=0.01, maximum=50.0, unit="m"
     )
-    rule: str = parameter("B5678/S3456", "rule: numbers of neighbours with which a cell is born (B) and survives (S)")
+    rule: str = parameter("B5678/S3456", "numbers of neighbours with which a cell is born (B) and survives (S)")
     iterations: int = parameter(2, "number of times that the rule is applied", minimum=0, maximum=1000)
     density: float = parameter(0.34, "share of living cells at the start", minimum=0.0, maximum=1.0)
 
@@ -82,7 +82,7 @@ class ForestOptions(SiteOptions):
     spacing: float = parameter(
         2.5, "size of the automaton's cells, each with one tree", minimum=0.5, maximum=50.0, unit="m"
     )
-    rule: str = parameter("B5678/S345678", "rule: numbers of neighbours with which a cell is born (B) and survives (S)")
+    rule: str = parameter("B5678/S345678", "numbers of neighbours with which a cell is born (B) and survives (S)")
     iterations: int = parameter(3, "number of times that the rule is applied", minimum=0, maximum=1000)
     density: float = parameter(0.4, "share of living cells at the start", minimum=0.0, maximum=1.0)
     jitter: float = parameter(

@@ -26,8 +26,8 @@ class Orchard(FieldOptions):
     tree_spacing: float = parameter(1.8, "distance between trees in a row", minimum=0.5, maximum=30.0, unit="m")
     jitter: float = parameter(0.1, "maximum random offset of a tree", minimum=0.0, maximum=5.0, unit="m")
     tree_height: float = parameter(3.2, "height of the trees", minimum=1.0, maximum=30.0, unit="m")
-    crown_diameter: float = parameter(1.6, "radius of the trees' crowns", minimum=0.3, maximum=20.0, unit="m")
-    trunk_diameter: float = parameter(0.16, "radius of the trees' trunks", minimum=0.04, maximum=2.0, unit="m")
+    crown_diameter: float = parameter(1.6, "diameter of the trees' crowns", minimum=0.3, maximum=20.0, unit="m")
+    trunk_diameter: float = parameter(0.16, "diameter of the trees' trunks", minimum=0.04, maximum=2.0, unit="m")
 
 
 @generates(
@@ -38,7 +38,7 @@ class Orchard(FieldOptions):
 def orchard(given: Layers, options: Orchard, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
     if options.crown_diameter < options.trunk_diameter:
-        raise invalid_option_error("crown_diameter", "must be at least trunk_radius")
+        raise invalid_option_error("crown_diameter", "must be at least trunk_diameter")
     site = Site(given, options, notes, coloured=True)
     lines = _field.number_rows(options.rows or _field.MAX_ROWS)
     out = _field.open_field(

@@ -73,7 +73,7 @@ class Options(SiteOptions):
         2.5, "width of sidewalks, at most a quarter of a street", minimum=1.0, maximum=20.0, unit="m"
     )
     block: float = parameter(4500.0, "maximum area of a block", minimum=200.0, maximum=1e6, unit="m²")
-    lot: float = parameter(320.0, "usual lot", minimum=50.0, maximum=1e5, unit="m²")
+    lot: float = parameter(320.0, "typical area of a lot", minimum=50.0, maximum=1e5, unit="m²")
     setback: float = parameter(
         3.0, "distance between a lot's edge and its building", minimum=0.0, maximum=100.0, unit="m"
     )
@@ -124,9 +124,7 @@ def _town_boundary(site: Site, options: Options) -> Any:
     boundary = None if options.boundary is None else _polygon(options.boundary)
     outline = shapely.box(0.0, 0.0, options.width, options.depth) if boundary is None else boundary
     if outline.area > MAX_AREA_M2:
-        raise invalid_option_error(
-            "boundary", f"{outline.area / 1e6:.1f} km² are more than the maximum of {MAX_AREA_M2 / 1e6:g} km²"
-        )
+        raise invalid_option_error("boundary", f"{outline.area / 1e6:.1f} km² are more than {MAX_AREA_M2 / 1e6:g} km²")
     around = shapely.buffer(outline, MARGIN, join_style="mitre", mitre_limit=3.0)
     fence = site.set_fence(around, room=options.sidewalk / 2 - options.robot_radius)
     if not site.is_given:

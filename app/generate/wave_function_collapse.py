@@ -86,7 +86,7 @@ class Options(SiteOptions):
 
     sample: str = parameter(
         "warehouse",
-        f"one of {', '.join(SAMPLES)}, or the name of a grid of the environment; the site has the same cell size",
+        f"sample: {', '.join(SAMPLES)}, or the name of a grid of the environment, whose cell size is used",
     )
     width: float = parameter(10.0, "size along x, if there is no fence", minimum=0.5, maximum=10_000.0, unit="m")
     depth: float = parameter(10.0, "size along y, if there is no fence", minimum=0.5, maximum=10_000.0, unit="m")
@@ -107,7 +107,8 @@ class Options(SiteOptions):
     )
     wrap: bool = parameter(False, "whether the sample continues at its other side")
     border: Literal["walls", "open", "periodic"] = parameter(
-        "walls", "closed by walls; open like a section of a larger site; or periodic, so that copies fit side by side"
+        "walls",
+        "border: closed by walls; open like a section of a larger site; or periodic, so that copies fit together",
     )
     order: Literal["rows", "entropy"] = parameter(
         "rows", "order of decisions: row by row, close to the sample's shares, or lowest entropy first"

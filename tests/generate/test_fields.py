@@ -199,7 +199,7 @@ def test_one_way_aisles_alternate_directions() -> None:
         ("orchard", {"colour": "red"}, "no such parameter of orchard"),
         ("orchard", {"robot_radius": 1.7}, r"row_spacing: 3.60 m .* at least 3.91 m are needed"),
         ("orchard", {"headland": 1.5, "robot_radius": 0.8}, "headland: 1.5 m are too few to turn"),
-        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "must be at least trunk_radius"),
+        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "must be at least trunk_diameter"),
         ("orchard", {"rows": 500, "row_length": 1000, "tree_spacing": 0.5, "resolution": 1}, "row_spacing|trees"),
         ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* use a coarser"),
         ("orchard", {"docks": 20, "row_length": 10}, "docks: the lane of 15"),

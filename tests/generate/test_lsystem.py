@@ -169,7 +169,7 @@ def test_exploding_system_raises_while_it_grows() -> None:
         draw(
             expand(parse("axiom: " + "F" * 300 + "; F -> " + "F" * 100), 1, dice()), angle=20, length=0.001, radius=0.01
         )
-    with pytest.raises(CannotGenerate, match="200 brackets"):
+    with pytest.raises(CannotGenerate, match="200 nested brackets"):
         draw([("[", ())] * 300, angle=20, length=1, radius=0.01)
     with pytest.raises(CannotGenerate, match="more than 1000 m"):
         draw([("F", (2000.0,))], angle=20, length=1, radius=0.01)

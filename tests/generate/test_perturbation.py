@@ -281,9 +281,9 @@ def test_invalid_perturbations_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MissingLayer, match="objects or occupancy or topology"):
         disturbed(Layers())
     before = Layers({PartKey("occupancy"): room()})
-    with pytest.raises(CannotGenerate, match="there are: ground"):
+    with pytest.raises(CannotGenerate, match="available: ground"):
         disturbed(before, level="attic")
-    with pytest.raises(CannotGenerate, match="there are: map"):
+    with pytest.raises(CannotGenerate, match="available: map"):
         disturbed(before, grid="attic")
     with pytest.raises(CannotGenerate, match="ground: it has neither obstacles nor a grid"):
         disturbed(Layers({PartKey("topology", "ground", "network"): lane(1.0)}))
@@ -300,7 +300,7 @@ def test_invalid_perturbations_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(full, **{**ALONE, "obstacles": 3})
     monkeypatch.setattr("app.generate.perturbation.MAX_CELLS", 1000)
-    with pytest.raises(CannotGenerate, match="at most 1000"):
+    with pytest.raises(CannotGenerate, match="the maximum is 1000"):
         disturbed(before)
 
 

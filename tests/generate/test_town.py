@@ -80,7 +80,7 @@ def test_random_rules_follow_weights_and_seed() -> None:
 @pytest.mark.parametrize(
     ("rules", "why"),
     [
-        ("", "there are 0 rules"),
+        ("", "1 to 200 rules, got 0"),
         ("town", "is not a rule"),
         ("town -> explode(3) a", "unknown action 'explode'"),
         ("town -> house", "no rule for 'house'"),
