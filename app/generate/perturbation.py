@@ -282,8 +282,8 @@ class _Level:
         removed_count = sum(t.gone for t in things)
         moved = sum(t.has_changed for t in things) - removed_count
         rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
-        phrases = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
-        return phrases + ([f"{removed_count} gone"] if removed_count else [])
+        phrases = [f"{moved} objects moved" + (f" ({rows} rows)" if rows else "")] if moved else []
+        return phrases + ([f"{removed_count} removed"] if removed_count else [])
 
     def _shaken(self, loose: list[Movable]) -> None:
         """Draw the removed objects, and the displacement of the others."""

@@ -134,7 +134,7 @@ def test_rows_move_as_a_whole() -> None:
     rows = [{by[f"tree/{row}/{k}"] for k in range(9)} for row in range(4)]
     assert all(len(row) == 1 for row in rows)
     assert len(set().union(*rows)) == 4, "each in its own way"
-    assert any("36 things moved (4 rows)" in w.problem for w in notes.warnings)
+    assert any("36 objects moved (4 rows)" in w.problem for w in notes.warnings)
 
 
 def test_turned_objects_keep_shape_and_do_not_collide() -> None:
@@ -187,7 +187,7 @@ def test_grid_without_objects_has_its_pieces_moved() -> None:
     assert (cells == OCCUPIED).sum() == (old == OCCUPIED).sum()
     assert (cells[:2] == OCCUPIED).all(), "walls are too long to be things"
     assert ((cells == UNKNOWN) == (old == UNKNOWN)).all()
-    assert any("3 things moved" in w.problem for w in notes.warnings)
+    assert any("3 objects moved" in w.problem for w in notes.warnings)
     empty_site, _, _ = disturbed(before, **{**ALONE, "missing": 1.0})
     assert (grid(empty_site).cells == OCCUPIED).sum() == (old == OCCUPIED).sum() - 3 * 160
     more, _, _ = disturbed(before, **{**ALONE, "obstacles": 5})
