@@ -1,8 +1,8 @@
 """Derivations: pure functions from layers to a layer, and the planner that chains them.
 
 A derivation is one module with one function under ``@derives``; its parameters are a frozen dataclass. ``plan`` finds
-the cheapest chain from the layers that are stored to one that a format needs, prefers stored layers, ends on cycles,
-and when stuck says what to supply.
+the cheapest chain from the stored layers to a layer that a format needs. It prefers stored layers, stops at cycles, and
+if there is no chain, the error names the layer to supply.
 """
 
 from __future__ import annotations
@@ -25,28 +25,34 @@ from app.model.voxels import VoxelMap
 
 @dataclass(slots=True)
 class DerivationNotes(Notes):
-    """Where a step says what was doubtful, what it left out, and what it made up (it goes into the map's report)."""
+    """Notes of a step for the map's report: warnings, dropped data and filled-in values."""
 
 
 P = TypeVar("P")
 T = TypeVar("T")
 
 Function = Callable[[Layers, Any, DerivationNotes], Layers]
-"""(stored and derived layers, parameters, notes) -> the new parts. Pure but for the notes."""
+"""Signature (layers, parameters, notes) -> new parts; the layers are stored or derived. Pure except for the notes."""
 
 Trial = Callable[[Layers, Any], None]
-"""(layers, parameters): raises what the function would raise on them, in a fraction of its time."""
+"""Signature (layers, parameters): raises the errors that the function would raise, in a fraction of its time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """One step. gives: the layer it makes. needs: the layers it reads. also: stored layers that it uses a part of where
-    they are there, and does without where they are not. cost: relative effort and loss, above 0.
+    """Derivation of one layer from others.
 
-    part_names: names of the parts that it makes, where these are others than the usual one. Such a step is no way to
-    the layer; it is taken where a part of such a name is asked for and not stored, and is given the layer's usual part,
-    whose frame it may take. is_terminal: what it makes is good for a map and not for deriving more (a grid that knows
-    of no obstacle). trial: says whether it works, where that is cheaper to tell than to do.
+    Attributes:
+        gives: layer that it creates.
+        needs: layers that it reads.
+        also: stored layers of which it uses a part if present; they are optional.
+        cost: relative effort and loss, above 0.
+        part_names: names of the parts that it creates, if they differ from the layer's default name. Such a derivation
+            does not provide the layer: it runs only if a part of such a name is requested and not stored, and it
+            receives the layer's default part, whose frame it may use.
+        is_terminal: whether the result is good for a map but not as input of other derivations (a grid without
+            obstacles).
+        trial: cheap check whether the derivation works on given layers.
     """
 
     name: str
@@ -63,13 +69,14 @@ class Derivation:
     trial: Trial | None = None
 
     def step(self) -> Step:
-        """The derivation as it stands in a plan, with its default parameters."""
+        """Return this derivation as a step of a plan, with its default parameters."""
         return Step(self.name, self.gives, tuple(sorted(self.needs)), self.version, (), tuple(sorted(self.also)))
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A derivation as it stands in a plan. given: its parameters that differ from the defaults, sorted by name."""
+    """Step of a plan: a derivation with its parameters. given: parameters that differ from the defaults, sorted by
+    name."""
 
     name: str
     gives: Layer
@@ -80,11 +87,11 @@ class Step:
 
     @property
     def reads(self) -> frozenset[Layer]:
-        """All layers that it looks at."""
+        """All layers that the step reads."""
         return frozenset((*self.needs, *self.also))
 
     def as_dict(self) -> dict[str, Any]:
-        """The step as JSON, with all its parameters."""
+        """Return the step as JSON, with all its parameters."""
         defaults = {p["name"]: p["default"] for p in parameters.describe(all_derivations()[self.name].parameters)}
         values = {**defaults, **dict(self.given)}
         looked = {"also": list(self.also)} if self.also else {}
@@ -93,7 +100,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How to come from stored layers to the wanted ones: steps in order; empty where everything is stored."""
+    """Chain from stored layers to the required ones: steps in order; empty if everything is stored."""
 
     steps: tuple[Step, ...]
     cost: float
@@ -114,7 +121,7 @@ def derives(
     last: bool = False,
     trial: Trial | None = None,
 ) -> Callable[[Function], Function]:
-    """Declare a function as a derivation; its name is its id, its docstring's first line its title."""
+    """Register a function as a derivation: its name is the id, the first line of its docstring the title."""
 
     def declare(function: Function) -> Function:
         name = function.__name__
@@ -138,12 +145,12 @@ def derives(
 
 
 def all_derivations() -> Mapping[str, Derivation]:
-    """Every derivation by name, in alphabetical order."""
+    """Return all derivations by name, in alphabetical order."""
     return _registry.all()
 
 
 def ends_in_display_step(steps: Iterable[Mapping[str, Any]]) -> bool:
-    """Whether one of these steps, as provenance tells them, is the last one that a map may take (see ``last``)."""
+    """Return whether provenance steps include a terminal derivation (``is_terminal``)."""
     derivations = all_derivations()
     return any(
         name in derivations and derivations[name].is_terminal for name in (str(step.get("step")) for step in steps)
@@ -156,9 +163,9 @@ def plan(
     without: frozenset[str] = frozenset(),
     dead: frozenset[Layer] = frozenset(),
 ) -> Plan | None:
-    """The cheapest chain that adds what is wanted to what is available (Dijkstra over sets of layers), or None.
+    """Find the cheapest chain from available to required layers (Dijkstra over sets of layers), or None.
 
-    without: names of derivations that must not be part of it. dead: available layers that nothing is derived from.
+    without: names of derivations to exclude. dead: available layers that no derivation may use.
     """
     queue: list[tuple[float, int, frozenset[Layer], tuple[Step, ...]]] = [(0.0, 0, available, ())]
     done: set[frozenset[Layer]] = set()
@@ -182,8 +189,12 @@ def plan(
 
 @dataclass(frozen=True, slots=True)
 class ChainFailure:
-    """Why a chain does not work on what is stored. step: the one to blame, empty where none is. choose: it would, with
-    one of several things named."""
+    """Reason why a chain does not work on the stored layers.
+
+    Attributes:
+        step: derivation that failed; empty if none did.
+        choose: whether the chain would work if the request named one of several parts.
+    """
 
     step: str
     reason: str
@@ -191,23 +202,23 @@ class ChainFailure:
 
     @classmethod
     def from_error(cls, error: CannotDerive) -> ChainFailure:
-        """The failure that an error reports."""
+        """Create the failure that an error reports."""
         return cls(error.step, error.detail, error.choose)
 
     def as_error(self) -> CannotDerive:
-        """The error that reports this failure."""
+        """Return the error that reports this failure."""
         return CannotDerive(self.reason, step=self.step, choose=self.choose)
 
 
 def no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> CannotConvert:
-    """Nothing is left to try: what to name or to supply, and why the derivations that were tried found nothing."""
+    """Return the error for exhausted plans: what to name or to supply, and why each tried derivation failed."""
     unnamed = next((one for one in failed if one.choose), None)
     if unnamed is not None:
         return Ambiguous(unnamed.reason)
     if not failed:
         return error
     reasons = "; ".join(one.reason for one in failed)
-    return MissingLayer(f"{error.detail}; what is stored does not do: {reasons}", error.problems)
+    return MissingLayer(f"{error.detail}; the stored layers do not suffice: {reasons}", error.problems)
 
 
 def first_working(
@@ -215,11 +226,11 @@ def first_working(
     attempt: Callable[[P, Sequence[ChainFailure]], T],
     exhausted: Callable[[MissingLayer, Sequence[ChainFailure]], CannotConvert] = no_chain_error,
 ) -> T:
-    """What the cheapest plan gives whose derivations find something to use in the content.
+    """Carry out the cheapest plan whose derivations all find usable content.
 
-    make_plan: the cheapest plan without these derivations; MissingLayer if none is left, which ``exhausted`` turns into
-    the error to raise. attempt: carry out a plan, given the failures so far; CannotDerive names the step that failed.
-    All else that these raise is passed on.
+    make_plan: returns the cheapest plan without the given derivations; raises MissingLayer if none is left, which
+    ``exhausted`` turns into the error to raise. attempt: carries out a plan, given the failures so far; raises
+    CannotDerive with the step that failed. Other errors are passed on.
     """
     failed: list[ChainFailure] = []
     while True:
@@ -236,12 +247,12 @@ def first_working(
 
 
 def parameter_names(name: str) -> frozenset[str]:
-    """The names of a derivation's parameters."""
+    """Return the parameter names of a derivation."""
     return frozenset(f.name for f in dataclasses.fields(all_derivations()[name].parameters))
 
 
 def with_parameters(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step, ...]:
-    """The steps, each with those of the values that it knows. Invalid names what is wrong with one."""
+    """Return the steps, each with the values that are its parameters. Raises Invalid for an invalid value."""
     out = []
     for step in steps:
         step_values = {name: value for name, value in values.items() if name in parameter_names(step.name)}
@@ -251,7 +262,7 @@ def with_parameters(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[S
 
 
 def _is_empty_result(part: Part) -> bool:
-    """Whether a derived part is no information: no items, no voxels, or all cells unknown or free alike."""
+    """Return whether a derived part is empty: no items, no voxels, or all cells unknown or all free."""
     if isinstance(part, OccupancyGrid):
         first = part.cells[0, 0]
         return bool(first in (FREE, UNKNOWN) and (part.cells == first).all())
@@ -259,7 +270,10 @@ def _is_empty_result(part: Part) -> bool:
 
 
 def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = None) -> Layers:
-    """Carry out a plan: the layers with what each step adds. CannotDerive names the step that found nothing to use."""
+    """Carry out a plan: return the layers with each step's result added.
+
+    Raises CannotDerive with the step that failed if it raises CannotConvert or its result is empty.
+    """
     notes = notes or DerivationNotes()
     for step in steps:
         derivation = all_derivations()[step.name]
@@ -271,14 +285,14 @@ def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = N
             and all(map(_is_empty_result, derived_layers.parts_of(step.gives).values()))
         ):
             needs = " and ".join(step.needs)
-            reason = f"{step.name} finds nothing in the stored {needs} to make {step.gives} of: supply {step.gives}"
-            raise CannotDerive(f"{reason}, or {needs} with more in it", [Problem(reason)], step=step.name)
+            reason = f"{step.name} finds nothing in the stored {needs} to derive {step.gives} from: supply {step.gives}"
+            raise CannotDerive(f"{reason}, or {needs} with more content", [Problem(reason)], step=step.name)
         layers = Layers({**layers.parts, **derived_layers.parts}, layers.datum or derived_layers.datum, layers.levels)
     return layers
 
 
 def try_steps(steps: Sequence[Step], layers: Layers) -> None:
-    """Raise what ``run`` would raise; cheaper where the last step has a trial."""
+    """Raise the errors that ``run`` would raise; cheaper if the last step has a trial."""
     last = all_derivations()[steps[-1].name]
     if last.trial is None:
         run(steps, layers)
@@ -290,7 +304,7 @@ def try_steps(steps: Sequence[Step], layers: Layers) -> None:
 
 @contextlib.contextmanager
 def _as_derivation_error(step: Step) -> Iterator[None]:
-    """CannotDerive instead of CannotConvert: the step is to blame."""
+    """Turn CannotConvert into CannotDerive, which names the step."""
     try:
         yield
     except CannotConvert as error:

@@ -1,7 +1,7 @@
-"""Figures in a mask: what is round, what is a rectangle, what is a thin straight piece, and what is none of these.
+"""Detect shapes in a mask: discs, rectangles, thin straight walls, and irregular areas.
 
-Masks are uint8 [height, width] of zeros and ones, row 0 the lowest. Places are (x, y) in cells from the corner of cell
-(0, 0), so that the middle of cell (row, column) is (column + 0.5, row + 0.5).
+Masks are uint8 [height, width] of zeros and ones, row 0 the lowest. Positions are (x, y) in cells from the corner of
+cell (0, 0), so that the centre of cell (row, column) is (column + 0.5, row + 0.5).
 """
 
 from __future__ import annotations
@@ -16,36 +16,39 @@ from numpy.typing import NDArray
 from app.errors import CannotConvert
 
 ROUND = 0.8
-"""Share of its enclosing circle that a round figure fills: more than a square (0.64), less than an octagon (0.9)."""
+"""Minimum share of its enclosing circle that a disc fills: above a square (0.64), below an octagon (0.9)."""
 
 PARTLY, HOLLOW = 0.7, 0.88
-"""The same for a rim of which a part was not seen, and of its rectangle it then fills less than this (a disc 0.79)."""
+"""Minimum share of the enclosing circle for a partly seen rim, which must fill less than HOLLOW of its rectangle.
+
+A disc fills 0.79 of its rectangle.
+"""
 
 MIN_ASPECT = 0.7
-"""How wide a round figure is against its length at least."""
+"""Minimum ratio of width to length of a disc."""
 
 MIN_FILL = 0.85
-"""Share of its enclosing rectangle that a rectangle fills: more than a disc (0.79) or a triangle (0.5)."""
+"""Minimum share of its enclosing rectangle that a rectangle fills: above a disc (0.79) and a triangle (0.5)."""
 
 MAX_FIGURES = 200_000
-"""Figures, and edges of middle lines: more are noise."""
+"""Maximum number of shapes, and of centreline edges; more are noise."""
 
 MAX_PIECES = 2_000_000
-"""Pieces and holes of a mask, specks too."""
+"""Maximum number of connected pieces and holes of a mask, including specks."""
 
 ROWS_PER_BLOCK = 1024
-"""Rows that are looked at together."""
+"""Rows that are processed together."""
 
 STEP = 0.25
-"""Cells between the places at which a wall's width is looked up."""
+"""Distance in cells between the positions at which a wall's width is sampled."""
 
 MAX_SAMPLES = 64
-"""Places along a wall at which its width is looked up, at most."""
+"""Maximum number of positions along a wall at which its width is sampled."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A round figure in cells."""
+    """Disc, in cells."""
 
     x: float
     y: float
@@ -54,7 +57,7 @@ class Disc:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A rectangle in cells: its middle, its longer and its shorter side, and the direction of the longer one."""
+    """Rectangle in cells: its centre, its longer and its shorter side, and the direction of the longer one."""
 
     x: float
     y: float
@@ -65,7 +68,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class MaskShapes:
-    """What a mask shows. areas: polygons (shapely), in cells. specks: how many figures were too small."""
+    """Shapes found in a mask. areas: polygons (shapely), in cells. specks: number of shapes that were too small."""
 
     discs: list[Disc]
     boxes: list[Box]
@@ -76,9 +79,16 @@ class MaskShapes:
 
 @dataclass(frozen=True, slots=True)
 class ShapeLimits:
-    """How large figures are, in cells. speck: the least. disc: the widest round one. box: the longest rectangle.
-    wall: the widest wall. small: up to this length all counts as round. tolerance: how far straight edges may be from
-    the cells."""
+    """Size limits of shapes, in cells.
+
+    Attributes:
+        speck: smallest shape.
+        disc: widest disc.
+        box: longest rectangle.
+        wall: widest wall.
+        small: length up to which every shape counts as a disc.
+        tolerance: maximum distance of straight edges from the cells.
+    """
 
     speck: float
     disc: float
@@ -89,21 +99,21 @@ class ShapeLimits:
 
 
 def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits) -> MaskShapes:
-    """All figures of a mask, in order of their rows and columns.
+    """Find all shapes of a mask, in order of their rows and columns.
 
-    free: bool [height, width], which cells are known to be free; what closes around such a cell is no solid figure but
-    walls around a room. CannotConvert where there are more figures than ``MAX_FIGURES``.
+    free: bool [height, width], cells known to be free; an outline that encloses such a cell is no solid shape but the
+    walls of a room. Raises CannotConvert if there are more than ``MAX_FIGURES`` shapes.
     """
     import cv2
 
     if pieces(mask) > MAX_PIECES:
-        raise CannotConvert(f"this is noise: it has more than {MAX_PIECES} pieces and holes")
+        raise CannotConvert(f"the grid is too noisy: it has more than {MAX_PIECES} pieces and holes")
     contours, tree = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     shapes = MaskShapes([], [], [], [], 0)
     specks = 0
     rest = np.zeros(mask.shape, np.uint8)
     links = np.empty((0, 4), np.int64) if tree is None else np.asarray(tree[0], np.int64)
-    # (row, column) of each figure's first cell: the order of the findings does not hang on OpenCV's.
+    # (row, column) of each shape's first cell: the order must not depend on OpenCV
     outer = [k for k in range(len(contours)) if links[k, 3] < 0]
     outer.sort(key=lambda k: tuple(contours[k][:, 0, ::-1].min(axis=0).tolist()))
     for k in outer:
@@ -117,7 +127,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
         while child >= 0:
             inner.append(child)
             child = int(links[child, 0])
-        # What is larger than a disc or a box, and wider than a wall, is none of these anyway.
+        # a shape larger than a disc or a box, and wider than a wall, is none of these
         small = box.length <= max(sizes.disc, sizes.box) or box.width <= sizes.wall
         room = small and any(_has_free_cell(contours[c], free) for c in inner)
         disc = None if room else _disc(points, sides, sizes)
@@ -135,7 +145,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
 
 
 def _has_free_cell(contour: Any, free: NDArray[np.bool_]) -> bool:
-    """Whether a hole has a free cell."""
+    """Return whether a hole contains a free cell."""
     import cv2
 
     x, y, w, h = cv2.boundingRect(contour)
@@ -146,7 +156,7 @@ def _has_free_cell(contour: Any, free: NDArray[np.bool_]) -> bool:
 
 
 def pieces(mask: NDArray[np.uint8]) -> int:
-    """How many pieces and holes a mask has at most: cells that begin one, with none of the same before and above."""
+    """Return an upper bound of the number of pieces and holes: cells that differ from the cells before and above."""
     height, width = mask.shape
     count = 0
     for start in range(0, height, ROWS_PER_BLOCK):
@@ -161,7 +171,7 @@ def pieces(mask: NDArray[np.uint8]) -> int:
 
 
 def _cells(contour: Any) -> float:
-    """How many cells a figure has, its holes filled: Pick's theorem for the polygon through the cells' middles."""
+    """Count the cells of a shape with its holes filled: Pick's theorem for the polygon through the cell centres."""
     import cv2
 
     steps = np.abs(np.diff(contour[:, 0, :], axis=0, append=contour[:1, 0, :])).max(axis=1)
@@ -169,10 +179,10 @@ def _cells(contour: Any) -> float:
 
 
 def _rectangle(contour: Any) -> tuple[Box, float, tuple[float, float]]:
-    """The smallest rectangle around a figure, the share of it that the figure fills, and its sides between middles.
+    """Return the smallest rectangle around a shape, the share that the shape fills, and its sides between cell centres.
 
-    The sides are longer than those between the middles of cells, by a cell where a rectangle lies straight, by less
-    where it is turned: by as much as makes its area that of the cells.
+    The sides of the rectangle are longer than those between cell centres: by one cell if it is axis-aligned, by less if
+    it is rotated, so that its area matches that of the cells.
     """
     import cv2
 
@@ -188,7 +198,7 @@ def _rectangle(contour: Any) -> tuple[Box, float, tuple[float, float]]:
 
 
 def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: ShapeLimits) -> Disc | None:
-    """A round figure, or None. sides: of the rectangle around it, between the middles of cells."""
+    """Return the shape as a disc, or None. sides: of the rectangle around it, between cell centres."""
     import cv2
 
     (x, y), reach = cv2.minEnclosingCircle(points.astype(np.float32))
@@ -196,7 +206,7 @@ def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: ShapeLimits) 
     if 2 * radius > sizes.disc:
         return None
     hull = cv2.convexHull(points)
-    # Half a cell more all around (Steiner's formula): contours run through the middles of cells.
+    # half a cell more all around (Steiner's formula): contours run through cell centres
     area = cv2.contourArea(hull) + 0.5 * cv2.arcLength(hull, True) + math.pi / 4
     length, width = sides[0] + 1, sides[1] + 1
     share = area / (math.pi * radius**2)
@@ -208,7 +218,7 @@ def _disc(points: NDArray[Any], sides: tuple[float, float], sizes: ShapeLimits) 
 
 
 def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> None:
-    """Figures that are neither: their thin parts are walls, the others rectangles or areas."""
+    """Split the remaining shapes: thin parts become walls, the others rectangles or areas."""
     from app.derive import _skeleton
 
     rows, columns = np.flatnonzero(rest.any(axis=1)), np.flatnonzero(rest.any(axis=0))
@@ -222,10 +232,10 @@ def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShape
     if not thin.any():
         return
     free_space = _skeleton.space(thin.copy(), 0, 0, 0.0)
-    # Ends that reach less than their width out of a wall are its roughness.
+    # branches that reach less than their width out of a wall are roughness
     graph, _ = _skeleton.skeleton(free_space, merge=2.0, spur=sizes.speck, tolerance=sizes.tolerance, island=0.0)
     if len(graph.edges) > MAX_FIGURES:
-        raise CannotConvert(f"this is no place with walls: thin pieces have more than {MAX_FIGURES} edges")
+        raise CannotConvert(f"the grid shows no walls: its thin pieces have more than {MAX_FIGURES} edges")
     ends = straighten_lines(graph.nodes[:, ::-1].astype(np.float64), graph.edges, sizes.tolerance)
     for a, b in ends:
         wall = _wall(thin, a + 0.5, b + 0.5, sizes.wall)
@@ -234,14 +244,14 @@ def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShape
 
 
 def _open_mask(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
-    """What is wider than two radii, with its corners. The mask has a border of zeros."""
+    """Return the parts of a mask wider than two radii, including their corners. The mask has a border of zeros."""
     from app.derive import _skeleton
 
     core = _skeleton.space(mask.copy(), 0, 0, radius)
     if not core.cells:
         return np.zeros(mask.shape, np.uint8)
-    # The corner of a square is 0.41 radii beyond the circle in it. What is beyond the arrays counts as core to these
-    # kernels, so that it is moved out of reach.
+    # The corner of a square is 0.41 radii beyond its inscribed circle. These kernels count everything outside the
+    # arrays as core, so it is moved out of reach.
     edge = int(1.5 * radius) + 2
     far = _skeleton.space(np.pad(1 - core.mask, edge, constant_values=1), 0, 0, 1.5 * radius).mask
     far = far[edge:-edge, edge:-edge]
@@ -249,7 +259,7 @@ def _open_mask(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:
 
 
 def _areas(thick: NDArray[np.uint8], sizes: ShapeLimits, mask_shapes: MaskShapes, at: NDArray[np.float64]) -> list[Any]:
-    """Rectangles among the thick figures go to the boxes; the others' outlines, in order of their rows."""
+    """Add rectangular thick shapes to the boxes and return the outlines of the others, in order of their rows."""
     import cv2
     import shapely
 
@@ -282,9 +292,9 @@ def _areas(thick: NDArray[np.uint8], sizes: ShapeLimits, mask_shapes: MaskShapes
 def straighten_lines(
     nodes: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """The ends of straight lines, each of edges that go on where another ends and that it passes within ``tolerance``.
+    """Join edges into straight lines within ``tolerance`` and return the end points of each line.
 
-    At each node the pair that is straightest is joined first. Lines are in the order of their first edges.
+    At each node the straightest pair is joined first. Lines are in the order of their first edges.
     """
     lines: dict[int, list[int]] = {k: [int(a), int(b)] for k, (a, b) in enumerate(edges)}
     at: dict[int, set[int]] = {}
@@ -315,14 +325,14 @@ def straighten_lines(
 
 
 def _join_lines(one: list[int], other: list[int], node: int) -> list[int]:
-    """Two lines as one that runs through a common end."""
+    """Join two lines at a common end."""
     first = one if one[-1] == node else one[::-1]
     second = other if other[0] == node else other[::-1]
     return [*first, *second[1:]]
 
 
 def _distance_from_line(line: NDArray[np.float64], tolerance: float) -> float | None:
-    """How far the straight line between the ends is from the corners; None if too far, or if the line turns back."""
+    """Return the maximum distance of the corners from the chord; None if above tolerance, or if the line turns back."""
     chord = line[-1] - line[0]
     length = float(np.hypot(*chord))
     if length == 0.0:
@@ -336,7 +346,7 @@ def _distance_from_line(line: NDArray[np.float64], tolerance: float) -> float | 
 
 
 def _wall(thin: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64], widest: float) -> Box:
-    """A straight wall from the middle line of one: as wide as its cells, in their middle, to where they end."""
+    """Fit a straight wall to a centreline: as wide as its cells, centred in them, up to where they end."""
     length = float(np.hypot(*(b - a)))
     along = (b - a) / length
     across = np.array([-along[1], along[0]])
@@ -356,7 +366,7 @@ def _wall(thin: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64
 def _reach(
     mask: NDArray[np.uint8], places: NDArray[np.float64], direction: NDArray[np.float64], max_distance: float
 ) -> NDArray[np.float64]:
-    """How far cells of the mask go on from places in a direction, ``max_distance`` cells at most."""
+    """Measure how far the mask continues from positions in a direction, in cells; at most ``max_distance``."""
     steps = np.arange(0.0, max_distance + 1.0, STEP) + STEP / 2
     at = np.floor(places[:, None, :] + direction * steps[:, None]).astype(np.int64)
     x = np.clip(at[..., 0], 0, mask.shape[1] - 1)

@@ -1,6 +1,6 @@
-"""Which straight ways a network gains by, as native code."""
+"""Greedy spanner: select the straight edges that shorten a network's detours, as native code."""
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ def _link(head: I64, following: I64, to: I64, weight: F64, place: int, a: int, b
 
 @native
 def spanner(count: int, edges: I64, length: F64, wanted: I64, straight: F64, detour: float, out: U8) -> None:
-    """Mark the wanted edges without which the way between their ends is more than ``detour`` times as long.
+    """Mark the wanted edges without which the path between their ends is more than ``detour`` times as long.
 
-    count: nodes. edges [m, 2] with their length are there already; wanted [n, 2] come in order, shortest first, and
-    each one that is marked counts as there for the next (the greedy spanner of Althöfer and others, 1993).
+    count: number of nodes. edges: existing edges [m, 2], with their lengths. wanted: candidates [n, 2], shortest first;
+    each marked one counts as existing for the next (the greedy spanner of Althöfer and others, 1993).
     """
     m, n = len(edges), len(wanted)
     head = np.full(count, -1, np.int64)
@@ -74,6 +74,6 @@ def spanner(count: int, edges: I64, length: F64, wanted: I64, straight: F64, det
 
 
 def compile_all() -> None:
-    """Call every kernel once on a tiny graph."""
+    """Compile all kernels: call each one once on a tiny graph."""
     pairs, lengths = np.array([[0, 1]], np.int64), np.ones(1)
     spanner(2, pairs, lengths, pairs, lengths, 1.5, np.zeros(1, np.uint8))

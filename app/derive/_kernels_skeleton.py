@@ -1,10 +1,10 @@
-"""The graph in the skeleton of a mask, as native code.
+"""Graph of the skeleton of a mask, as native code.
 
-Masks are [height, width] with a border of zeros, thinned by ``_kernels_thinning``; cells of the skeleton are listed by
-row and column, and paths hold places in that list.
+Masks are [height, width] with a border of zeros, thinned by ``_kernels_thinning``. Skeleton cells are listed by row and
+column, and paths hold indices into that list.
 """
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Graph = tuple[I64, I64, I64, I64, I64]
 
 @native
 def list_cells(mask: U8, cells: I32, rows: I64) -> None:
-    """The set cells as [n, 2] row and column, and where each row begins in that list ([height + 1])."""
+    """List the set cells as [n, 2] row and column, and the index at which each row begins ([height + 1])."""
     height, width = mask.shape
     n = 0
     for y in range(height):
@@ -58,7 +58,7 @@ def _neighbours(mask: U8, cells: I32, rows: I64, k: int, out: I64) -> int:
 
 @native
 def _walk(mask: U8, cells: I32, rows: I64, node: I64, done: U8, path: I64, used: int, at: int, following: int) -> int:
-    """Append the cells from node ``at`` over its neighbour ``following`` to the next node; cells of the path now."""
+    """Append the cells from node ``at`` via its neighbour ``following`` to the next node; return the path's length."""
     near = np.empty(8, np.int64)
     path[used] = at
     used += 1
@@ -76,11 +76,11 @@ def _walk(mask: U8, cells: I32, rows: I64, node: I64, done: U8, path: I64, used:
 
 @native
 def trace(mask: U8, cells: I32, rows: I64) -> Graph:
-    """The graph of a skeleton: (nodes, start, end, begin, path).
+    """Build the graph of a skeleton: (nodes, start, end, begin, path).
 
-    nodes: the cells that have other than two neighbours, and one cell of each ring. start, end: places of nodes for
-    each edge. Edge e runs over the cells ``path[begin[e] : begin[e + 1]]``, each next to the one before, the nodes'
-    own cells included.
+    nodes: cells with a number of neighbours other than two, and one cell of each ring. start, end: node indices of each
+    edge. Edge e runs along the cells ``path[begin[e] : begin[e + 1]]``, each adjacent to the one before, including the
+    nodes' own cells.
     """
     n = len(cells)
     near = np.empty(8, np.int64)
@@ -105,7 +105,7 @@ def trace(mask: U8, cells: I32, rows: I64) -> Graph:
             if phase == 0:
                 if node[k] < 0:
                     continue
-            else:  # rings, which no node has led to
+            else:  # rings, which no node leads to
                 if node[k] >= 0 or done[k]:
                     continue
                 node[k] = count
@@ -120,7 +120,7 @@ def trace(mask: U8, cells: I32, rows: I64) -> Graph:
                 used = _walk(mask, cells, rows, node, done, path, used, k, q)
                 last = path[used - 1]
                 if last == k and used - begin[edges] < 5:
-                    used = begin[edges]  # two cells beside a junction, around nothing
+                    used = begin[edges]  # two cells beside a junction that enclose nothing
                     continue
                 start[edges], end[edges] = node[k], node[last]
                 edges += 1
@@ -130,7 +130,7 @@ def trace(mask: U8, cells: I32, rows: I64) -> Graph:
 
 @native
 def _incidence(count: int, start: I64, end: I64, alive: U8) -> tuple[I64, I64]:
-    """The edges at each node: those of node v are ``edges[first[v] : first[v + 1]]`` (a loop stands there twice)."""
+    """Return the edges at each node: those of node v are ``edges[first[v] : first[v + 1]]`` (loops twice)."""
     first = np.zeros(count + 1, np.int64)
     for e in range(len(start)):
         if alive[e]:
@@ -162,10 +162,10 @@ def _lengths(cells: I32, begin: I64, path: I64) -> F64:
 
 @native
 def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> tuple[I64, I64, F64]:
-    """The junctions that lie together: (head, via, away).
+    """Cluster junctions that are close together: (head, via, away).
 
-    head: [nodes], the node that each is led on to, itself for one that stays; via: the edge towards it, or -1; away:
-    how far that is along the skeleton, in cells.
+    head: [nodes], the junction that each node is merged into, itself if it stays. via: the edge towards it, or -1.
+    away: its distance along the skeleton, in cells.
     """
     nodes, start, end = graph[:3]
     count = len(nodes)
@@ -199,10 +199,10 @@ def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> 
 
 @native
 def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
-    """One junction where several lie within ``radius`` cells of each other along the skeleton.
+    """Merge junctions within ``radius`` cells of each other along the skeleton.
 
-    The one farthest from obstacles stays, and edges of the others are led on to it over the cells between. Loops that
-    arise and are not longer than four times the radius go, since they lead nowhere.
+    The junction farthest from obstacles stays, and edges of the others are extended to it along the cells between.
+    Resulting loops of at most four times the radius are removed, since they lead nowhere.
     """
     nodes, start, end, begin, path = graph
     count, edges = len(nodes), len(start)
@@ -247,7 +247,7 @@ def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
 
 @native
 def _onwards(v: int, start: I64, end: I64, begin: I64, path: I64, via: I64, out: I64, used: int) -> int:
-    """Append the cells from node v, without its own, to its head."""
+    """Append the cells from node v (without its own) to its head."""
     while via[v] >= 0:
         e = via[v]
         low, high = begin[e], begin[e + 1] - 1
@@ -261,9 +261,10 @@ def _onwards(v: int, start: I64, end: I64, begin: I64, path: I64, via: I64, out:
 
 @native
 def prune(graph: Graph, gap: U16, cells: I32, spur: float) -> U8:
-    """Which edges stay when dead ends go that reach less than ``spur`` cells beyond the free circle of their junction.
+    """Mark the edges that remain after dead ends shorter than ``spur`` are removed.
 
-    Shortest first, one at a junction at a time; what had three branches has two then, and counts as a line.
+    The length of a dead end is measured in cells beyond the free circle of its junction. Removed are the shortest
+    first, one per junction and round; a junction that then has two branches counts as part of a line.
     """
     nodes, start, end, begin, path = graph
     count, edges = len(nodes), len(start)
@@ -312,10 +313,10 @@ def prune(graph: Graph, gap: U16, cells: I32, spur: float) -> U8:
 
 @native
 def chains(graph: Graph, alive: U8) -> tuple[I64, I64, I64]:
-    """The lines between junctions and ends: (lone, begin, path).
+    """Return the lines between junctions and ends: (lone, begin, path).
 
-    lone: cells of nodes without edges that never had any. Line c runs over the cells ``path[begin[c] : begin[c + 1]]``;
-    a ring without junctions begins and ends at one of its cells.
+    lone: cells of nodes that never had edges. Line c runs along the cells ``path[begin[c] : begin[c + 1]]``; a ring
+    without junctions begins and ends at one of its cells.
     """
     nodes, start, end, begin, path = graph
     count, edges = len(nodes), len(start)
@@ -361,10 +362,10 @@ def chains(graph: Graph, alive: U8) -> tuple[I64, I64, I64]:
 
 @native
 def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep: U8) -> None:
-    """Mark in ``keep`` (one for each place in ``path``) the corners of straight lines that replace each line.
+    """Simplify lines: mark in ``keep`` (one value per element of ``path``) the corners of their straight segments.
 
-    As Douglas and Peucker do it, but a straight line must also stay in the mask; it deviates by ``tolerance`` cells at
-    most. Steps to a neighbouring cell always may stay, so this always ends.
+    Like Douglas-Peucker, but each segment must also stay within the mask; it deviates by ``tolerance`` cells at most.
+    Steps between neighbouring cells are always allowed, so this terminates.
     """
     stack = np.empty((len(path) + 2, 2), np.int64)
     for c in range(len(begin) - 1):
@@ -399,7 +400,7 @@ def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep
 
 
 def compile_all() -> None:
-    """Call every kernel once on a tiny grid."""
+    """Compile all kernels: call each one once on a tiny grid."""
     mask = np.zeros((7, 9), np.uint8)
     mask[1:-1, 1:-1] = 1
     gap = np.zeros(mask.shape, np.uint16)

@@ -1,12 +1,12 @@
 """Free space for a round robot, as native code: distances to obstacles, erosion, and straight lines through cells.
 
 Grids are [height, width] with a border of one obstacle cell all around. Distances are between cell centres, in cells,
-as Nav2's inflation measures them; squared they are whole numbers, so all of this is exact. A distance is kept as the
-``gap`` of each cell, the distance to the next obstacle in its column (two bytes a cell): the distance in the plane
-follows from a few gaps of its row, so that no array of floats is needed.
+as in Nav2's inflation; their squares are integers, so all of this is exact. A distance is stored as the ``gap`` of each
+cell, the distance to the nearest obstacle in its column (two bytes per cell): the distance in the plane follows from a
+few gaps of its row, so no array of floats is needed.
 """
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 MAX_GAP = 65535
-"""The largest gap that is told apart."""
+"""Largest gap that can be stored."""
 
 
 @native
 def gaps(free: U8, out: U16) -> None:
-    """For each cell the distance to the nearest obstacle in its column."""
+    """Compute the distance of each cell to the nearest obstacle in its column."""
     height, width = free.shape
     for x in range(width):
         out[0, x] = 0
@@ -44,7 +44,7 @@ def gaps(free: U8, out: U16) -> None:
 
 @native
 def erode(gap: U16, radius2: float, out: U8) -> int:
-    """1 where the squared distance to every obstacle is more than radius2, else 0; how many such cells there are."""
+    """Set 1 if the squared distance to every obstacle is above ``radius2``, else 0; return the number of ones."""
     height, width = gap.shape
     reach = np.int64(np.floor(np.sqrt(radius2)))
     half = np.empty(reach + 1, np.int64)
@@ -71,7 +71,7 @@ def erode(gap: U16, radius2: float, out: U8) -> int:
 
 @native
 def distance2(gap: U16, y: int, x: int) -> int:
-    """The squared distance of one cell to the nearest obstacle."""
+    """Return the squared distance of one cell to the nearest obstacle."""
     best = np.int64(gap[y, x]) * np.int64(gap[y, x])
     k = 1
     while k * k < best:
@@ -85,7 +85,7 @@ def distance2(gap: U16, y: int, x: int) -> int:
 
 @native
 def clear(mask: U8, y0: int, x0: int, y1: int, x1: int) -> bool:
-    """Whether all cells that the straight line between two cell centres touches are in the mask."""
+    """Return whether all cells that the straight line between two cell centres touches are in the mask."""
     dx, dy = abs(x1 - x0), abs(y1 - y0)
     sx, sy = (1 if x1 > x0 else -1), (1 if y1 > y0 else -1)
     x, y, i, j = x0, y0, 0, 0
@@ -107,16 +107,16 @@ def clear(mask: U8, y0: int, x0: int, y1: int, x1: int) -> bool:
 
 @native
 def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
-    """The smallest squared distance to an obstacle over the cells that a straight line touches.
+    """Return the smallest squared distance to an obstacle of the cells that a straight line touches.
 
-    From one cell to the next a distance changes by as much as the cells are apart at most, so that far from obstacles
-    most cells need not be looked at.
+    Between two cells the distance changes at most by how far they are apart, so most cells far from obstacles are
+    skipped.
     """
     dx, dy = abs(x1 - x0), abs(y1 - y0)
     sx, sy = (1 if x1 > x0 else -1), (1 if y1 > y0 else -1)
     x, y, i, j = x0, y0, 0, 0
     best = distance2(gap, y, x)
-    slack = 0.0  # how far a cell must be from here to be nearer to an obstacle than the nearest so far
+    slack = 0.0  # distance that a cell must have from the current one to be nearer to an obstacle than the minimum
     while not (i == dx and j == dy):
         side = (1 + 2 * i) * dy - (1 + 2 * j) * dx
         if side == 0 and slack < 1.5:
@@ -127,7 +127,7 @@ def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
         if side >= 0:
             y += sy
             j += 1
-        slack -= 1.5  # more than a step to a diagonal neighbour
+        slack -= 1.5  # larger than a step to a diagonal neighbour
         if slack < 0.0:
             current = distance2(gap, y, x)
             best = min(best, current)
@@ -137,9 +137,9 @@ def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
 
 @native
 def widths(gap: U16, cells: I64, pairs: I64, out: F64) -> None:
-    """For each pair (places in ``cells``, [n, 2] row and column) the free width along its line, in cells.
+    """Compute the free width along the line of each pair (indices into ``cells``, [n, 2] row and column), in cells.
 
-    A corridor of n free cells is told as n wide where n is odd, else as n - 1.
+    A corridor of n free cells has width n if n is odd, else n - 1.
     """
     for k in range(len(pairs)):
         a, b = pairs[k, 0], pairs[k, 1]
@@ -149,21 +149,21 @@ def widths(gap: U16, cells: I64, pairs: I64, out: F64) -> None:
 
 @native
 def clearances(gap: U16, cells: I64, out: F64) -> None:
-    """The distance of each cell ([n, 2] row and column) to the nearest obstacle."""
+    """Compute the distance of each cell ([n, 2] row and column) to the nearest obstacle."""
     for k in range(len(cells)):
         out[k] = np.sqrt(distance2(gap, cells[k, 0], cells[k, 1]))
 
 
 @native
 def clear_pairs(mask: U8, cells: I64, pairs: I64, out: U8) -> None:
-    """For each pair (places in ``cells``) whether its straight line stays in the mask."""
+    """Compute for each pair (indices into ``cells``) whether its straight line stays within the mask."""
     for k in range(len(pairs)):
         a, b = pairs[k, 0], pairs[k, 1]
         out[k] = clear(mask, cells[a, 0], cells[a, 1], cells[b, 0], cells[b, 1])
 
 
 def compile_all() -> None:
-    """Call every kernel once on a tiny grid."""
+    """Compile all kernels: call each one once on a tiny grid."""
     free = np.zeros((5, 5), np.uint8)
     free[1:-1, 1:-1] = 1
     gap, mask = np.zeros((5, 5), np.uint16), np.zeros((5, 5), np.uint8)

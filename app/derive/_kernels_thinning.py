@@ -1,14 +1,14 @@
 """Thinning of a mask, as native code.
 
-It is that of Zhang and Suen (A fast parallel algorithm for thinning digital patterns, CACM 27, 1984), but each round
-looks only at cells whose neighbourhood has changed: the result is the same, cell for cell, at a fraction of the work.
-A block of 2 × 2 cells, which their rules delete altogether, keeps one cell, so that the skeleton has as many pieces
-and holes as the mask (pieces: 8-connected).
+Algorithm of Zhang and Suen (A fast parallel algorithm for thinning digital patterns, CACM 27, 1984), but each round
+checks only cells whose neighbourhood has changed: the result is equal, cell by cell, at a fraction of the work. A block
+of 2 × 2 cells, which their rules delete completely, keeps one cell, so that the skeleton has as many pieces and holes
+as the mask (pieces: 8-connected).
 
 Masks are [height, width] with a border of zeros.
 """
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from app.native import native
 
 DY = np.array([-1, -1, 0, 1, 1, 1, 0, -1], np.int64)
 DX = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)
-"""The eight neighbours, clockwise from the row above: bit k of a neighbourhood's code stands for neighbour k."""
+"""The eight neighbours, clockwise from the row above: bit k of a neighbourhood's code is neighbour k."""
 
 
 def pieces(code: int) -> int:
-    """Yokoi's number of a neighbourhood: how many 8-connected pieces the neighbours fall into without its cell."""
+    """Compute Yokoi's number: the number of 8-connected pieces of a neighbourhood without its centre."""
     q = [1 - (code >> k & 1) for k in range(8)]
     return sum(q[k] - q[k] * q[(k + 1) % 8] * q[(k + 2) % 8] for k in (0, 2, 4, 6))
 
 
 def _tables() -> tuple[U8, U8]:
-    """By code of a neighbourhood: bit 1 and 2 whether the first and second pass delete; whether a cell is redundant."""
+    """Build tables by neighbourhood code: bits 1 and 2 if the first or second pass deletes the cell; whether it is
+    redundant."""
     passes, redundant = np.zeros(256, np.uint8), np.zeros(256, np.uint8)
     for code in range(256):
         p = [code >> k & 1 for k in range(8)]
@@ -47,12 +48,12 @@ def _tables() -> tuple[U8, U8]:
 
 _PASSES, _REDUNDANT = _tables()
 _BLOCK = 4 | 8 | 16
-"""The neighbourhood of the upper left cell of a 2 × 2 block: east, south-east and south."""
+"""Neighbourhood of the upper left cell of a 2 × 2 block: east, south-east and south."""
 
 
 @native
 def steps(width: int) -> I64:
-    """From a cell to its eight neighbours, in a flat mask of this width."""
+    """Return the offsets from a cell to its eight neighbours, in a flat mask of this width."""
     out = np.empty(8, np.int64)
     for k in range(8):
         out[k] = DY[k] * width + DX[k]
@@ -61,10 +62,10 @@ def steps(width: int) -> I64:
 
 @native
 def slim(flat: U8, step: I64, cells: I32, count: int) -> int:
-    """Take away cells that can go without cutting anything, until there is none; how many are left.
+    """Delete redundant cells until none is left; return the number of remaining cells.
 
-    flat: of zeros and ones, one where a cell is; step: to its neighbours; cells: the first ``count`` of them are looked
-    at, and those that stay are moved to its beginning.
+    flat: zeros and ones. step: offsets to the neighbours. cells: its first ``count`` elements are checked, and the
+    remaining ones are moved to its beginning.
     """
     again = True
     while again:
@@ -87,7 +88,7 @@ def slim(flat: U8, step: I64, cells: I32, count: int) -> int:
 
 @native
 def _lone_block(mask: U8, y: int, x: int) -> bool:
-    """Whether the 2 × 2 cells from (y, x) on have no neighbours (those of (y, x) itself are known)."""
+    """Return whether the 2 × 2 cells from (y, x) on have no neighbours (those of (y, x) itself are already checked)."""
     height, width = mask.shape
     for j in range(-1, 3):
         for i in range(-1, 3):
@@ -113,7 +114,7 @@ def _count_cells(mask: U8) -> tuple[int, int]:
 
 @native
 def _list_edge(mask: U8, first: I32, second: I32) -> int:
-    """Mark the cells at the edge with 6, as waiting for both passes, and list them for each; how many they are.
+    """Set bits 2 and 4 of the cells at the edge (pending in both passes), list them for each pass, return their number.
 
     Cells whose only missing neighbours are diagonal cannot be deleted yet: they have seven.
     """
@@ -130,9 +131,9 @@ def _list_edge(mask: U8, first: I32, second: I32) -> int:
 
 @native
 def _delete(mask: U8, step: I64, cells: I32, count: int, bit: int, removed: I32) -> int:
-    """Delete those of the first ``count`` cells that the pass of this bit deletes, and list them; how many they are.
+    """Delete the cells among the first ``count`` that this bit's pass deletes, list them, and return their number.
 
-    All are judged before the first is deleted.
+    All are checked before the first is deleted.
     """
     width = mask.shape[1]
     flat = mask.ravel()
@@ -156,7 +157,7 @@ def _delete(mask: U8, step: I64, cells: I32, count: int, bit: int, removed: I32)
 
 @native
 def thin(mask: U8) -> int:
-    """Thin a mask of zeros and ones in place, to lines one cell wide; how many cells are left."""
+    """Thin a mask of zeros and ones in place, to lines one cell wide; return the number of remaining cells."""
     flat = mask.ravel()
     count, edge = _count_cells(mask)
     size = max(1024, edge * 2)
@@ -210,7 +211,7 @@ def _grow(array: I32, used: int, need: int) -> I32:
 
 
 def compile_all() -> None:
-    """Call every kernel once on a tiny grid."""
+    """Compile all kernels: call each one once on a tiny grid."""
     mask = np.zeros((7, 9), np.uint8)
     mask[1:-1, 1:-1] = 1
     thin(mask)

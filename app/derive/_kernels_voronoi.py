@@ -1,14 +1,13 @@
-"""The generalised Voronoi diagram of free space, as native code.
+"""Generalised Voronoi diagram of free space, as native code.
 
-Cells are taken away in order of their distance to obstacles, nearest first, as long as that changes neither pieces nor
-holes (distance-ordered homotopic thinning: Pudney, Distance-ordered homotopic thinning, CVIU 72, 1998). Anchors stay:
-cells between obstacles that lie on about opposite sides of them. What is left are the ridges of the distance, and
-between them the ways along which the distance is largest.
+Cells are deleted in order of their distance to obstacles, nearest first, unless that changes the pieces or holes
+(Pudney, Distance-ordered homotopic thinning, CVIU 72, 1998). Anchors stay: cells between obstacles on roughly opposite
+sides. The result are the ridges of the distance, and the paths of largest clearance between them.
 
 Masks are [height, width] with a border of zeros, as in ``_kernels_thinning``.
 """
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
 
 from __future__ import annotations
@@ -20,20 +19,23 @@ from app.derive._kernels_thinning import pieces, slim, steps
 from app.native import native
 
 _SIMPLE = np.array([pieces(code) == 1 for code in range(256)], np.uint8)
-"""By code of a neighbourhood (``_kernels_thinning``): whether a cell can go without changing pieces or holes."""
+"""By neighbourhood code (``_kernels_thinning``): whether a cell can be deleted without changing pieces or holes."""
 
 OPPOSITE = 1.6
-"""Obstacles that are this many times as far from each other as from a cell lie on opposite sides: 106 degrees as seen
-from it, so that the bisectors of right-angled corners lead nowhere, and a corridor's middle (180 degrees) stays."""
+"""Minimum ratio of the distance between two obstacles to their distance from a cell that makes them opposite.
+
+It is 106 degrees as seen from the cell, so bisectors of right-angled corners are no anchors, and the centreline of a
+corridor (180 degrees) is one.
+"""
 
 
 @native
 def envelope(gap: U16, y: int, at: I64, until: F64, far: I64, column: I64) -> None:
-    """For each cell of a row the squared distance to the nearest obstacle, and the column in which that lies.
+    """Compute for each cell of a row the squared distance to the nearest obstacle, and that obstacle's column.
 
-    The lower envelope of the row's parabolas (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions,
-    2012); rows begin and end with an obstacle, so that the distance is less than half the width. at, until: room of the
-    row's width, and one more.
+    Lower envelope of the row's parabolas (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions,
+    2012). Rows begin and end with an obstacle, so the distance is less than half the width. at, until: work arrays of
+    the row's width, and one more.
     """
     width = gap.shape[1]
     n = 0
@@ -63,7 +65,7 @@ def envelope(gap: U16, y: int, at: I64, until: F64, far: I64, column: I64) -> No
 
 @native
 def farthest(mask: U8, gap: U16) -> int:
-    """The largest squared distance of the mask's cells to their nearest obstacle."""
+    """Return the largest squared distance of the mask's cells to their nearest obstacle."""
     height, width = gap.shape
     at, until = np.empty(width, np.int64), np.empty(width + 1, np.float64)
     far, column = np.empty(width, np.int64), np.empty(width, np.int64)
@@ -78,16 +80,17 @@ def farthest(mask: U8, gap: U16) -> int:
 
 @native
 def _row(gap: U16, y: int, x: int) -> int:
-    """The row of the obstacle nearest to (y, x) in its column."""
+    """Return the row of the obstacle nearest to (y, x) in its column."""
     g = np.int64(gap[y, x])
     return y - g if y >= g and gap[y - g, x] == 0 else y + g
 
 
 @native
 def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
-    """Set bit 1 of the cells of the mask that lie between obstacles on opposite sides; how many these are.
+    """Set bit 1 of the mask's cells that lie between obstacles on opposite sides; return their number.
 
-    rank: of each cell, its distance to the nearest obstacle times ``scale``. Two rows of distances are all it keeps.
+    rank: output, the distance of each cell to its nearest obstacle times ``scale``. Only two rows of distances are
+    kept.
     """
     height, width = mask.shape
     at, until = np.empty(width, np.int64), np.empty(width + 1, np.float64)
@@ -107,7 +110,7 @@ def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
                 continue
             ax = column[current, x]
             ay = np.int64(_row(gap, y, ax))
-            # In the middle of an odd number of cells: the same distance to both sides.
+            # centre of an odd number of cells: equal distance to both sides
             g = np.int64(np.sqrt(far[current, x]))
             if g * g == far[current, x] and (
                 (y >= g and y + g < height and gap[y - g, x] == 0 and gap[y + g, x] == 0)
@@ -123,7 +126,7 @@ def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
                 bx = column[other, u]
                 by = np.int64(_row(gap, v, bx))
                 apart = np.sqrt((ax - bx) * (ax - bx) + (ay - by) * (ay - by))
-                # Neighbours see obstacles that are a cell farther apart, because they are at different places.
+                # neighbours may see obstacles up to one cell farther apart, because their positions differ
                 if apart - 1.0 >= OPPOSITE * (np.sqrt(far[current, x]) + np.sqrt(far[other, u])) / 2.0:
                     if far[other, u] > far[current, x]:
                         count += 1 if mask[v, u] & 2 == 0 else 0
@@ -136,7 +139,7 @@ def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
 
 @native
 def count_ranks(mask: U8, rank: U16, out: I64) -> None:
-    """How many cells of the mask there are of each rank ([65536])."""
+    """Count the mask's cells of each rank ([65536])."""
     height, width = mask.shape
     for y in range(height):
         for x in range(width):
@@ -146,8 +149,11 @@ def count_ranks(mask: U8, rank: U16, out: I64) -> None:
 
 @native
 def sort_band(mask: U8, rank: U16, low: int, high: int, place: I64, out: I32) -> None:
-    """The cells of the mask with ranks from ``low`` to before ``high``, by rank, then row and column, as places in the
-    flat mask. place: where the cells of each rank begin in ``out``, [high - low]; it is counted up."""
+    """List the mask's cells with ranks from ``low`` up to but excluding ``high``, by rank, row and column, as flat
+    indices.
+
+    place: start of each rank's cells in ``out``, [high - low]; it is advanced.
+    """
     height, width = mask.shape
     for y in range(height):
         for x in range(width):
@@ -159,8 +165,7 @@ def sort_band(mask: U8, rank: U16, low: int, high: int, place: I64, out: I32) ->
 
 @native
 def thin(mask: U8, order: I32, rank: U16) -> None:
-    """Take cells of a mask away in this order (places in the flat mask, nearest to obstacles first). Bit 1 marks
-    anchors, which stay."""
+    """Delete cells of a mask in this order (flat indices, nearest to obstacles first), except anchors (bit 1)."""
     flat, key = mask.ravel(), rank.ravel()
     step = steps(mask.shape[1])
     stack = np.empty(1024, np.int64)
@@ -171,7 +176,7 @@ def thin(mask: U8, order: I32, rank: U16) -> None:
         while size > 0:
             size -= 1
             cell = stack[size]
-            if flat[cell] != 1:  # gone, or an anchor
+            if flat[cell] != 1:  # already deleted, or an anchor
                 continue
             code = 0
             for k in range(8):
@@ -185,7 +190,7 @@ def thin(mask: U8, order: I32, rank: U16) -> None:
                 stack = larger
             for k in range(8):
                 other = cell + step[k]
-                # Those that come later are looked at then.
+                # cells of a higher rank are checked later
                 if flat[other] == 1 and key[other] <= now:
                     stack[size] = other
                     size += 1
@@ -193,10 +198,10 @@ def thin(mask: U8, order: I32, rank: U16) -> None:
 
 @native
 def finish(mask: U8, order: I32) -> int:
-    """Make what is left one cell wide, and of zeros and ones; how many cells are left.
+    """Thin the remaining cells to one cell wide, of zeros and ones; return their number.
 
-    Anchors may be two cells wide: those go that are no ends. order: the cells that are left, as for ``thin``; it is
-    used up.
+    Anchors may be two cells wide: those that are no ends are deleted. order: remaining cells, as for ``thin``;
+    overwritten.
     """
     flat = mask.ravel()
     for i in range(len(order)):
@@ -205,7 +210,7 @@ def finish(mask: U8, order: I32) -> int:
 
 
 def compile_all() -> None:
-    """Call every kernel once on a tiny grid."""
+    """Compile all kernels: call each one once on a tiny grid."""
     free = np.zeros((7, 9), np.uint8)
     free[1:-1, 1:-1] = 1
     gap = np.zeros(free.shape, np.uint16)

@@ -1,4 +1,4 @@
-"""A model that the operator supplies tells what a picture shows: of which family it is, and what belongs to it."""
+"""Segmentation by a model that the operator supplies: detect its family and run it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from app.errors import CannotConvert, Invalid, Problem
 
 
 def segments(ground: GroundImage, how: Segmentation, notes: DerivationNotes, name: str) -> Segments:
-    """What the model ``how.model`` finds in a picture.
+    """Segment an image with the model ``how.model``.
 
-    Two files are of the Segment-Anything family; one file that gives a table of boxes is of the YOLO family; one that
-    gives [1, classes, h, w] tells pixels. Raises CannotConvert, NotFound or TooLarge, which say what to supply, and
-    Invalid for parameters that belong to another family.
+    Two files are a model of the Segment-Anything family; one file that outputs a table of boxes is of the YOLO family;
+    one that outputs [1, classes, h, w] classifies pixels. Raises CannotConvert, NotFound or TooLarge, which name the
+    file to supply, and Invalid for parameters of another family.
     """
     supplied = _onnx.find_model(how.model or "")
     min_area = 1.0 if how.minimum_area is None else how.minimum_area
@@ -23,7 +23,7 @@ def segments(ground: GroundImage, how: Segmentation, notes: DerivationNotes, nam
         stable = _sam.MIN_STABILITY if how.stability is None else how.stability
         return _sam.segments(ground, model, sure, stable, how.points or _sam.POINTS, min_area, notes, name)
     problems = [
-        Problem(f"belongs to models of the Segment-Anything family, and {how.model} is none", where=word)
+        Problem(f"applies only to models of the Segment-Anything family, which {how.model} is not", where=word)
         for word in ("points", "stability")
         if getattr(how, word) is not None
     ]
@@ -36,9 +36,9 @@ def segments(ground: GroundImage, how: Segmentation, notes: DerivationNotes, nam
         return _pixels.segments(ground, _pixels.check_model(supplied, file), sure, min_area, notes, name)
     if 3 not in ranks:
         raise CannotConvert(
-            f"the model {supplied.name} is of no family that is known: of one file [1, 3, h, w] -> boxes [1, values, "
-            "n] (YOLO) or [1, classes, h, w] is expected, of Segment-Anything two files, "
-            f"{supplied.name}.encoder.onnx and {supplied.name}.decoder.onnx; it is {file.signature()}"
+            f"the model {supplied.name} has an unsupported signature {file.signature()}: supply one file [1, 3, h, w] "
+            "-> boxes [1, values, n] (YOLO) or -> [1, classes, h, w] (pixel classes), or for Segment-Anything two "
+            f"files, {supplied.name}.encoder.onnx and {supplied.name}.decoder.onnx"
         )
     sure = _yolo.MIN_CONFIDENCE if how.confidence is None else how.confidence
     return _yolo.segments(ground, _yolo.check_model(supplied, file), sure, min_area, notes, name)

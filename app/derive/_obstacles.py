@@ -1,4 +1,4 @@
-"""The objects of a site on their way to grids and voxels: what ``app.model.obstacles`` says of each, by level."""
+"""Collect the obstacles of each level from stored objects, for grids and voxels."""
 
 from __future__ import annotations
 
@@ -23,27 +23,31 @@ from app.model.osm_areas import ground_around, incomplete_areas, multipolygon_ar
 Array = NDArray[np.float64]
 
 DEFAULT_SURROUNDINGS_METRES = 5.0
-"""Metres around the origin of a solid that cannot be read: ground of which nothing is known."""
+"""Default radius of unknown ground around the origin of an unreadable solid, in metres."""
 
 NO_AREA = "they have neither an area nor a size"
-WITHOUT_FILES = "they say neither shapes nor a size: upload the files of their models with them"
-POINTS = "they are points: say their size, or draw their outlines"
+WITHOUT_FILES = "they have neither shapes nor a size: upload the files of their models too"
+POINTS = "they are points: state their size, or draw their outlines"
 INCOMPLETE = "their ways or nodes are missing, or their rings do not close: upload the whole area"
 
 MAX_TRIANGLES = 10_000_000
-"""Of all solids of a site together: a mesh of some megabytes can stand in a world many thousand times."""
+"""Maximum number of triangles of all solids together: a world can place a mesh of some megabytes thousands of times."""
 
-NOT_AN_OBSTACLE = "nothing in a robot's way"
+NOT_AN_OBSTACLE = "not an obstacle for robots"
 
 
 @dataclass(slots=True)
 class LevelObstacles:
-    """What stands on a level, in metres of the local frame.
+    """Obstacles and ground of a level, in metres of the local frame.
 
-    footprints: areas, lines or points (shapely); base and top: of each, metres above the level's floor (infinite where
-    nothing says). triangles: float64 [n, 3, 3] of all solids, their heights above the level's floor too; owner: whose
-    they are. free: ground that is known to be free. unknown: ground around solids that cannot be read and objects of
-    unknown extent, which is never free. unreadable: why they cannot, each reason once.
+    Attributes:
+        footprints: areas, lines or points (shapely).
+        base, top: of each footprint, metres above the level's floor; infinite if not stated.
+        triangles: float64 [n, 3, 3] of all solids, heights above the level's floor.
+        owner: index of the solid of each triangle.
+        free: ground known to be free.
+        unknown: ground around unreadable solids and objects of unknown extent, which is never free.
+        unreadable: reasons why solids are unreadable, each once.
     """
 
     footprints: list[Any] = field(default_factory=list)
@@ -57,13 +61,13 @@ class LevelObstacles:
 
     @property
     def count(self) -> int:
-        """How many obstacles there are."""
+        """Number of obstacles."""
         return len(self.footprints) + len(np.unique(self.owner))
 
     def cut(self, low: float, high: float) -> LevelObstacles:
-        """What of it stands between two heights above the floor, or where they are equal at that height."""
+        """Return the obstacles between two heights above the floor, or at that height if both are equal."""
         meets = (self.triangles[:, :, 2].min(axis=1) <= high) & (self.triangles[:, :, 2].max(axis=1) >= low)
-        # A solid around the band without a surface in it still fills it.
+        # a solid that spans the band without a surface in it still fills it
         meets = np.isin(self.owner, np.unique(self.owner[self._spans(low)])) | meets
         standing = [
             k for k, (base, top) in enumerate(zip(self.base, self.top, strict=True)) if base <= high and top > low
@@ -78,7 +82,7 @@ class LevelObstacles:
         )
 
     def _spans(self, height: float) -> NDArray[np.bool_]:
-        """The triangles of solids that reach from below a height to above it."""
+        """Mark the triangles of solids that reach from below a height to above it."""
         if not len(self.triangles):
             return np.zeros(0, bool)
         owners, index = np.unique(self.owner, return_inverse=True)
@@ -88,21 +92,21 @@ class LevelObstacles:
         return np.asarray(((lowest <= height) & (highest > height))[index])
 
     def draw(self, cells: NDArray[np.uint8], frame: raster.RasterFrame, low: float, high: float) -> None:
-        """Occupy every cell that is touched between two heights by what ``cut`` has given for them."""
+        """Mark every cell as occupied that an obstacle of ``cut`` touches between two heights."""
         slab = np.array([[low, high]])
         raster.paint(cells, raster.surfaces(self.triangles, frame, slab), OCCUPIED)
         raster.paint(cells, raster.insides(self.triangles, self.owner, frame, slab[:, 0]), OCCUPIED)
         raster.paint(cells, raster.areas(self.footprints, frame, touched=True), OCCUPIED)
 
     def draw_unknown(self, cells: NDArray[np.uint8], frame: raster.RasterFrame) -> None:
-        """Make the ground of ``unknown`` unknown where it is not occupied."""
+        """Mark the ground of ``unknown`` as unknown unless it is occupied."""
         if self.unknown:
             solid = cells == OCCUPIED
             raster.paint(cells, raster.areas(self.unknown, frame, touched=True), UNKNOWN)
             cells[solid] = OCCUPIED
 
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """The box around everything, seen from above; None where there is nothing."""
+        """Return the bounding box of everything, seen from above; None if there is nothing."""
         boxes = shapely.bounds(np.array([*self.footprints, *self.free], object)).reshape(-1, 4)
         if len(self.triangles):
             flat = self.triangles[:, :, :2].reshape(-1, 2)
@@ -124,24 +128,26 @@ def sites(
     surroundings: float = DEFAULT_SURROUNDINGS_METRES,
     unknown_radius: float = UNKNOWN_RADIUS_METRES,
 ) -> dict[str, LevelObstacles]:
-    """The sites of all levels that have objects; of several worlds one (``app.model.worlds``).
+    """Collect the obstacles of all levels that have objects; if there are several worlds, of one
+    (``app.model.worlds``).
 
-    surroundings: metres around a solid that cannot be read. unknown_radius: metres around an object of unknown extent.
-    Raises MissingDatum where objects are places on earth without one, Invalid where there is no such world.
+    surroundings: radius in metres around an unreadable solid. unknown_radius: metres around an object of unknown
+    extent. Raises MissingDatum if objects have WGS 84 coordinates and there is no datum, Invalid if there is no such
+    world.
     """
     solid_reader = solids.Solids(layers.resources(), visuals=visuals)
     out: dict[str, LevelObstacles] = {}
     reader = _Reader(layers, notes, solid_reader, doors_closed, surroundings, unknown_radius)
     parts = {key: part for key, part in layers.vector("objects").items() if len(part)}
     if world is not None and not any(worlds.names(part) for part in parts.values()):
-        raise Invalid("no world is stored", [Problem("no world is stored", where="world")])
+        raise Invalid("no world is stored: omit world", [Problem("no world is stored: omit world", where="world")])
     for key, part in parts.items():
         try:
             one, others = worlds.select_world(part, world)
         except NotFound as error:
             raise Invalid(error.detail, [Problem(error.detail, where="world")]) from error
         if others:
-            notes.warn(f"one world is looked at; ask for another one with world=: {', '.join(others)}")
+            notes.warn(f"only one world is used; select another one with world=: {', '.join(others)}")
         if len(one):
             reader.read(one, out.setdefault(key.level, LevelObstacles()), key.level)
     reader.report()
@@ -149,15 +155,15 @@ def sites(
 
 
 def unreadable_error(reasons: Iterable[str], summary: str) -> MissingLayer:
-    """The error for a map that would be a guess, since solids cannot be read. summary: what is therefore unknown."""
+    """Return the error for a map that unreadable solids would make a guess. summary: what is therefore unknown."""
     named = list(dict.fromkeys(reasons))
     more = f"; and {len(named) - 3} more" if len(named) > 3 else ""
-    detail = f"{summary}, since solids of the objects cannot be read: {'; '.join(named[:3])}{more}"
+    detail = f"{summary}, because solids of the objects cannot be read: {'; '.join(named[:3])}{more}"
     return MissingLayer(detail, [Problem(reason) for reason in named[:100]])
 
 
 class _Reader:
-    """Objects on their way to obstacles: what all parts share."""
+    """Converter of objects to obstacles, with the state that all parts share."""
 
     def __init__(
         self,
@@ -182,7 +188,7 @@ class _Reader:
         self.triangles = 0
 
     def read(self, part: Features, site: LevelObstacles, level: str) -> None:
-        """Sort a part's objects into a site."""
+        """Add a part's objects to a level's obstacles."""
         rows: list[int] = []
         for k, p in enumerate(part.properties):
             kind = str(p.get("kind") or "") or "without a kind"
@@ -217,7 +223,7 @@ class _Reader:
                 self._around(part, k, geometry, error.detail, site)
 
     def _outline(self, part: Features, k: int, geometry: Any, site: LevelObstacles, level: str) -> None:
-        """An object by its geometry in metres: a body, or ground that is free."""
+        """Add an object by its geometry in metres: as an obstacle, or as free ground."""
         p = part.properties[k]
         role = obstacles.object_role(p, doors_closed=self.doors_closed)
         if role == "bodiless":
@@ -245,9 +251,9 @@ class _Reader:
             self._around(part, k, geometry, NO_AREA, site)
 
     def _around(self, part: Features, k: int, geometry: Any, reason: str, site: LevelObstacles) -> None:
-        """The ground of an object of unknown extent. geometry: what there is of it, in metres."""
+        """Add the ground of an object of unknown extent. geometry: its known geometry, in metres."""
         p = part.properties[k]
-        if p.get("kind") != "floor":  # a floor is free only where it is known
+        if p.get("kind") != "floor":  # a floor of unknown extent is not free
             self._unknown(part, k, obstacles.object_surroundings(p, geometry, self.unknown_radius), reason, site)
 
     def _unknown(self, part: Features, k: int, ground: Any, reason: str, site: LevelObstacles) -> None:
@@ -276,16 +282,16 @@ class _Reader:
             self._mark_unknown_ground(_name(part, k), p, ground, [one.error.detail for one in unreadable], site)
         self.triangles += len(triangles)
         if self.triangles > MAX_TRIANGLES:
-            raise CannotConvert(f"the solids of the objects have more than {MAX_TRIANGLES} triangles")
+            raise CannotConvert(f"the solids of the objects have more than {MAX_TRIANGLES} triangles: simplify them")
         if unreadable and not len(triangles):
             return
         if len(triangles):
             self.shapes.setdefault(id(site), []).append(triangles - np.array([0.0, 0.0, self.layers.elevation(level)]))
         else:
-            self.left["with planes or pictures only"] += 1
+            self.left["with planes or images only"] += 1
 
     def _ground_around(self, part: Features, k: int) -> Any:
-        """The ground around an object whose solids cannot be placed."""
+        """Return the ground around an object whose solids cannot be placed."""
         try:
             geometry = part.select([k]).in_local(self.layers.frame)[0]
         except (Invalid, MissingDatum):
@@ -296,14 +302,14 @@ class _Reader:
     def _mark_unknown_ground(
         self, name: str, p: Properties, ground: Any, reasons: Iterable[str], site: LevelObstacles
     ) -> None:
-        """The ground around solids of unknown extent, and what of the object is seen or said to be there."""
+        """Add the ground around solids of unknown extent, including shapes of the object that can be read."""
         around = [ground]
         shapes = p.get("shapes")
         for shape in shapes if isinstance(shapes, (list, tuple)) else ():
             try:
                 around.append(self.seen.footprint({**p, "shapes": [shape]}))
             except (Invalid, TooLarge):
-                continue  # the disc stands for it
+                continue  # the disc covers it
         site.unknown.append(shapely.union_all(around))
         for reason in dict.fromkeys(reasons):
             self.unreadable.setdefault(reason, []).append(name)
@@ -311,7 +317,7 @@ class _Reader:
                 site.unreadable.append(reason)
 
     def finish(self, site: LevelObstacles) -> LevelObstacles:
-        """The site with its solids' triangles."""
+        """Return the level's obstacles with the triangles of their solids."""
         pieces = self.shapes.get(id(site), [])
         if pieces:
             site.triangles = np.concatenate(pieces)
@@ -319,19 +325,19 @@ class _Reader:
         return site
 
     def report(self) -> None:
-        """What was left out, and why."""
+        """Write dropped objects and warnings to the notes."""
         for kind, count in sorted(self.left.items()):
             self.notes.drop(f"objects {kind}", count, NOT_AN_OBSTACLE)
         for kind, count in sorted(self.shapeless.items()):
             self.notes.drop(f"objects {kind}", count, WITHOUT_FILES)
         self.notes.drop("objects", self.bodiless, NO_AREA)
-        self.notes.drop("objects", self.broken, "their ground cannot be read")
+        self.notes.drop("objects", self.broken, "their geometry is invalid")
         for reason, names in list(self.unreadable.items())[:100]:
             self._warn(names, "a solid that cannot be read", f"{reason}; the ground around it is unknown")
         for reason, names in list(self.unsized.items())[:100]:
             self._warn(names, "an unknown extent", f"{reason}; the ground around is unknown")
         if self.nowhere:
-            self._warn(self.nowhere, "no known place", "a grid may show their ground as free; give them a geometry")
+            self._warn(self.nowhere, "no known position", "a grid may show their ground as free; add a geometry")
         if self.unreadable:
             why = "solids that cannot be read have an unknown extent"
             self.notes.fill("surroundings", self.surroundings, why, "surroundings")

@@ -1,9 +1,8 @@
-"""Models in ONNX that the operator supplies: which there are, loading them, and asking them.
+"""ONNX models supplied by the operator: find, load and run them.
 
-They lie in the folder ``FLEETMAP_MODELS_DIR``: ``NAME.onnx``, or of the Segment-Anything family two files,
-``NAME.encoder.onnx`` and ``NAME.decoder.onnx`` (``_`` or ``-`` instead of the point, too), beside them ``NAME.json``
-where the model has classes. Together they are at most ``FLEETMAP_MODELS_MAX_BYTES`` large, weights kept in files of
-their own included.
+They are in the directory ``FLEETMAP_MODELS_DIR``: ``NAME.onnx``, or for the Segment-Anything family two files,
+``NAME.encoder.onnx`` and ``NAME.decoder.onnx`` (``_`` or ``-`` may replace the dot), with ``NAME.json`` beside them if
+the model has classes. Together, including external weight files, they have at most ``FLEETMAP_MODELS_MAX_BYTES``.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ MAX_MODEL_BYTES = 2 * 2**30
 INSTALL = 'models need onnxruntime, which is not installed: pip install "fleet-map-server[models]"'
 
 OVERLAP = 0.2
-"""Share of a tile that the next one shows, too."""
+"""Share of a tile that overlaps with the next one."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
 _PAIR = re.compile(r"(.+)[._-](encoder|decoder)", re.IGNORECASE)
@@ -50,20 +49,20 @@ Shape = list[int | str | None]
 
 @dataclass(frozen=True, slots=True)
 class ModelFiles:
-    """A model of the operator's. files: the model, or its encoder and its decoder."""
+    """Model files of the operator. files: the model, or its encoder and its decoder."""
 
     name: str
     files: tuple[Path, ...]
 
     @property
     def classes_file(self) -> Path:
-        """The file with its classes."""
+        """Path of the file with the model's classes."""
         return self.files[0].with_name(f"{self.name}.json")
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedModel:
-    """One loaded file. inputs and outputs: (type, shape) by name, in the file's order; free sizes are texts or None."""
+    """Loaded model file. inputs, outputs: (type, shape) by name, in the file's order; free sizes are texts or None."""
 
     session: Any
     name: str
@@ -71,17 +70,19 @@ class LoadedModel:
     outputs: Mapping[str, tuple[str, Shape]]
 
     def run(self, feed: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
-        """What it answers, by name, as float32. The values are given the types that it wants. CannotConvert where it
-        fails, or answers with something else than numbers."""
+        """Run the model and return its outputs by name, as float32. Inputs are cast to the types that it needs.
+
+        Raises CannotConvert if the model fails or outputs anything but numbers.
+        """
         given = {n: np.ascontiguousarray(v, _TYPES.get(self.inputs[n][0], np.float32)) for n, v in feed.items()}
         try:
             answer = self.session.run(list(self.outputs), given)
             return {n: np.asarray(a, np.float32) for n, a in zip(self.outputs, answer, strict=True)}
         except Exception as error:
-            raise CannotConvert(f"the model {self.name} fails: {str(error)[:300]}") from error
+            raise CannotConvert(f"the model {self.name} failed: {str(error)[:300]}") from error
 
     def signature(self) -> str:
-        """Its inputs and outputs, for people."""
+        """Return its inputs and outputs as readable text."""
 
         def describe(of: Mapping[str, tuple[str, Shape]]) -> str:
             return ", ".join(f"{n[:60]} [{', '.join(str(s)[:20] for s in shape)}]" for n, (_, shape) in of.items())
@@ -90,30 +91,31 @@ class LoadedModel:
 
 
 def find_model(name: str) -> ModelFiles:
-    """The operator's model of that name. CannotConvert or NotFound say what to supply, TooLarge what is too much."""
+    """Find a model of the operator by name.
+
+    Raises CannotConvert or NotFound, which name the files to supply, and TooLarge for files above the limit.
+    """
     folder = os.environ.get(FOLDER, "")
     if not folder:
         raise CannotConvert(
-            f"there are no models: the operator sets {FOLDER} to a folder with {name[:100]}.onnx, or "
+            f"no models are configured: set {FOLDER} to a directory that contains {name[:100]}.onnx, or "
             f"{name[:100]}.encoder.onnx and {name[:100]}.decoder.onnx"
         )
     models = _list_models(Path(folder))
     if not _NAME.fullmatch(name) or name not in models:
         near = did_you_mean(name, models)
-        raise NotFound(f"there is no model {name[:100]!r}{near}; there are: {', '.join(models) or 'none'}")
+        raise NotFound(f"unknown model {name[:100]!r}{near}; available: {', '.join(models) or 'none'}")
     files = models[name]
     max_bytes = int(os.environ.get(LARGEST) or MAX_MODEL_BYTES)
     stems = {file.stem for file in files}
     beside = (f for f in Path(folder).iterdir() if f.is_file() and any(f.name.startswith(stem) for stem in stems))
     if sum(f.stat().st_size for f in beside) > max_bytes:
-        raise TooLarge(
-            f"the files of the model {name} are larger than {max_bytes} bytes: the operator may set {LARGEST}"
-        )
+        raise TooLarge(f"the files of the model {name} are larger than {max_bytes} bytes: raise {LARGEST}")
     return ModelFiles(name, files)
 
 
 def _list_models(folder: Path) -> dict[str, tuple[Path, ...]]:
-    """The models of a folder by name, sorted."""
+    """List the models of a directory by name, sorted."""
     files = {f.stem: f for f in sorted(folder.glob("*.onnx"))}
     halves: dict[str, dict[str, Path]] = {}
     for stem, file in files.items():
@@ -125,7 +127,7 @@ def _list_models(folder: Path) -> dict[str, tuple[Path, ...]]:
 
 
 def load_session(file: Path, name: str) -> LoadedModel:
-    """A file's session on one thread, so that sums are made in one order: the same picture, the same map."""
+    """Load a file as a session on one thread: a fixed order of sums makes the result reproducible."""
     try:
         runtime = importlib.import_module("onnxruntime")
     except ModuleNotFoundError:
@@ -144,10 +146,10 @@ def load_session(file: Path, name: str) -> LoadedModel:
 
 
 def classes(model: ModelFiles, session: Any) -> tuple[tuple[str | None, ...], Mapping[str, Any]]:
-    """(the kind that each class becomes, or None; what else its file says).
+    """Read a model's classes: (the kind of each class, or None; other members of its file).
 
-    The file is a list of kinds, or a mapping with the list as ``classes``; without a file the names in the model's own
-    metadata (as Ultralytics writes them) count.
+    The file is a list of kinds, or an object with the list as ``classes``. Without a file, the names in the model's own
+    metadata are used (as written by Ultralytics). Raises CannotConvert if there are none.
     """
     file, name = model.classes_file, model.name
     metadata: Any
@@ -165,40 +167,42 @@ def classes(model: ModelFiles, session: Any) -> tuple[tuple[str | None, ...], Ma
     except (OSError, ValueError, SyntaxError, TypeError) as error:
         raise CannotConvert(f"the classes of the model {name} cannot be read: {error}") from error
     if not isinstance(metadata, list) or not metadata:
-        raise CannotConvert(f"the model {name} does not say its classes: put {name}.json beside it, a list of kinds")
+        raise CannotConvert(f"the model {name} states no classes: add {name}.json beside it with a list of kinds")
     if file.is_file() and not all(kind is None or kind in KINDS for kind in metadata):
         raise CannotConvert(f"{file.name}: each class must be null or one of {', '.join(KINDS)}")
     kinds = tuple(kind if kind in KINDS else None for kind in metadata)
     if not any(kinds):
-        raise CannotConvert(f"no class of the model {name} is one of {', '.join(KINDS)}: put {name}.json beside it")
+        raise CannotConvert(f"no class of the model {name} is one of {', '.join(KINDS)}: add {name}.json beside it")
     return kinds, more
 
 
 def input_side(model: ModelFiles, file: LoadedModel, reason: str, usual: int) -> int:
-    """The side of the one picture [1, 3, h, w] that a model takes. reason: why another one is wrong, for the error.
-    CannotConvert says what it should take."""
+    """Return the side in pixels of a model's single input image [1, 3, h, w].
+
+    reason: why the model is unsuitable, for the error. Raises CannotConvert, which states the expected input.
+    """
     (kind, shape), *more = file.inputs.values()
     if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
         raise CannotConvert(
-            f"the model {model.name} {reason}: its input is not one picture [1, 3, h, w] of floats; it is "
+            f"the model {model.name} {reason}: its input must be one image [1, 3, h, w] of floats, got "
             f"{file.signature()}"
         )
     return square(shape[2:], model.name, usual)
 
 
 def square(shape: Iterable[int | str | None], name: str, usual: int) -> int:
-    """The side of the pictures that a model takes, of its height and width. usual: where it takes any."""
+    """Return the side of a model's input images from their height and width. usual: side if the model accepts any."""
     sizes = [n for n in shape if isinstance(n, int)]
     if len(set(sizes)) > 1 or any(n < 32 or n > 4096 for n in sizes):
         raise CannotConvert(
-            f"the model {name} takes pictures of {' × '.join(str(n) for n in shape)}: square ones of 32 to 4096 pixels "
-            "are needed"
+            f"the model {name} has input images of {' × '.join(str(n) for n in shape)} pixels: they must be square, of "
+            "32 to 4096 pixels"
         )
     return sizes[0] if sizes else usual
 
 
 def starts(length: int, side: int) -> list[int]:
-    """Where tiles begin along an edge, the last one at its end."""
+    """Return the start of each tile along an edge; the last one ends at the edge's end."""
     if length <= side:
         return [0]
     step = max(1, int(side * (1 - OVERLAP)))

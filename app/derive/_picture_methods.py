@@ -1,4 +1,4 @@
-"""What the two derivations of pictures share: the method, and carrying it out."""
+"""Choose and run the segmentation method for imagery_to_objects and imagery_to_occupancy."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from app.model.imagery import LOCAL, GeoImage, display_pixels
 from app.model.resampling import resample
 
 THUMB = 2**20
-"""Pixels by which it is told whether a picture is a plan."""
+"""Maximum number of pixels of the thumbnail that decides whether an image is a floor plan."""
 
 
 def choose_method(picture: GeoImage, how: Segmentation) -> str:
-    """The method, found out where it is ``auto``. Invalid for parameters that belong to another one."""
+    """Return the segmentation method; ``auto`` is decided from the image.
+
+    Raises Invalid for parameters of another method.
+    """
     method: str = how.segmentation
     if method == "auto":
         step = max(1, round((picture.pixels.shape[0] * picture.pixels.shape[1] / THUMB) ** 0.5))
@@ -33,7 +36,7 @@ def choose_method(picture: GeoImage, how: Segmentation) -> str:
     wrong = [n for n in changed if method not in METHOD_PARAMETERS.get(n, (method,))]
     if wrong:
         problems = [
-            Problem(f"belongs to segmentation={METHOD_PARAMETERS[n][0]}, not to {method}", where=n) for n in wrong
+            Problem(f"applies only to segmentation={METHOD_PARAMETERS[n][0]}, not to {method}", where=n) for n in wrong
         ]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
     return method
@@ -42,10 +45,13 @@ def choose_method(picture: GeoImage, how: Segmentation) -> str:
 def segment_picture(
     on: GroundImage, picture: GeoImage, how: Segmentation, method: str, notes: DerivationNotes, name: str
 ) -> Segments:
-    """A picture told apart."""
+    """Segment an image by the chosen method."""
     if method == "model":
         if not how.model:
-            raise Invalid("model: name one", [Problem("segmentation=model needs the name of a model", where="model")])
+            raise Invalid(
+                "model is missing: name a model",
+                [Problem("missing: segmentation=model needs the name of a model", where="model")],
+            )
         return _model.segments(on, how, notes, name)
     nir = infrared_band(picture, how.near_infrared, name) if method == "index" else None
     return segments(on, how, method, nir, notes, name)
@@ -54,7 +60,7 @@ def segment_picture(
 def plan_to_grid(
     picture: GeoImage, frame: LocalFrame | None, how: Segmentation, notes: DerivationNotes, name: str
 ) -> OccupancyGrid:
-    """A plan as a grid."""
+    """Convert a floor plan to a grid."""
     upright = picture if picture.crs == LOCAL else resample(picture, frame, crs=LOCAL)
     speck = 0.05 if how.minimum_area is None else how.minimum_area
     return _plans.plan_to_grid(

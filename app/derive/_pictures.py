@@ -1,4 +1,4 @@
-"""Pictures for derivations: which one of a level is meant, and its pixels on a grid of the local frame."""
+"""Images for derivations: select one per level, and resample it to the local frame."""
 
 from __future__ import annotations
 
@@ -19,30 +19,36 @@ from app.model.resampling import resample
 from app.model.selection import parts_with_name, select_per_level
 
 SATELLITE = "satellite"
-"""The usual name of a picture."""
+"""Default name of an image."""
 
 STEPS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-"""Metres a pixel that are taken unless asked otherwise: the first that is no finer than the picture."""
+"""Default pixel sizes in metres: the first that is not finer than the image is used."""
 
 DEFAULT_MAX_PIXELS = 2**21
-"""Pixels up to which that is kept."""
+"""Maximum number of pixels at the default pixel size; larger images use a coarser one."""
 
 MAX_PIXELS = 2**25
-"""Pixels that are looked at whatever was asked for."""
+"""Maximum number of pixels at a requested pixel size."""
 
 OPAQUE = 128
-"""Alpha from which on there is a picture."""
+"""Minimum alpha of a valid pixel."""
 
 INFRARED = ("nir", "near infrared", "near-infrared", "near_infrared", "infrared")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundImage:
-    """A picture on a grid of the local frame, row 0 on top, north up.
+    """Image resampled to the local frame, row 0 on top, north up.
 
-    rgb: uint8 [h, w, 3]. valid: bool [h, w], where there is a picture. resolution: metres a pixel. left, top: metres of
-    the upper left corner. raw: the resampled bands. frame: the local frame (a passing one, where the environment has no
-    datum). grey: whether the picture has no colours. on_earth: whether the picture is anchored there.
+    Attributes:
+        rgb: uint8 [h, w, 3].
+        valid: bool [h, w], pixels that the image covers.
+        resolution: metres per pixel.
+        left, top: metres of the upper left corner.
+        raw: the resampled bands.
+        frame: the local frame; a temporary one if the environment has no datum.
+        grey: whether the image has no colours.
+        on_earth: whether the image is anchored in WGS 84.
     """
 
     rgb: NDArray[np.uint8]
@@ -57,12 +63,12 @@ class GroundImage:
 
     @property
     def transform(self) -> tuple[float, float, float, float, float, float]:
-        """Of pixels to metres."""
+        """Affine transform from pixels to metres."""
         return (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
 
 
 def select_pictures(layers: Layers, name: str | None) -> dict[PartKey, GeoImage]:
-    """One picture for each level: the named one, else ``satellite``, else the only one. NotFound, or Ambiguous."""
+    """Select an image per level: the named one, else ``satellite``, else the only one. Raises NotFound, Ambiguous."""
     pictures = {key: part for key, part in layers.parts_of("imagery").items() if isinstance(part, GeoImage)}
     if name is not None:
         return parts_with_name(pictures, name, "picture")
@@ -70,16 +76,16 @@ def select_pictures(layers: Layers, name: str | None) -> dict[PartKey, GeoImage]
 
 
 def picture_label(key: PartKey) -> str:
-    """What messages call a picture."""
-    return f"the picture {key.name!r} of level {key.level!r}"
+    """Return the name of an image for messages."""
+    return f"the image {key.name!r} of level {key.level!r}"
 
 
 def ground(
     picture: GeoImage, frame: LocalFrame | None, resolution: float | None, notes: DerivationNotes, name: str
 ) -> GroundImage:
-    """A picture as the local frame sees it. frame: None uses a passing one at a picture's own place on earth.
+    """Resample an image to the local frame. frame: None uses a temporary one at the image's own position.
 
-    Raises CannotConvert where it would be too large, Invalid where PROJ knows no way.
+    Raises CannotConvert if it would be too large, Invalid if PROJ has no transformation.
     """
     on_earth = picture.crs != LOCAL
     if on_earth and frame is None:
@@ -93,11 +99,11 @@ def ground(
                 break
         if resolution > size * 2:
             notes.fill(
-                "resolution", resolution, f"{name} is looked at in pixels of this size; a finer one can be given"
+                "resolution", resolution, f"{name} is segmented at this pixel size in metres; a finer one can be set"
             )
     if _count(picture, size, resolution) > MAX_PIXELS:
         raise CannotConvert(
-            f"{name} would have more than {MAX_PIXELS} pixels of {resolution:g} m: give a coarser resolution"
+            f"{name} would have more than {MAX_PIXELS} pixels of {resolution:g} m: use a coarser resolution"
         )
     try:
         seen = resample(picture, frame, crs=LOCAL, resolution=resolution, most_pixels=2 * MAX_PIXELS)
@@ -109,17 +115,20 @@ def ground(
     grey = bands < 3
     rgb = np.repeat(shown[..., :1], 3, axis=2) if grey else np.ascontiguousarray(shown[..., :3])
     if not valid.any():
-        raise CannotConvert(f"{name} shows nothing: all of it is transparent or without data")
+        raise CannotConvert(f"{name} is empty: every pixel is transparent or has no data")
     _, _, left, _, _, top = seen.transform
     return GroundImage(rgb, valid, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
 
 
 def infrared_band(picture: GeoImage, number: int | None, name: str) -> int | None:
-    """The place of the near-infrared band: the told one (counted from 1), else the one that says so."""
+    """Return the index of the near-infrared band: the given number (from 1), else the band described as such.
+
+    Raises CannotConvert for a band that does not exist or is an alpha band.
+    """
     count = picture.pixels.shape[2]
     if number is not None:
         if number > count:
-            raise CannotConvert(f"{name} has {count} bands, and no band {number}: correct near_infrared")
+            raise CannotConvert(f"{name} has {count} bands, no band {number}: correct near_infrared")
         if picture.colours[number - 1] in CLEAR:
             raise CannotConvert(f"band {number} of {name} is its {picture.colours[number - 1]}: correct near_infrared")
         return number - 1
@@ -133,16 +142,16 @@ def infrared_band(picture: GeoImage, number: int | None, name: str) -> int | Non
 
 
 def _middle(picture: GeoImage) -> Datum:
-    """The middle of a picture on earth."""
+    """Return the centre of an image in WGS 84."""
     outline = picture.outline()
     lonlat = crs_to_wgs84(picture.crs, np.column_stack([outline, np.zeros(len(outline))]))[:, :2].mean(axis=0)
     if not np.isfinite(lonlat).all():
-        raise CannotConvert("the picture lies at no place on earth: correct its CRS or transform")
+        raise CannotConvert("the image has no valid position on earth: correct its CRS or transform")
     return Datum(round(float(lonlat[1]), 9), round(float(lonlat[0]), 9))
 
 
 def _native(picture: GeoImage, frame: LocalFrame | None) -> float:
-    """Metres a pixel of the picture itself, in its middle."""
+    """Return the image's own pixel size in metres, at its centre."""
     if picture.crs == LOCAL or frame is None:
         a, b, _, d, e, _ = picture.transform
         return float(np.sqrt(abs(a * e - b * d)))
@@ -154,7 +163,7 @@ def _native(picture: GeoImage, frame: LocalFrame | None) -> float:
     p, q, r = frame.to_local(crs_to_wgs84(picture.crs, places)[:, :2])
     size = float(np.sqrt(abs((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))))
     if not np.isfinite(size) or size <= 0.0:
-        raise CannotConvert("the picture is too far from the datum: correct one of the two")
+        raise CannotConvert("the image is too far from the datum: correct one of the two")
     return size
 
 

@@ -1,8 +1,8 @@
-"""Models that tell each pixel: semantic segmentation.
+"""Semantic segmentation models, which classify each pixel.
 
-A tile of the picture goes in as float32 [1, 3, side, side], RGB from 0 to 1, less ``mean`` and over ``std`` (three
-numbers each in the model's ``NAME.json``; else ImageNet's, as torchvision has them). Out come logits [1, classes, h,
-w], as fine as the picture or coarser. Of a class's pixels each connected piece is a thing.
+Input is a tile of the image as float32 [1, 3, side, side], RGB from 0 to 1, minus ``mean`` and divided by ``std``
+(three numbers each in the model's ``NAME.json``; default: ImageNet's, as in torchvision). Output are logits [1,
+classes, h, w], as fine as the image or coarser. Each connected piece of a class is a region.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from app.derive._segments import Region, Segments, way_attributes
 from app.errors import CannotConvert
 
 SIDE = 512
-"""Pixels of a tile where a model takes any size."""
+"""Default side of a tile in pixels, for models that accept any size."""
 
 MIN_CONFIDENCE = 0.5
-"""Probability from which on a pixel is told, unless asked otherwise."""
+"""Default minimum probability of a classified pixel."""
 
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 MAX_SEGMENTS = 100_000
-"""Things in one picture: more is noise."""
+"""Maximum number of regions in one image; more are noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A loaded model. classes: the kind that each class becomes, or None. side: pixels of a tile."""
+    """Loaded model. classes: kind of each class, or None. side: pixels of a tile."""
 
     file: LoadedModel
     name: str
@@ -46,8 +46,8 @@ class Model:
 
 
 def check_model(supplied: ModelFiles, file: LoadedModel) -> Model:
-    """A loaded file as a model that tells pixels. CannotConvert says what it should take."""
-    side = input_side(supplied, file, "tells no pixels", SIDE)
+    """Return a loaded file as a pixel classification model. Raises CannotConvert, which states the expected input."""
+    side = input_side(supplied, file, "does not classify pixels", SIDE)
     kinds, metadata = classes(supplied, file.session)
     mean, deviation = (_three(metadata, word, usual, supplied) for word, usual in (("mean", MEAN), ("std", DEVIATION)))
     if (deviation <= 0).any():
@@ -62,7 +62,7 @@ def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], sup
         values = np.empty(0, np.float32)
     if values.shape != (3,) or not np.isfinite(values).all():
         raise CannotConvert(
-            f"{supplied.classes_file.name}: {word} must be three numbers, of red, green and blue from 0 to 1"
+            f"{supplied.classes_file.name}: {word} must be three numbers, for red, green and blue from 0 to 1"
         )
     return values
 
@@ -70,7 +70,7 @@ def _three(metadata: Mapping[str, Any], word: str, usual: tuple[float, ...], sup
 def segments(
     ground: GroundImage, model: Model, sure: float, min_area: float, notes: DerivationNotes, name: str
 ) -> Segments:
-    """What a model tells of each pixel. least: square metres."""
+    """Segment an image by the class of each pixel. min_area: square metres."""
     import cv2
 
     height, width = ground.valid.shape
@@ -81,7 +81,7 @@ def segments(
     rows, columns = starts(height, model.side), starts(width, model.side)
     for (i, row), (j, column) in itertools.product(enumerate(rows), enumerate(columns)):
         best, score = _tile(ground.rgb[row : row + model.side, column : column + model.side], model)
-        # Where two tiles show the same, each counts up to the middle.
+        # each of two overlapping tiles counts up to the middle of the overlap
         top, left = (_half(starts_, k, model.side) for starts_, k in ((rows, i), (columns, j)))
         inner = (slice(top, None), slice(left, None))
         at = (slice(row + top, row + best.shape[0]), slice(column + left, column + best.shape[1]))
@@ -100,7 +100,7 @@ def segments(
         small += int(count - 1 - large[1:].sum())
         if len(regions) + int(large[1:].sum()) > MAX_SEGMENTS:
             raise CannotConvert(
-                f"{name}: the model {model.name} tells more than {MAX_SEGMENTS} things: give minimum_area"
+                f"{name}: the model {model.name} finds more than {MAX_SEGMENTS} regions: set a larger minimum_area"
             )
         for piece in (np.flatnonzero(large[1:]) + 1).tolist():
             x, y, w, h, area = (int(v) for v in stats[piece])
@@ -112,20 +112,20 @@ def segments(
             regions.append(Region(kind, min(mean, 1.0), attributes))  # type: ignore[arg-type]
             label[at][inside] = len(regions)
     if not regions:
-        raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {sure:g}")
+        raise CannotConvert(f"{name}: the model {model.name} finds nothing with a confidence of at least {sure:g}")
     area = round(other * ground.resolution**2)
-    notes.drop("m² of ground", area, f"{name}: of classes that the model's operator gave no kind")
+    notes.drop("m² of ground", area, f"{name}: the classes of this model map them to no kind")
     notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m²")
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 
 def _half(starts_: list[int], k: int, side: int) -> int:
-    """Pixels at a tile's start that the tile before it tells."""
+    """Return the pixels at a tile's start that belong to the tile before it."""
     return (starts_[k - 1] + side - starts_[k]) // 2 if k else 0
 
 
 def _tile(part: NDArray[np.uint8], model: Model) -> tuple[NDArray[np.int64], Array]:
-    """(class, its probability) of each pixel of a tile."""
+    """Return (class, its probability) of each pixel of a tile."""
     import cv2
 
     side, count = model.side, len(model.classes)
@@ -136,8 +136,8 @@ def _tile(part: NDArray[np.uint8], model: Model) -> tuple[NDArray[np.int64], Arr
     logits = next(iter(answers.values()))
     if logits.ndim != 4 or logits.shape[:2] != (1, count) or 0 in logits.shape:
         raise CannotConvert(
-            f"the model {model.name} has other than {count} classes: it gives {logits.shape}, and "
-            f"[1, {count}, h, w] was expected"
+            f"the model {model.name} does not have {count} classes: it returns {logits.shape}, expected "
+            f"[1, {count}, h, w]"
         )
     full = np.stack([cv2.resize(one, (side, side), interpolation=cv2.INTER_LINEAR) for one in logits[0]])
     full = full[:, : part.shape[0], : part.shape[1]]

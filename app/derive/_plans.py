@@ -1,9 +1,9 @@
-"""A floor plan -> walls, rooms and what is outside.
+"""Convert a floor plan to walls, rooms and the ground outside.
 
-Ink is what is darker than Otsu's threshold between ink and paper. A room is what cannot be reached from the edge of the
-picture without crossing ink or a gap narrower than ``gap`` (doors, dashed lines). A shade between ink and paper that
-fills much of the picture evenly is the grey of ROS maps, which means unknown: such a plan tells itself what is outside,
-so all of its paper is free.
+Ink is darker than Otsu's threshold between ink and paper. A room cannot be reached from the edge of the image without
+crossing ink or a gap narrower than ``gap`` (doors, dashed lines). An even shade between ink and paper on much of the
+image is the grey of ROS maps, which means unknown: such a plan shows itself what is outside, so all of its paper is
+free.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from app.model.imagery import GeoImage, display_pixels, pixel_positions
 from app.model.raster import RasterFrame, check_frame
 
 RESOLUTION = 0.05
-"""Metres a cell unless asked otherwise or the picture is coarser."""
+"""Default cell size in metres, unless the image is coarser."""
 
 MAX_CELLS = 2**28
 MAX_SIDE_CELLS = 32767
 
 MIN_CONTRAST = 24
-"""Levels of grey by which ink and paper must differ."""
+"""Minimum difference in grey levels between ink and paper."""
 
 SHADE = 0.02
-"""Share of the picture from which on an even shade between ink and paper is no room."""
+"""Minimum share of the image of an even shade between ink and paper that counts as unknown."""
 
 MAX_ROOM_DISTANCE_METRES = 1.0
-"""Metres from a room beyond which ink is no wall but a title, a scale or a measure."""
+"""Distance from a room in metres beyond which ink is no wall but a title, a scale or a dimension."""
 
 ROOM = 1.0
-"""Square metres of the smallest room; what else ink encloses are letters, pillars and hollow walls."""
+"""Area of the smallest room in square metres; smaller enclosed areas are letters, pillars and hollow walls."""
 
 COLOURFUL, CHROMA = 0.05, 40
 PAPER = 0.4
@@ -45,7 +45,7 @@ PAPER = 0.4
 
 @dataclass(frozen=True, slots=True)
 class FloorPlanOptions:
-    """What a plan is made with. gap, speck: metres and square metres. outside: whether that is free."""
+    """Options of a floor plan conversion. gap: metres. speck: square metres. outside_free: whether outside is free."""
 
     gap: float
     speck: float
@@ -54,7 +54,7 @@ class FloorPlanOptions:
 
 
 def looks_like_plan(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
-    """Whether a picture is ink on paper: hardly any colour, and one bright shade on much of it."""
+    """Return whether an image is ink on paper: almost no colour, and one bright shade on much of it."""
     if not valid.any():
         return False
     pixels = rgb[valid]
@@ -64,12 +64,12 @@ def looks_like_plan(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
     grey = pixels.max(axis=1)
     counts = np.bincount(grey, minlength=256)
     around = np.convolve(counts, np.ones(17, np.int64), "same")
-    # Ink, too: a bright field with nothing darker in it is no plan.
+    # require ink, too: a bright field with nothing darker in it is no floor plan
     return bool(around[180:].max() >= PAPER * len(grey)) and bool((grey < 128).any())
 
 
 def to_grey(picture: GeoImage) -> NDArray[np.uint8]:
-    """The picture in grey on white paper: uint8 [h, w]."""
+    """Return the image in grey on white paper: uint8 [h, w]."""
     shown = display_pixels(picture)
     rgb = shown[..., :3] if shown.shape[2] >= 3 else shown[..., :1]
     grey = rgb[..., 0] if rgb.shape[2] == 1 else _luma(rgb)
@@ -86,9 +86,9 @@ def _luma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNotes, name: str) -> OccupancyGrid:
-    """A plan in the local frame as a grid: ink occupied, rooms free, else unknown. Its origin is a multiple of a cell.
+    """Convert a floor plan in the local frame to a grid: ink occupied, rooms free, the rest unknown.
 
-    Raises CannotConvert for a picture without ink or without a closed room.
+    The origin is a multiple of a cell. Raises CannotConvert for an image without ink or without a closed room.
     """
     import cv2
 
@@ -97,16 +97,16 @@ def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNote
     level = int(threshold)
     ink = grey <= level
     if ink.all() or not ink.any() or int(grey[~ink].mean()) - int(grey[ink].mean()) < MIN_CONTRAST:
-        raise CannotConvert(f"{name} is of one shade: there is no ink on paper in it. Ask with another segmentation")
+        raise CannotConvert(f"{name} has a single shade, with no ink on paper: use another segmentation")
     if ink.mean() > 0.5:
-        raise CannotConvert(f"{name} is dark all over, and no plan on bright paper. Ask with another segmentation")
+        raise CannotConvert(f"{name} is dark overall, not a plan on bright paper: use another segmentation")
     unknown = _shades(grey, level, notes, name)
     a, b, _, d, e, _ = picture.transform
     size = math.sqrt(abs(a * e - b * d))
     resolution = how.resolution or max(RESOLUTION, float(f"{size:.6g}"))
     corners = picture.outline()
     if not np.abs(corners).max() <= MAX_METRES:
-        raise CannotConvert(f"{name} reaches beyond the local frame")
+        raise CannotConvert(f"{name} extends beyond the local frame: correct its position or scale")
     low, high = corners.min(axis=0), corners.max(axis=0)
     frame = check_frame(
         RasterFrame.from_box((float(low[0]), float(low[1]), float(high[0]), float(high[1])), resolution),
@@ -116,7 +116,7 @@ def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNote
     walls = _walls(ink, picture, frame, size)
     paper, shaded = _sample_picture(~unknown, picture, frame)
     walls, specks = _drop_specks(walls, how.speck / resolution**2)
-    notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² is dirt or writing")
+    notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² counts as dirt or lettering")
     has_unknown = bool(unknown.any())
     if has_unknown:
         inside = (walls == 0) & paper & ~shaded
@@ -125,8 +125,8 @@ def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNote
         inside = _rooms(~outside & (walls == 0) & paper, ROOM / resolution**2)
     if not inside.any() and not how.outside_free:
         raise CannotConvert(
-            f"{name} encloses no room: its walls have openings wider than gap={how.gap:g} m. Give a wider gap, or "
-            "outside_free=true where all that is no wall is free"
+            f"{name} encloses no room: its walls have openings wider than gap={how.gap:g} m. Set a wider gap, or "
+            "outside_free=true if everything but walls is free"
         )
     cells = np.full(walls.shape, UNKNOWN, np.uint8)
     if how.outside_free:
@@ -143,7 +143,7 @@ def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNote
 
 
 def _shades(grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
-    """Pixels of even shades between ink and paper."""
+    """Mark pixels of even shades between ink and paper."""
     counts = np.bincount(grey.ravel(), minlength=256)
     paper = int(np.argmax(counts[level + 1 :])) + level + 1
     brightest = int(np.flatnonzero(counts > 0.05 * grey.size)[-1]) if (counts > 0.05 * grey.size).any() else paper
@@ -152,15 +152,18 @@ def _shades(grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: s
         return np.zeros(grey.shape, bool)
     listing = ", ".join(map(str, shades))
     notes.warn(
-        f"{name}: the even grey {listing} is taken as unknown, as in the maps of ROS: gap is not needed",
+        f"{name}: the even grey {listing} counts as unknown, as in ROS maps; gap has no effect",
         where="imagery",
     )
     return np.asarray(np.isin(grey, shades))
 
 
 def _walls(ink: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame, size: float) -> NDArray[np.uint8]:
-    """Cells with ink, uint8 [rows, columns], row 0 lowest: every pixel of ink marks the cell of its middle, and every
-    cell whose middle is ink is marked, so that no line is lost whichever of the two is finer."""
+    """Mark cells with ink, uint8 [rows, columns], row 0 lowest.
+
+    Marked are the cell of each ink pixel's centre and each cell whose centre is ink, so no line is lost at any ratio of
+    resolutions.
+    """
     walls = np.zeros((frame.height, frame.width), np.uint8)
     if size <= frame.resolution * 1.5:
         rows, columns = np.nonzero(ink)
@@ -177,7 +180,7 @@ def _walls(ink: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame, size: 
 def _sample_picture(
     bright: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(cells whose middle is in the picture, those of them where it is not bright)."""
+    """Return (cells whose centre is in the image, those of them that are not bright)."""
     a, b, c, d, e, f = picture.transform
     det = a * e - b * d
     height, width = bright.shape
@@ -197,7 +200,7 @@ def _sample_picture(
 
 
 def _drop_specks(walls: NDArray[np.uint8], min_area: float) -> tuple[NDArray[np.uint8], int]:
-    """Without pieces of ink that cover fewer cells than that, and how many they were."""
+    """Remove pieces of ink that cover fewer than ``min_area`` cells; return the rest and the number removed."""
     import cv2
 
     if min_area <= 1:
@@ -211,7 +214,7 @@ def _drop_specks(walls: NDArray[np.uint8], min_area: float) -> tuple[NDArray[np.
 
 
 def _rooms(inside: NDArray[np.bool_], min_area: float) -> NDArray[np.bool_]:
-    """Without pieces of fewer cells than that."""
+    """Remove pieces of fewer than ``min_area`` cells."""
     import cv2
 
     _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=4)
@@ -221,7 +224,7 @@ def _rooms(inside: NDArray[np.bool_], min_area: float) -> NDArray[np.bool_]:
 
 
 def _outside(walls: NDArray[np.uint8], radius: float) -> NDArray[np.bool_]:
-    """What is reached from beyond the edge through openings of more than two radii (in cells)."""
+    """Mark the cells reachable from beyond the edge through openings wider than two radii (in cells)."""
     import cv2
 
     margin = math.ceil(radius) + 2
@@ -230,7 +233,7 @@ def _outside(walls: NDArray[np.uint8], radius: float) -> NDArray[np.bool_]:
     core = (away > radius).astype(np.uint8)
     _, labels = cv2.connectedComponents(core, connectivity=4)
     reached = ((labels == labels[0, 0]) & (core == 1)).astype(np.uint8)
-    # Back to the walls, and not through them.
+    # grow back to the walls, but not through them
     open_ = (padded == 0).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     for _ in range(math.ceil(radius * 1.5)):

@@ -1,4 +1,4 @@
-"""A probabilistic roadmap over free cells, joined along the skeleton where samples alone do not."""
+"""Probabilistic roadmap over free cells; pieces that samples do not connect are joined along the skeleton."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 from app.derive._skeleton import FreeSpace, Graph, drop_blocked, lengths, pieces, subgraph, tidy
 
 MAX_LINKS = 16
-"""To how many nodes of the skeleton a sample may be joined."""
+"""Maximum number of skeleton nodes that a sample may be joined to."""
 
 
 def roadmap(
     free_space: FreeSpace, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int
 ) -> tuple[Graph, int]:
-    """Seeded samples joined to their nearest neighbours by collision-free straight lines. Lengths are in cells.
+    """Join seeded samples to their nearest neighbours by collision-free straight lines. Lengths are in cells.
 
     Half of the samples are drawn evenly from the space, half from the skeleton's nodes and edges, where clearance is
-    largest and narrow passages are met (as medial-axis roadmaps do). Pieces that samples leave apart are joined over
-    nodes of the skeleton, so that what the skeleton connects is connected; samples in places that the skeleton leaves
-    out, and those that see neither it nor another sample, are left out; how many is told.
+    largest and narrow passages are covered (as in medial-axis roadmaps). Unconnected pieces are joined via skeleton
+    nodes, so that the roadmap connects what the skeleton connects. Samples in places that the skeleton omits, and those
+    that see neither it nor another sample, are dropped. Returns the roadmap and the number of dropped samples.
     """
     from scipy.spatial import cKDTree
 
@@ -36,7 +36,7 @@ def roadmap(
 
 
 def _sample_along(skeleton: Graph, free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """Cells on the skeleton's edges, evenly by length."""
+    """Draw cells from the skeleton's edges, evenly by length."""
     if not len(skeleton.edges):
         return np.empty((0, 2), np.int64)
     length = lengths(skeleton.nodes, skeleton.edges)
@@ -47,7 +47,7 @@ def _sample_along(skeleton: Graph, free_space: FreeSpace, count: int, random: np
 
 
 def _sample_cells(free_space: FreeSpace, count: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """Different cells of the space, evenly."""
+    """Draw distinct cells of the space, evenly."""
     before = np.concatenate([[0], np.cumsum(free_space.mask.sum(axis=1, dtype=np.int64))])
     chosen = np.sort(random.choice(int(before[-1]), size=min(count, int(before[-1])), replace=False))
     rows = np.searchsorted(before, chosen, side="right") - 1
@@ -60,7 +60,10 @@ def _sample_cells(free_space: FreeSpace, count: int, random: np.random.Generator
 
 
 def _join_pieces(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[Graph, int]:
-    """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
+    """Join the roadmap's pieces with edges of the skeleton, and drop samples that nothing can join.
+
+    Returns the graph and the number of dropped samples.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial import cKDTree
@@ -72,12 +75,12 @@ def _join_pieces(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[
     pairs = np.stack([np.repeat(np.arange(n), k), near.reshape(-1) + n], axis=1).astype(np.int64)
     fallback_edges = np.concatenate([drop_blocked(pairs, nodes, free_space), skeleton.edges + n])
     links = np.concatenate([graph.edges, fallback_edges])
-    # A tree that prefers the roadmap's own edges, then short ways; a weight of 0 would mean no edge to scipy.
+    # A tree that prefers the roadmap's own edges, then short ones; scipy takes a weight of 0 as no edge.
     weight = np.concatenate([np.full(len(graph.edges), 1e-6), np.maximum(lengths(nodes, fallback_edges), 0.0) + 1e-3])
     size = n + more
     tree = minimum_spanning_tree(coo_array((weight, (links[:, 0], links[:, 1])), (size, size)).tocsr()).tocoo()
     added = np.stack([tree.row, tree.col], axis=1).astype(np.int64)[(tree.row >= n) | (tree.col >= n)]
-    # Ends of the tree that are nodes of the skeleton lead nowhere.
+    # leaves of the tree that are skeleton nodes lead nowhere
     while True:
         degree = np.bincount(added.ravel(), minlength=size)
         degree[:n] = 2
@@ -89,7 +92,7 @@ def _join_pieces(graph: Graph, skeleton: Graph, free_space: FreeSpace) -> tuple[
     remaining = np.ones(size, bool)
     remaining[n:] = False
     remaining[added.ravel()] = True
-    count, piece = pieces(Graph(nodes, links))  # with all of the skeleton: which pieces belong to it
+    count, piece = pieces(Graph(nodes, links))  # with the complete skeleton: which pieces belong to it
     connected = np.zeros(count, bool)
     connected[piece[n:]] = True
     remaining &= connected[piece]

@@ -1,23 +1,22 @@
-"""Models of the Segment-Anything family: an image encoder and a decoder of prompts, asked all over a picture.
+"""Models of the Segment-Anything family: an image encoder, and a prompt decoder queried at a grid of points.
 
-The files are those of facebookresearch/segment-anything's ``export_onnx_model.py`` (and of MobileSAM's, which has the
-same decoder), or of SAM 2 as it is commonly exported:
+Supported files are those of facebookresearch/segment-anything's ``export_onnx_model.py`` (and of MobileSAM, which has
+the same decoder), or of SAM 2 as it is commonly exported:
 
 ======= ===============================================================================================================
-encoder one picture -> ``image_embeddings``. Either [1, 3, side, side], normalised by ImageNet's mean and deviation and
+encoder one image -> ``image_embeddings``. Either [1, 3, side, side], normalised by ImageNet's mean and deviation and
         padded with 0, or [height, width, 3] with values 0 to 255, normalised and padded in the file itself. SAM 2:
-        [1, 3, side, side] -> ``image_embed`` and ``high_res_feats_…``, the picture stretched to the square
-decoder those, ``point_coords`` [n, points, 2] in pixels of the encoder's picture, ``point_labels`` [n, points] (1: in
-        the thing, -1: no point), ``mask_input`` [n, 1, side / 4, side / 4], ``has_mask_input`` [1], ``orig_im_size``
-        [2] (height, width; SAM 2 may do without) -> ``masks``, ``iou_predictions`` [n, m] and ``low_res_masks`` [n, m,
+        [1, 3, side, side] -> ``image_embed`` and ``high_res_feats_…``, the image stretched to the square
+decoder those, ``point_coords`` [n, points, 2] in pixels of the encoder's image, ``point_labels`` [n, points] (1: in
+        the object, -1: no point), ``mask_input`` [n, 1, side / 4, side / 4], ``has_mask_input`` [1], ``orig_im_size``
+        [2] (height, width; optional for SAM 2) -> ``masks``, ``iou_predictions`` [n, m] and ``low_res_masks`` [n, m,
         side / 4, side / 4], logits
 ======= ===============================================================================================================
 
-Masks are made as segment_anything's automatic mask generator makes them: at a grid of points in each tile, and in the
-whole picture made smaller; those of a low predicted IoU, or that change with the threshold, or end at a tile's edge
-are left out, and of those with nearly the same box the best of the finest tile stays. ``low_res_masks`` are preferred,
-since exports are known that cut ``masks`` as the picture of their export was. What a mask shows is told by its colour
-and shape.
+Masks are generated as by segment_anything's automatic mask generator: at a grid of points in each tile, and in the
+whole image scaled down. Masks with a low predicted IoU, masks that change with the threshold, and masks that end at a
+tile's edge are dropped; of those with nearly the same box the best of the finest tile stays. ``low_res_masks`` are
+preferred, because some exports crop ``masks`` to the image of their export. Masks are classified by colour and shape.
 """
 
 from __future__ import annotations
@@ -37,32 +36,32 @@ from app.derive._segments import ColourRules, Region, Segments
 from app.errors import CannotConvert
 
 DEFAULT_SIDE = 1024
-"""Pixels of a tile where the files do not say."""
+"""Default side of a tile in pixels, if the files do not state it."""
 
 MIN_SCORE, MIN_STABILITY, POINTS = 0.88, 0.95, 16
-"""Defaults: least predicted IoU and least stability of segment_anything, and points along a tile (there 32)."""
+"""Defaults: minimum predicted IoU and stability as in segment_anything, and points along a tile (there 32)."""
 
 OFFSET = 1.0
-"""By which the threshold is moved either way to see whether a mask is stable."""
+"""Offset of the threshold in both directions that tests a mask's stability."""
 
 MIN_DUPLICATE_OVERLAP = 0.7
-"""Intersection over union of boxes from which on two masks are one thing."""
+"""Minimum intersection over union of the boxes of duplicate masks."""
 
 EDGE = 20 / 1024
-"""Share of a tile's side: a mask that comes as near to an edge goes on beyond it."""
+"""Share of a tile's side: a mask that comes this close to an edge continues beyond it."""
 
 PROMPTS_PER_CALL = 16
-"""Prompts that are asked together where the decoder takes several."""
+"""Number of prompts per call, if the decoder accepts several."""
 
 MAX_TILES, MAX_PROMPTS = 256, 2**15
 
 MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 DEVIATION = np.array([58.395, 57.12, 57.375], np.float32)
-"""ImageNet's, of values 0 to 255."""
+"""ImageNet's standard deviations, for values 0 to 255."""
 
 PROMPT = ("point_coords", "point_labels", "mask_input", "has_mask_input")
 EXPECTED_MODEL = (
-    "an encoder with one picture [1, 3, side, side] or [height, width, 3] as its input, and a decoder with the inputs "
+    "an encoder with one image [1, 3, side, side] or [height, width, 3] as its input, and a decoder with the inputs "
     "image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size and the outputs masks, "
     "iou_predictions, low_res_masks (segment-anything's scripts/export_onnx_model.py), or SAM 2's with image_embed and "
     "high_res_feats_… in place of image_embeddings"
@@ -71,9 +70,15 @@ EXPECTED_MODEL = (
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """Both files. passed: the decoder's input for each of the encoder's outputs. side: pixels of a tile. upright:
-    whether the encoder takes [height, width, 3]. stretched: whether a tile fills the square, whatever its shape.
-    together: whether the decoder takes several prompts at once."""
+    """Loaded encoder and decoder.
+
+    Attributes:
+        passed: the decoder's input for each of the encoder's outputs.
+        side: pixels of a tile.
+        upright: whether the encoder takes [height, width, 3].
+        stretched: whether a tile fills the square, whatever its shape.
+        together: whether the decoder accepts several prompts at once.
+    """
 
     encoder: LoadedModel
     decoder: LoadedModel
@@ -87,8 +92,11 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Mask:
-    """One mask: its window in the picture's pixels, its pixels there (packed), its size in pixels, its predicted IoU,
-    its stability, and how large the tile was that it was seen in."""
+    """One mask of a detected region.
+
+    Attributes, in order: its window in the image's pixels, its pixels there (packed), its size in pixels, its predicted
+    IoU, its stability, and the size of the tile in which it was found.
+    """
 
     box: tuple[int, int, int, int]
     bits: NDArray[np.uint8]
@@ -98,20 +106,20 @@ class Mask:
     tile: int
 
     def pixels(self) -> NDArray[np.bool_]:
-        """The mask within its box."""
+        """Return the mask within its box."""
         x0, y0, x1, y1 = self.box
         return np.unpackbits(self.bits, count=(y1 - y0) * (x1 - x0)).astype(bool).reshape(y1 - y0, x1 - x0)
 
 
 def check_model(supplied: ModelFiles) -> Model:
-    """The two files as a model. CannotConvert says which inputs and outputs are expected."""
+    """Load the two files as a model. Raises CannotConvert, which states the expected inputs and outputs."""
     name = supplied.name
     encoder, decoder = (load_session(file, f"{name} ({file.name})") for file in supplied.files)
 
     def wrong(file: LoadedModel) -> CannotConvert:
         return CannotConvert(
-            f"the model {name} is not of the Segment-Anything family: expected are {EXPECTED_MODEL}; {file.name} is "
-            f"{file.signature()}"
+            f"the model {name} is not of the Segment-Anything family: expected {EXPECTED_MODEL}; {file.name} has the "
+            f"signature {file.signature()}"
         )
 
     if len(encoder.inputs) != 1:
@@ -149,10 +157,9 @@ def segments(
     notes: DerivationNotes,
     name: str,
 ) -> Segments:
-    """What a model sees as a thing of its own, the smaller ones above the larger ones. least: square metres.
+    """Segment an image into the regions that the model finds, smaller ones above larger ones. min_area: square metres.
 
-    Raises CannotConvert before work starts where the model would have to be asked too often, and where it finds
-    nothing.
+    Raises CannotConvert before work starts if the model would have to be queried too often, and if it finds nothing.
     """
     height, width = ground.valid.shape
     tiles = list(_tiles(height, width, model.side))
@@ -160,8 +167,8 @@ def segments(
     prompt_count = sum(len(p) for p in prompts)
     if len(tiles) > MAX_TILES or prompt_count > MAX_PROMPTS:
         raise CannotConvert(
-            f"{name}: the model {model.name} would be asked {prompt_count} times in {len(tiles)} tiles of {model.side} "
-            f"pixels, at most {MAX_PROMPTS} in {MAX_TILES} are done: give a coarser resolution than "
+            f"{name}: the model {model.name} would need {prompt_count} prompts in {len(tiles)} tiles of {model.side} "
+            f"pixels, above the maximum of {MAX_PROMPTS} in {MAX_TILES}: use a resolution coarser than "
             f"{ground.resolution:g} m, or fewer points than {points}"
         )
     masks: list[Mask] = []
@@ -171,13 +178,14 @@ def segments(
     best_masks = _drop_duplicates(masks)
     if not best_masks:
         raise CannotConvert(
-            f"{name}: the model {model.name} finds nothing of a confidence of {sure:g} and a stability of {stable:g}"
+            f"{name}: the model {model.name} finds nothing with a confidence of at least {sure:g} and a stability of "
+            f"at least {stable:g}"
         )
     return _masks_to_segments(ground, best_masks, model, min_area, notes, name)
 
 
 def _tiles(height: int, width: int, side: int) -> Iterator[tuple[int, int, int, int]]:
-    """(row, column, rows, columns) of the tiles: the whole picture, and where that is larger than a tile, its parts."""
+    """Return (row, column, rows, columns) of the tiles: the whole image, and if it is larger than a tile, its parts."""
     yield 0, 0, height, width
     if max(height, width) > side:
         for row, column in itertools.product(starts(height, side), starts(width, side)):
@@ -185,7 +193,7 @@ def _tiles(height: int, width: int, side: int) -> Iterator[tuple[int, int, int, 
 
 
 def _grid(tile: tuple[int, int, int, int], points: int, valid: NDArray[np.bool_]) -> Array:
-    """The points (x, y) of a tile that it is asked at, in its pixels: as dense both ways, where there is a picture."""
+    """Return the prompt points (x, y) of a tile in its pixels, equally dense in both directions, in valid pixels."""
     row, column, rows, columns = tile
     step = max(rows, columns) / points
     down, across = max(1, round(rows / step)), max(1, round(columns / step))
@@ -199,7 +207,7 @@ def _grid(tile: tuple[int, int, int, int], points: int, valid: NDArray[np.bool_]
 def _tile_masks(
     ground: GroundImage, tile: tuple[int, int, int, int], places: Array, model: Model, sure: float, stable: float
 ) -> list[Mask]:
-    """The good masks of one tile."""
+    """Return the masks of one tile that pass all thresholds."""
     import cv2
 
     row, column, rows, columns = tile
@@ -228,7 +236,7 @@ def _tile_masks(
 
 
 def _encode_image(image: Array, model: Model) -> dict[str, Array]:
-    """What the encoder says of a picture [h, w, 3] of values 0 to 255, by the decoder's names."""
+    """Encode an image [h, w, 3] of values 0 to 255; return the outputs by the decoder's input names."""
     if not model.upright:
         padded = np.zeros((model.side, model.side, 3), np.float32)
         padded[: image.shape[0], : image.shape[1]] = (image - MEAN) / DEVIATION
@@ -240,11 +248,11 @@ def _encode_image(image: Array, model: Model) -> dict[str, Array]:
 def _prompt_masks(
     at: Array, feed: Mapping[str, Array], size: tuple[int, int], inner: tuple[int, int], model: Model
 ) -> tuple[Array, Array]:
-    """(logits [m, h, w] of the tile alone, predicted IoU [m]) at each of the points, one mask after the other."""
+    """Return (logits [m, h, w] of the tile alone, predicted IoU [m]) for all points, one mask after the other."""
     n, low = len(at), model.side // 4
     prompt: dict[str, NDArray[Any]] = {
         **feed,
-        # A point that is none stands for the box that there is not (segment_anything's own example).
+        # a padding point (label -1) replaces the missing box prompt, as in segment_anything's own example
         "point_coords": np.stack([at, np.zeros_like(at)], axis=1),
         "point_labels": np.tile(np.array([1.0, -1.0], np.float32), (n, 1)),
         "mask_input": np.zeros((n, 1, low, low), np.float32),
@@ -259,9 +267,9 @@ def _prompt_masks(
     if masks.ndim != 4 or masks.shape[0] != n or scores.shape != masks.shape[:2] or 0 in masks.shape:
         raise CannotConvert(
             f"the model {model.name} answers {n} points with masks {masks.shape} and iou_predictions {scores.shape}: "
-            "expected were [points, masks, height, width] and [points, masks]"
+            "expected [points, masks, height, width] and [points, masks]"
         )
-    if masks.shape[1] == 4:  # the first is the one for several points, which a single point does not ask for
+    if masks.shape[1] == 4:  # the first mask is for several points; here each prompt has one
         masks, scores = masks[:, 1:], scores[:, 1:]
     if small is not None:
         down, across = (max(1, int(np.ceil(n * f / model.side))) for n, f in zip(inner, masks.shape[2:], strict=True))
@@ -271,7 +279,7 @@ def _prompt_masks(
 
 
 def _stability(logits: Array) -> float:
-    """Intersection over union of a mask with itself, at a higher and at a lower threshold (one holds the other)."""
+    """Return the IoU of a mask at a higher and at a lower threshold (the lower one contains the higher)."""
     low = int((logits > -OFFSET).sum())
     return int((logits > OFFSET).sum()) / low if low else 0.0
 
@@ -283,7 +291,7 @@ def _mask(
     score: float,
     stability: float,
 ) -> Mask | None:
-    """A mask in its place; None where it is empty, or goes on beyond its tile."""
+    """Crop a mask to its box; None if it is empty, or continues beyond its tile."""
     row, column, rows, columns = tile
     down, across = np.flatnonzero(full.any(axis=1)), np.flatnonzero(full.any(axis=0))
     if not len(down):
@@ -300,7 +308,7 @@ def _mask(
 
 
 def _drop_duplicates(masks: list[Mask]) -> list[Mask]:
-    """Non-maximum suppression by boxes: what is seen in a finer tile goes first, then the surest."""
+    """Non-maximum suppression by boxes: masks of finer tiles first, then by score."""
     import cv2
 
     if not masks:
@@ -315,7 +323,7 @@ def _drop_duplicates(masks: list[Mask]) -> list[Mask]:
 def _masks_to_segments(
     ground: GroundImage, masks: list[Mask], model: Model, min_area: float, notes: DerivationNotes, name: str
 ) -> Segments:
-    """The masks as regions, by their colours and shapes."""
+    """Convert masks to regions, classified by colour and shape."""
     label = np.zeros(ground.valid.shape, np.int32)
     pixels = max(min_area / ground.resolution**2, 1.0)
     masks.sort(key=lambda m: (-m.size, m.score, m.box))
@@ -334,7 +342,7 @@ def _masks_to_segments(
         x0, y0, x1, y1 = mask.box
         at = (slice(y0, y1), slice(x0, x1))
         region_mask = label[at] == k
-        rest = _drop_small(region_mask, pixels)  # what others leave of it
+        rest = _drop_small(region_mask, pixels)  # the part that no other mask covers
         label[at][region_mask & ~rest] = 0
         if not rest.any():
             continue
@@ -346,27 +354,27 @@ def _masks_to_segments(
         numbers[k] = len(regions)
     if not regions:
         raise CannotConvert(
-            f"{name}: all that the model {model.name} finds is smaller than minimum_area={min_area:g} m²"
+            f"{name}: everything that the model {model.name} finds is smaller than minimum_area={min_area:g} m²"
         )
     notes.drop(
         "masks", len(masks) - len(regions), f"{name}: smaller than minimum_area={min_area:g} m², or hidden by others"
     )
     notes.warn(
-        f"{name}: the model {model.name} finds things and does not say what they are: {len(regions) - unsure} are told "
-        f"by colour and shape, {unsure} cannot be and are of kind area"
+        f"{name}: the model {model.name} returns masks without classes; {len(regions) - unsure} were classified by "
+        f"colour and shape, {unsure} have kind area"
     )
     return Segments(numbers[label], regions, np.zeros(label.shape, bool))
 
 
 def _clean_mask(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_] | None:
-    """A mask without pieces and holes that are too small; None where nothing is left."""
+    """Remove pieces and holes of a mask that are too small; None if nothing is left."""
     filled = ~_drop_small(np.pad(~mask, 1, constant_values=True), min_pixels)[1:-1, 1:-1]
     inside = _drop_small(filled, min_pixels)
     return inside if inside.any() else None
 
 
 def _drop_small(mask: NDArray[np.bool_], min_pixels: float) -> NDArray[np.bool_]:
-    """A mask without its connected pieces of fewer pixels."""
+    """Remove connected pieces with fewer pixels from a mask."""
     import cv2
 
     count, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)

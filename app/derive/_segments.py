@@ -1,12 +1,12 @@
-"""A picture from above -> fields, trees, vegetation, paths, roads and buildings, without a model.
+"""Segment an aerial image into fields, trees, vegetation, paths, roads and buildings, without a model.
 
-Pixels are told by colour: k-means in CIELAB groups them (seeded, so that the same picture gives the same groups), the
-excess green of a group, (2g - r - b) of colours that add up to 1 (Woebbecke et al. 1995), says whether it grows; with
-``index`` every pixel is told by its own excess green, or by NDVI = (nir - red) / (nir + red) where there is a
-near-infrared band. What grows is wood where it is dark or rough and turf where it is bright and smooth: wood is cut
-into crowns at the saddles of its distance to the edge, round ones are trees; turf, and bare ground of that size, is
-fields, parted at edges (Canny). What does not grow is told by shape: long and narrow is a path, or a road where it is
-wide; compact, with straight edges and of one shade is a building. The rest, and shadow, is nothing.
+Pixels are classified by colour: k-means in CIELAB groups them (seeded, so that the same image gives the same groups),
+and the excess green of a group, (2g - r - b) of colours that sum to 1 (Woebbecke et al. 1995), decides whether it is
+vegetation. With ``index`` every pixel is classified by its own excess green, or by NDVI = (nir - red) / (nir + red) if
+there is a near-infrared band. Dark or rough vegetation is wood, bright and smooth vegetation is turf. Wood is cut into
+crowns at the saddles of its distance to the edge; round ones are trees. Large areas of turf or bare ground are fields,
+separated at edges (Canny). Other areas are classified by shape: long and narrow is a path, or a road if it is wide;
+compact, with straight edges and of one shade is a building. The rest, and shadow, is nothing.
 """
 
 from __future__ import annotations
@@ -25,103 +25,108 @@ from app.parameters import parameter
 
 Kind = Literal["field", "tree", "vegetation", "path", "road", "building", "area"]
 KINDS: tuple[str, ...] = get_args(Kind)
-"""What is told; an ``area`` is a thing of its own of which it is not known what it is."""
+"""Kinds of regions; an ``area`` is a separate region of unknown kind."""
 
 Mask = NDArray[np.uint8]
 
 GREEN = 0.06
-"""Excess green from which on a group of pixels is vegetation."""
+"""Minimum excess green of a group of pixels that is vegetation."""
 
 NDVI = 0.2
-"""The least NDVI of vegetation, whatever Otsu's threshold says; sparse grass has about that."""
+"""Minimum NDVI of vegetation, whatever Otsu's threshold is; typical of sparse grass."""
 
 SPREAD = 0.03
-"""Excess green, or NDVI, by which vegetation and the rest must differ at least."""
+"""Minimum difference in excess green or NDVI between vegetation and the rest."""
 
 DARK, SHADOW = 38.0, 20.0
-"""CIELAB lightness (0 to 100) below which vegetation is wood, and below which what is not green is shadow."""
+"""CIELAB lightness (0 to 100) below which vegetation is wood, and below which other pixels are shadow."""
 
 ROUGH = 2.5
-"""Mean difference of lightness from its median within 5 pixels, over ``WINDOW`` metres, from which on it is wood:
-a median follows edges, so a smooth tree on smooth turf has none."""
+"""Minimum roughness of wood: mean difference of lightness from its median within 5 pixels, over ``WINDOW`` metres.
+
+A median follows edges, so a smooth tree on smooth turf has no roughness.
+"""
 
 WINDOW = 1.5
 CROWNS = (0.8, 20.0)
-"""Metres across a tree's crown, least and most."""
+"""Minimum and maximum diameter of a tree's crown in metres."""
 
 ROUND = 0.75
-"""Share of its circle around the same middle that a tree's crown covers at least."""
+"""Minimum share of its circle around the same centre that a tree's crown covers."""
 
 LONG = 4.0
-"""How many times as long as wide paths and roads are at least."""
+"""Minimum ratio of length to width of paths and roads."""
 
 PATH, ROAD = 4.0, 20.0
-"""Metres: wider paths are roads, wider roads are none."""
+"""Width in metres above which paths are roads, and maximum width of roads."""
 
 FIELD, TURF = 50.0, 10.0
-"""Square metres of bare ground, and of turf, that is a field, at least."""
+"""Minimum area of a field of bare ground, and of turf, in square metres."""
 
 BUILDING, SIDE, RECTANGULAR = 8.0, 2.5, 0.78
-"""Least square metres, least metres of a side, and least share of its rectangle, of a building."""
+"""Minimum area in square metres, minimum side in metres, and minimum share of its rectangle, of a building."""
 
 MIXED = 0.25
-"""Share of green up to which an area does not grow, and of what is not green up to which it does."""
+"""Share of green up to which an area is no vegetation, and share of other pixels up to which it is."""
 
 SAMPLE = 2**16
-"""Pixels by which the groups are found."""
+"""Maximum number of pixels from which the groups are computed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """How a picture is told apart."""
+    """Parameters of image segmentation."""
 
     segmentation: Literal["auto", "colour", "index", "plan", "model"] = parameter(
         "auto",
-        "colour: groups of like colour, then shape; index: vegetation by excess green, or NDVI with a near-infrared "
-        "band; plan: dark walls on bright paper; model: what the model named by model= finds; auto: plan for what "
-        "looks like one, else colour",
+        "segmentation method; colour: groups of similar colour, then shape; index: vegetation by excess green, or NDVI "
+        "with a near-infrared band; plan: dark walls on bright paper; model: the model named by model=; auto: plan for "
+        "images that look like one, else colour",
     )
-    picture: str | None = parameter(None, "which picture; default: satellite, else the only one of a level")
+    picture: str | None = parameter(None, "name of the image; default: satellite, else the only one of a level")
     resolution: float | None = parameter(
         None,
-        "metres a pixel, or a cell; default: the picture's, rounded up and at least 0.05, as much coarser as needed",
+        "size of a pixel or cell; default: the image's, rounded up and at least 0.05, coarser if it would be too large",
         minimum=1e-3,
         maximum=100.0,
         unit="m",
     )
     model: str | None = parameter(
         None,
-        "model: name of the operator's model in ONNX: of the YOLO or Segment-Anything family, or one that tells pixels",
+        "model: name of the operator's ONNX model: YOLO or Segment-Anything family, or one that classifies pixels",
     )
     confidence: float | None = parameter(
         None,
-        "model: what it is less sure of is left out; default: 0.25, of Segment-Anything (its predicted IoU) 0.88, of "
-        "one that tells pixels 0.5",
+        "model: minimum confidence of a result; default: 0.25, for Segment-Anything (its predicted IoU) 0.88, for "
+        "pixel classes 0.5",
         minimum=0.01,
         maximum=1.0,
     )
     points: int | None = parameter(
-        None, "model, Segment-Anything: it is asked at so many points along a tile; default: 16", minimum=1, maximum=64
+        None, "model, Segment-Anything: number of prompt points along a tile; default: 16", minimum=1, maximum=64
     )
     stability: float | None = parameter(
         None,
-        "model, Segment-Anything: least intersection over union of a mask with itself at another threshold; default: "
+        "model, Segment-Anything: minimum intersection over union of a mask with itself at another threshold; default: "
         "0.95",
         minimum=0.0,
         maximum=1.0,
     )
-    clusters: int = parameter(8, "colour: how many groups of like colour", minimum=2, maximum=32)
-    cluster_seed: int = parameter(0, "colour: another number starts with other groups", minimum=0, maximum=2**31 - 1)
+    clusters: int = parameter(8, "colour: number of groups of similar colour", minimum=2, maximum=32)
+    cluster_seed: int = parameter(0, "colour: seed of the initial groups", minimum=0, maximum=2**31 - 1)
     near_infrared: int | None = parameter(
-        None, "index: number of the near-infrared band, from 1; default: the one that says so", minimum=1, maximum=999
+        None,
+        "index: number of the near-infrared band, from 1; default: the one described as such",
+        minimum=1,
+        maximum=999,
     )
     minimum_area: float | None = parameter(
-        None, "what is smaller is left out; default: 1 m², of a plan's ink 0.05 m²", minimum=0.0, maximum=1e6, unit="m²"
+        None, "minimum area of a region; default: 1 m², for ink of a plan 0.05 m²", minimum=0.0, maximum=1e6, unit="m²"
     )
     gap: float = parameter(
-        1.2, "plan: openings up to this wide do not make a room part of outside", minimum=0.0, maximum=20.0, unit="m"
+        1.2, "plan: maximum width of openings in the walls of a room", minimum=0.0, maximum=20.0, unit="m"
     )
-    outside_free: bool = parameter(False, "plan: whether what no wall encloses is free, too, and not unknown")
+    outside_free: bool = parameter(False, "plan: whether ground that no wall encloses is free instead of unknown")
 
 
 METHOD_PARAMETERS = {
@@ -135,13 +140,12 @@ METHOD_PARAMETERS = {
     "gap": ("plan",),
     "outside_free": ("plan",),
 }
-"""Parameters that belong to some methods only."""
+"""Parameters that apply to some methods only."""
 
 
 @dataclass(slots=True)
 class Region:
-    """One thing. confidence: 0 to 1, how well its shape and shade fit its kind. attributes: what else is known of
-    it."""
+    """Segmented region. confidence: 0 to 1, how well shape and shade fit its kind. attributes: further properties."""
 
     kind: Kind
     confidence: float
@@ -150,8 +154,13 @@ class Region:
 
 @dataclass(slots=True)
 class Segments:
-    """label: int32 [h, w], 0 nothing, k the region k - 1. regions: in the order of their labels. open_: bool [h, w],
-    what is known to be no obstacle without being a region."""
+    """Segmented image.
+
+    Attributes:
+        label: int32 [h, w], 0 nothing, k the region k - 1.
+        regions: in the order of their labels.
+        open_: bool [h, w], pixels known to be no obstacle that belong to no region.
+    """
 
     label: NDArray[np.int32]
     regions: list[Region]
@@ -161,21 +170,21 @@ class Segments:
 def segments(
     ground: GroundImage, how: Segmentation, method: str, nir: int | None, notes: DerivationNotes, name: str
 ) -> Segments:
-    """What a picture shows. nir: the place of the near-infrared band in ``ground.raw``.
+    """Segment an image by colour or vegetation index. nir: index of the near-infrared band in ``ground.raw``.
 
-    Raises CannotConvert for a picture without colours, or of one.
+    Raises CannotConvert for an image without colours, or with a single one.
     """
     import cv2
 
     if ground.grey and nir is None and ground.raw.shape[2] >= 3:
         raise CannotConvert(
-            f"{name} does not say which of its bands are red, green and blue: tag them (gdal_translate -colorinterp "
-            "red,green,blue), or give the number of the near-infrared band as near_infrared"
+            f"{name} does not state which of its bands are red, green and blue: tag them (gdal_translate -colorinterp "
+            "red,green,blue), or set near_infrared to the number of the near-infrared band"
         )
     if ground.grey and nir is None:
         raise CannotConvert(
-            f"{name} has no colours: what grows and what does not cannot be told. A floor plan is asked for with "
-            "segmentation=plan"
+            f"{name} has no colours, so vegetation cannot be detected: use a colour image, or segmentation=plan for a "
+            "floor plan"
         )
     min_area = 1.0 if how.minimum_area is None else how.minimum_area
     work = _RegionBuilder(ground, min_area)
@@ -189,7 +198,7 @@ def segments(
     lab = cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
     group, centres = _groups(np.asarray(lab, np.float32), ground.valid, how.clusters, how.cluster_seed)
     if len(centres) < 2:
-        raise CannotConvert(f"{name} is of one colour: there is nothing to be told apart")
+        raise CannotConvert(f"{name} has a single colour: nothing to segment")
     of = group[ground.valid]
     sums = np.stack([np.bincount(of, smooth[..., k][ground.valid], len(centres)) for k in range(3)], axis=1)
     means = sums / np.maximum(np.bincount(of, minlength=len(centres)), 1)[:, None]
@@ -201,15 +210,15 @@ def segments(
         work.add_sealed(ground.valid & (group == k))
     shadow = ground.valid & dark[group]
     area = ground.resolution**2
-    notes.drop("m² of shadow", round(float(shadow.sum()) * area), f"{name}: too dark to tell what it is")
+    notes.drop("m² of shadow", round(float(shadow.sum()) * area), f"{name}: too dark to classify")
     work.small(notes, name)
     left = (work.label == 0) & ground.valid & ~shadow & ~work.open_
-    notes.drop("m² of ground", round(float(left.sum()) * area), f"{name}: of no shape or colour that is known")
+    notes.drop("m² of ground", round(float(left.sum()) * area), f"{name}: shape and colour match no kind")
     return Segments(work.label, work.regions, work.open_)
 
 
 def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
-    """Where vegetation is."""
+    """Mark vegetation by its index."""
     import cv2
 
     if nir is None:
@@ -218,7 +227,7 @@ def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: Derivation
         index, minimum = (2 * rgb[..., 1] - rgb[..., 0] - rgb[..., 2]) / total, GREEN
     else:
         infrared, red = ground.raw[..., nir].astype(np.float64), _red(ground)
-        with np.errstate(over="ignore", invalid="ignore"):  # what is no number, or beyond them, does not grow
+        with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are no vegetation
             total = infrared + red
             index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0)
         index = np.clip(np.nan_to_num(index, nan=0.0), -1.0, 1.0).astype(np.float32)
@@ -227,26 +236,26 @@ def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: Derivation
     values = index[ground.valid]
     low, high = float(values.min()), float(values.max())
     if high < minimum:
-        raise CannotConvert(f"{name}: nothing in it grows, by its vegetation index of at most {high:.2f}")
+        raise CannotConvert(f"{name}: no vegetation, the vegetation index is at most {high:.2f}")
     threshold = minimum
     if high - low > SPREAD:
         scaled = np.round((values - low) / (high - low) * 255).astype(np.uint8)
         cut, _ = cv2.threshold(scaled.reshape(-1, 1), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
         threshold = max(minimum, low + (cut + 0.5) / 255 * (high - low))
     word = "excess green" if nir is None else "NDVI"
-    notes.fill("threshold", round(threshold, 4), f"{name}: what has a higher {word} is vegetation")
+    notes.fill("threshold", round(threshold, 4), f"{name}: pixels with a higher {word} are vegetation")
     return np.asarray(ground.valid & (index > threshold))
 
 
 def _red(ground: GroundImage) -> NDArray[np.float64]:
-    """Red as the bands have it, in the same unit as near infrared."""
+    """Return the raw red band, in the same unit as near infrared."""
     return np.asarray(ground.raw[..., 0], np.float64)
 
 
 def _groups(
     lab: NDArray[np.float32], valid: NDArray[np.bool_], clusters: int, seed: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """(the group of each pixel, the colours [k, 3] of the groups from dark to bright) by k-means."""
+    """Group pixels by k-means: (group of each pixel, colours [k, 3] of the groups from dark to bright)."""
     import cv2
 
     places = np.flatnonzero(valid)
@@ -267,7 +276,7 @@ def _groups(
 
 
 class _RegionBuilder:
-    """Regions as they are found."""
+    """Builder of regions: adds the regions of one image one after the other."""
 
     def __init__(self, ground: GroundImage, min_area: float) -> None:
         import cv2
@@ -283,22 +292,22 @@ class _RegionBuilder:
         self.open_ = np.zeros(ground.valid.shape, bool)
 
     def pixels(self, metres: float) -> int:
-        """A length as an odd number of pixels, at least 3."""
+        """Return a length as an odd number of pixels, at least 3."""
         return max(3, int(metres / self.size) // 2 * 2 + 1)
 
     def small(self, notes: DerivationNotes, name: str) -> None:
-        """Say what was left out for its size."""
+        """Note the number of regions that were too small."""
         min_area = self.minimum_area * self.size**2
         notes.drop("spots", self.few, f"{name}: smaller than minimum_area={min_area:g} m²")
 
     def add(self, mask: NDArray[np.bool_], at: tuple[slice, slice], region: Region) -> None:
-        """A region: the mask within a window of the picture."""
+        """Add a region: the mask within a window of the image."""
         self.regions.append(region)
         window = self.label[at]
         window[mask & (window == 0)] = len(self.regions)
 
     def pieces(self, mask: NDArray[Any]) -> list[tuple[NDArray[np.bool_], tuple[slice, slice], int]]:
-        """The connected pieces that are large enough: (mask, window, area in pixels)."""
+        """Yield the connected pieces that are large enough: (mask, window, area in pixels)."""
         import cv2
 
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
@@ -312,15 +321,15 @@ class _RegionBuilder:
             out.append((labels[at] == k, at, area))
         return out
 
-    # --- what grows ---------------------------------------------------------------------------------------------------
+    # --- vegetation ---------------------------------------------------------------------------------------------------
     def vegetation(self, grows: NDArray[np.bool_]) -> None:
-        """Wood and turf."""
+        """Add the regions of wood and turf."""
         import cv2
 
         light = self.lightness
         box = (self.pixels(WINDOW), self.pixels(WINDOW))
         rough = cv2.blur(np.abs(light - cv2.medianBlur(light, 5)), box)
-        # The roughness of an edge to something else is none of the vegetation's own.
+        # the roughness of an edge to another area is not the vegetation's own
         within = cv2.erode(grows.astype(np.uint8), np.ones(box, np.uint8)) == 1
         wood = grows & ((cv2.blur(light, (3, 3)) < DARK) | (within & (rough > ROUGH)))
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
@@ -332,7 +341,7 @@ class _RegionBuilder:
         edges = cv2.Canny(cv2.GaussianBlur(np.clip(light * 2.55, 0, 255).astype(np.uint8), (5, 5), 0), 60, 150)
         parted = turf & (cv2.dilate(edges, kernel) == 0)
         for mask, at, area in self.pieces(parted):
-            # What the edge itself took is given back.
+            # restore the pixels that the edge itself took
             high, wide = (slice(max(0, s.start - 2), s.stop + 2) for s in at)
             grown = np.pad(mask, ((at[0].start - high.start, 2), (at[1].start - wide.start, 2)))
             room = turf[high, wide] == 1
@@ -346,11 +355,11 @@ class _RegionBuilder:
             self.add(grown, (high, wide), Region("field", _fit(1.0 - shade / 30.0), attributes))
 
     def metres(self, area: float) -> float:
-        """Pixels as square metres, to be told."""
+        """Return pixels as square metres, for attributes."""
         return round(area * self.size**2, 2)
 
     def _wood(self, mask: NDArray[np.bool_], at: tuple[slice, slice]) -> None:
-        """A piece of wood: crowns where it falls into round ones, else vegetation."""
+        """Add a piece of wood: crowns if it splits into round ones, else vegetation."""
         import cv2
         from scipy.ndimage import find_objects
 
@@ -375,9 +384,9 @@ class _RegionBuilder:
         for part, inner, size in self.pieces(rest & (window == 0)):
             self.add(part, _inner(at, inner), Region("vegetation", 0.6, {"area": self.metres(size)}))
 
-    # --- what does not ------------------------------------------------------------------------------------------------
+    # --- ground and roofs ---------------------------------------------------------------------------------------------
     def add_sealed(self, mask: NDArray[np.bool_]) -> None:
-        """Ground and roofs of one group of colours."""
+        """Add the regions of ground and roofs of one colour group."""
         import cv2
 
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
@@ -395,10 +404,10 @@ class _RegionBuilder:
 
 
 class ColourRules:
-    """Tells the kinds of areas that somebody else has found, by the same colours and shapes."""
+    """Classifier of masks found by a model, by the same colours and shapes."""
 
     def __init__(self, ground: GroundImage, min_area: float) -> None:
-        """least: square metres of the smallest thing."""
+        """Set up the classifier. min_area: square metres of the smallest region."""
         import cv2
 
         self.size, self.grey = ground.resolution, ground.grey
@@ -413,7 +422,7 @@ class ColourRules:
         self.rough = cv2.blur(np.abs(self.light - cv2.medianBlur(self.light, 5)), (self.box, self.box)) > ROUGH
 
     def kind(self, mask: NDArray[np.bool_], at: tuple[slice, slice]) -> Region:
-        """What a mask within a window of the picture is; an ``area`` where colour and shape do not say."""
+        """Classify a mask within a window of the image; ``area`` if colour and shape are not conclusive."""
         import cv2
 
         size = int(mask.sum())
@@ -441,7 +450,7 @@ class ColourRules:
 
 
 def way_attributes(kind: str, mask: NDArray[np.bool_], size: float) -> dict[str, Any]:
-    """What a path or road of this shape says more than other kinds: its mean width. size: metres a pixel."""
+    """Return the additional attribute of a path or road: its mean width. size: metres per pixel."""
     if kind not in ("path", "road"):
         return {}
     _, width, _ = _band(mask, int(mask.sum()), 1.0)
@@ -449,10 +458,10 @@ def way_attributes(kind: str, mask: NDArray[np.bool_], size: float) -> dict[str,
 
 
 def _band(piece: NDArray[np.bool_], area: int, min_pixels: float) -> tuple[float, float, Any]:
-    """(length, width, outline) in pixels of the band with this area and this way around it."""
+    """Return (length, width, outline) in pixels of the band with this area and perimeter."""
     import cv2
 
-    # Without dents and holes of a pixel or two, which would make every outline long.
+    # close dents and holes of a pixel or two, which would make every outline long
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     plain = cv2.morphologyEx(np.pad(piece, 4).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     outlines, order = cv2.findContours(plain, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
@@ -465,8 +474,11 @@ def _band(piece: NDArray[np.bool_], area: int, min_pixels: float) -> tuple[float
 def _classify_shape(
     piece: NDArray[np.bool_], light: NDArray[Any], area: int, min_pixels: float, size: float, ends: bool
 ) -> Region | None:
-    """What a piece of ground or roof is by its shape. light: lightness of its window; area and least: pixels; size:
-    metres a pixel; ends: whether it reaches the picture's edge."""
+    """Classify a piece of ground or roof by its shape.
+
+    light: lightness of its window. area, min_area: pixels. size: metres per pixel. ends: whether it reaches the image's
+    edge.
+    """
     import cv2
 
     length, width, outer = _band(piece, area, min_pixels)
@@ -480,7 +492,7 @@ def _classify_shape(
     metres, side = width * size, min(w, h) * size
     long = length >= LONG * width and metres <= ROAD and length * size >= 2 * WINDOW
     straight = rectangular >= RECTANGULAR and square_metres >= BUILDING and side >= SIDE
-    # A way leads somewhere: a straight band that lies alone in the picture is rather a roof.
+    # a path leads somewhere: a straight band that is isolated in the image is rather a roof
     if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):
         sides = sorted((round(w * size, 2), round(h * size, 2)), reverse=True)
         return Region("building", _fit(rectangular * uniform), {**attributes, "sides": sides})
@@ -494,7 +506,7 @@ def _classify_shape(
 
 
 def _inner(at: tuple[slice, slice], inner: tuple[slice, slice]) -> tuple[slice, slice]:
-    """A window within a window, as one of the picture."""
+    """Return a window within a window as a window of the image."""
     rows, columns = (slice(o.start + i.start, o.start + i.stop) for o, i in zip(at, inner, strict=True))
     return rows, columns
 
@@ -504,7 +516,7 @@ def _fit(value: float) -> float:
 
 
 def _roundness(mask: NDArray[np.bool_]) -> float:
-    """Share of a shape that lies in the circle of its own area around its middle."""
+    """Return the share of a shape within the circle of equal area around its centre."""
     rows, columns = np.nonzero(mask)
     limit = len(rows) / math.pi
     inside = (rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2 <= limit
@@ -512,7 +524,7 @@ def _roundness(mask: NDArray[np.bool_]) -> float:
 
 
 def _watershed(mask: Mask, away: NDArray[np.float32], window: int) -> NDArray[np.int32]:
-    """A mask cut at the saddles of its distance to the edge: int32 [h, w], 0 outside."""
+    """Cut a mask at the saddles of its distance to the edge: int32 [h, w], 0 outside."""
     import cv2
 
     smooth = np.where(mask == 1, cv2.GaussianBlur(away, (window, window), 0), np.float32(0))
@@ -524,13 +536,13 @@ def _watershed(mask: Mask, away: NDArray[np.float32], window: int) -> NDArray[np
     height = np.clip(255.0 - smooth / max(float(smooth.max()), 1e-6) * 254.0, 0, 255).astype(np.uint8)
     cv2.watershed(np.repeat(height[..., None], 3, axis=2), markers)
     parts = np.where(markers > 1, markers - 1, 0)
-    # The lines between two basins go to one of them.
+    # lines between two basins go to one of them
     beside = cv2.dilate(parts.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
     return np.where(mask == 1, np.where(parts > 0, parts, beside), 0).astype(np.int32)
 
 
 def _hills(height: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The tops of the hills that rise more than a fifth above their saddles (domes by reconstruction)."""
+    """Return the tops of the hills that rise more than a fifth above their saddles (domes by reconstruction)."""
     import cv2
 
     kernel = np.ones((3, 3), np.uint8)

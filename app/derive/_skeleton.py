@@ -1,4 +1,4 @@
-"""Free space and its skeleton as arrays of cells: what the kernels are called through."""
+"""Free space and its skeleton as arrays of cells: the interface to the kernels."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeSpace:
-    """Where a round robot's centre may be.
+    """Cells where a round robot's centre may be.
 
-    mask: uint8 [h, w], 1 where it may; a border of zeros all around. gap: uint16 [h, w], distance to the next obstacle
-    in the cell's column. row, column: the grid's cell at which (0, 0) of these arrays lies. cells: how many may be.
+    Attributes:
+        mask: uint8 [h, w], 1 if it may be there; with a border of zeros.
+        gap: uint16 [h, w], distance to the nearest obstacle in the cell's column.
+        row, column: the grid's cell at (0, 0) of these arrays.
+        cells: number of ones in the mask.
     """
 
     mask: NDArray[np.uint8]
@@ -28,16 +31,16 @@ class FreeSpace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """nodes: int64 [n, 2] row and column in a Space; edges: int64 [m, 2] places of nodes, each pair once."""
+    """Graph. nodes: int64 [n, 2] row, column in a FreeSpace. edges: int64 [m, 2] indices of nodes, each pair once."""
 
     nodes: NDArray[np.int64]
     edges: NDArray[np.int64]
 
 
 def free_cells(grid: OccupancyGrid, unknown: bool) -> tuple[NDArray[np.uint8], int, int] | None:
-    """1 where a cell is free (or unknown, where that counts), cut to what is free with a border of zeros.
+    """Return 1 for free cells (and unknown ones, if included), cropped to them with a border of zeros.
 
-    With the row and column of the grid at which the cut begins; None where nothing is free.
+    Also returns the grid's row and column at which the crop begins; None if nothing is free.
     """
     free = grid.cells == FREE
     if unknown:
@@ -52,18 +55,18 @@ def free_cells(grid: OccupancyGrid, unknown: bool) -> tuple[NDArray[np.uint8], i
 
 
 def space(free: NDArray[np.uint8], row: int, column: int, radius: float) -> FreeSpace:
-    """The places for a robot of this radius (cells): farther than it from every obstacle's centre."""
+    """Return the free space of a robot of this radius (cells): cells farther than it from every obstacle's centre."""
     from app.derive import _kernels_space as kernels
 
     gap = np.empty(free.shape, np.uint16)
     kernels.gaps(free, gap)
-    # A hair more, so that 0.3 m in cells of 0.05 m are 6 and not 5.999…: what touches, collides.
+    # slightly larger, so that 0.3 m in cells of 0.05 m are 6 and not 5.999…: contact is a collision
     count = kernels.erode(gap, (radius * (1.0 + 1e-9)) ** 2, free)
     return FreeSpace(free, gap, row, column, int(count))
 
 
 def widest(free_space: FreeSpace) -> float:
-    """How far the freest cell is from obstacles, in cells."""
+    """Return the largest distance of a free cell to obstacles, in cells."""
     from app.derive import _kernels_space as kernels
 
     low, high = 0.0, float(max(free_space.mask.shape))
@@ -79,12 +82,17 @@ def widest(free_space: FreeSpace) -> float:
 def skeleton(
     free_space: FreeSpace, *, merge: float, spur: float, tolerance: float, island: float, voronoi: bool = False
 ) -> tuple[Graph, int]:
-    """The skeleton of a space as a graph of straight, collision-free edges. Lengths are in cells.
+    """Return the skeleton of a space as a graph of straight, collision-free edges. Lengths are in cells.
 
-    merge: junctions nearer than this along the skeleton are one. spur: dead ends that reach less than this beyond the
-    free circle of their junction are cut. tolerance: how far a straight edge may be from the skeleton. island: pieces
-    smaller than this across are left out (the largest always stays); how many is told. voronoi: of the generalised
-    Voronoi diagram, farthest from obstacles everywhere, instead of Zhang and Suen's skeleton.
+    Args:
+        merge: junctions closer than this along the skeleton are merged.
+        spur: dead ends that reach less than this beyond the free circle of their junction are cut.
+        tolerance: maximum distance of a straight edge from the skeleton.
+        island: pieces smaller than this across are dropped (the largest always stays).
+        voronoi: use the generalised Voronoi diagram, farthest from obstacles everywhere, instead of Zhang and Suen's
+            skeleton.
+
+    Returns the graph and the number of dropped pieces.
     """
     from app.derive import _kernels_skeleton as kernels
     from app.derive._kernels_thinning import thin
@@ -111,18 +119,18 @@ def skeleton(
 
 
 BAND = 2**25
-"""Cells that are sorted at a time."""
+"""Number of cells that are sorted at a time."""
 
 
 def ridges(mask: NDArray[np.uint8], gap: NDArray[np.uint16]) -> int:
-    """Thin a mask in place to the generalised Voronoi diagram; how many cells are left.
+    """Thin a mask in place to the generalised Voronoi diagram; return the number of remaining cells.
 
-    It takes 2 bytes a cell, and some for those that are left: cells are sorted by their distance a part at a time.
+    Takes 2 bytes per cell, and some for the remaining ones: cells are sorted by their distance one part at a time.
     """
     from app.derive import _kernels_voronoi as kernels
 
     rank = np.empty(mask.shape, np.uint16)
-    # In 16 bits a distance is exact to 1/65535 of the largest; below 181 cells no two different ones are the same.
+    # In 16 bits a distance is exact to 1/65535 of the largest; below 181 cells all distinct distances stay distinct.
     largest = np.sqrt(np.float32(kernels.farthest(mask, gap)))
     kernels.anchors(mask, gap, 65535.0 / max(float(largest), 1.0), rank)
     for order in _cells_by_rank(mask, rank, BAND):
@@ -132,9 +140,9 @@ def ridges(mask: NDArray[np.uint8], gap: NDArray[np.uint16]) -> int:
 
 
 def _cells_by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int) -> Iterator[NDArray[np.int32]]:
-    """The set cells as places in the flat mask, sorted by rank, then place; about ``limit`` at a time.
+    """Yield the set cells as flat indices, sorted by rank, then index; about ``limit`` at a time.
 
-    Those of higher ranks may not change meanwhile.
+    Cells of higher ranks must not change meanwhile.
     """
     from app.derive import _kernels_voronoi as kernels
 
@@ -153,10 +161,8 @@ def _cells_by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], limit: int
 
 
 def drop_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple[Graph, int]:
-    """The graph without pieces that are less than ``island`` cells across, but always with the largest one.
-
-    And how many such pieces there were.
-    """
+    """Drop pieces that are less than ``island`` cells across, except the largest one; return the graph and their
+    number."""
     from app.derive import _kernels_space as kernels
 
     count, piece = pieces(graph)
@@ -176,7 +182,7 @@ def drop_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple[Gr
 
 
 def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
-    """How many connected pieces a graph has, and which one each node is in."""
+    """Return the number of connected pieces of a graph, and the piece of each node."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -190,7 +196,7 @@ def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
 
 
 def subgraph(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
-    """Some nodes (whole pieces) with their edges."""
+    """Return some nodes (whole pieces) with their edges."""
     place = np.cumsum(mask) - 1
     return Graph(graph.nodes[mask], place[graph.edges[mask[graph.edges[:, 0]]]])
 
@@ -198,11 +204,11 @@ def subgraph(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
 def add_open_edges(
     graph: Graph, free_space: FreeSpace, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
 ) -> Graph:
-    """The graph with nodes ``spacing`` cells apart also in the open, and the straight ways that save a detour.
+    """Add nodes ``spacing`` cells apart, also in the open, and the straight edges that avoid a detour.
 
-    Nodes are put along edges and on a lattice that begins at ``phase`` (row, column), so that it stays where it is when
-    the map grows. Of the lines of their Delaunay triangulation that are collision-free, those are taken without which
-    the way between their ends would be more than ``detour`` times as long.
+    Nodes are added along edges and on a lattice that begins at ``phase`` (row, column), so that it stays in place when
+    the map grows. Of the collision-free lines of their Delaunay triangulation, those are added without which the path
+    between their ends would be more than ``detour`` times as long.
     """
     from app.derive import _kernels_roadmap as kernels
 
@@ -218,7 +224,7 @@ def add_open_edges(
     taken = np.zeros(len(pairs), np.uint8)
     kernels.spanner(len(nodes), graph.edges, lengths(nodes, graph.edges), pairs, straight, detour, taken)
     full = Graph(nodes, np.concatenate([graph.edges, pairs[taken == 1]]))
-    # Lattice nodes in pieces that the graph left out go again.
+    # drop lattice nodes in pieces that the graph omits
     count, piece = pieces(full)
     connected = np.zeros(count, bool)
     connected[piece[:node_count]] = True
@@ -227,7 +233,7 @@ def add_open_edges(
 
 
 def drop_blocked(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space: FreeSpace) -> NDArray[np.int64]:
-    """The pairs whose straight line is collision-free."""
+    """Drop pairs whose straight line is not collision-free."""
     from app.derive import _kernels_space as kernels
 
     good = np.zeros(len(pairs), np.uint8)
@@ -236,7 +242,7 @@ def drop_blocked(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space:
 
 
 def tidy(nodes: NDArray[np.int64], edges: NDArray[np.int64]) -> Graph:
-    """A graph with its nodes sorted by row and column, equal ones joined, and each edge once."""
+    """Sort nodes by row and column, merge equal ones, and keep each edge once."""
     distinct, place = np.unique(nodes, axis=0, return_inverse=True)
     linked = np.sort(place.reshape(-1)[edges], axis=1)
     linked = np.unique(linked[linked[:, 0] != linked[:, 1]], axis=0)
@@ -244,12 +250,12 @@ def tidy(nodes: NDArray[np.int64], edges: NDArray[np.int64]) -> Graph:
 
 
 def lengths(nodes: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The straight distance of each pair, in cells."""
+    """Return the straight distance of each pair, in cells."""
     return np.asarray(np.hypot(*(nodes[pairs[:, 0]] - nodes[pairs[:, 1]]).T))
 
 
 def divide_edges(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
-    """Nodes also along the edges, at most ``spacing`` apart where the cells allow."""
+    """Add nodes along the edges, at most ``spacing`` apart if the cells allow it."""
     if not len(graph.edges):
         return graph
     a, b = graph.nodes[graph.edges[:, 0]], graph.nodes[graph.edges[:, 1]]
@@ -262,7 +268,7 @@ def divide_edges(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
     pairs = np.arange(len(ends), dtype=np.int64).reshape(-1, 2)
     from app.derive import _kernels_space as kernels
 
-    # Between the cells nearest to points of a clear line, a line may still cut a corner: such an edge stays whole.
+    # Between cells nearest to points of a clear line, a line may still cut a corner: such an edge is not divided.
     good = np.zeros(len(pairs), np.uint8)
     kernels.clear_pairs(free_space.mask, ends, pairs, good)
     undivided = np.minimum.reduceat(good, first) == 0
@@ -272,7 +278,7 @@ def divide_edges(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
 
 
 def _lattice(graph: Graph, free_space: FreeSpace, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
-    """Cells of the space on a square lattice that are not near to a node already."""
+    """Return the cells of the space on a square lattice that are not near an existing node."""
     from scipy.spatial import cKDTree
 
     rows, columns = (
@@ -288,7 +294,7 @@ def _lattice(graph: Graph, free_space: FreeSpace, spacing: float, phase: tuple[f
 
 
 def _triangulate(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The edges of a Delaunay triangulation; none where all nodes are on one line."""
+    """Return the edges of a Delaunay triangulation; none if all nodes are collinear."""
     from scipy.spatial import Delaunay, QhullError
 
     try:

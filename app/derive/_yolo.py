@@ -1,8 +1,8 @@
-"""Models of the YOLO family: boxes, and masks where the model has them.
+"""Models of the YOLO family: boxes, and masks if the model has them.
 
-A tile of the picture goes in as float32 [1, 3, side, side], RGB from 0 to 1, the last ones padded. Out come boxes [1,
+Input is a tile of the image as float32 [1, 3, side, side], RGB from 0 to 1, the last tiles padded. Output are boxes [1,
 4 + classes (+ mask coefficients), n] (YOLOv8 and later) or [1, n, 5 + classes (+ coefficients)] (YOLOv5, with
-objectness), either way round, centre and size in pixels; of a segmentation model also prototypes of masks [1,
+objectness), with either axis order, centre and size in pixels; segmentation models also output mask prototypes [1,
 coefficients, h, w].
 """
 
@@ -20,13 +20,13 @@ from app.derive._segments import Region, Segments, way_attributes
 from app.errors import CannotConvert
 
 SIDE = 640
-"""Pixels of a tile where a model takes any size."""
+"""Default side of a tile in pixels, for models that accept any size."""
 
 MIN_DUPLICATE_OVERLAP = 0.5
-"""Intersection over union from which on two boxes of one class are one thing."""
+"""Minimum intersection over union of duplicate boxes of one class."""
 
 MIN_CONFIDENCE = 0.25
-"""Confidence from which on a box counts, unless asked otherwise."""
+"""Default minimum confidence of a box."""
 
 PAD = 114 / 255
 MAX_DETECTIONS = 20_000
@@ -44,7 +44,7 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A loaded model. classes: the kind that each class becomes, or None. side: pixels of a tile."""
+    """Loaded model. classes: kind of each class, or None. side: pixels of a tile."""
 
     file: LoadedModel
     name: str
@@ -53,7 +53,7 @@ class Model:
 
 
 def check_model(supplied: ModelFiles, file: LoadedModel) -> Model:
-    """A loaded file as a model of the family. CannotConvert says what it should take."""
+    """Return a loaded file as a YOLO model. Raises CannotConvert, which states the expected input."""
     side = input_side(supplied, file, "is not of the YOLO family", SIDE)
     return Model(file, supplied.name, classes(supplied, file.session)[0], side)
 
@@ -61,14 +61,19 @@ def check_model(supplied: ModelFiles, file: LoadedModel) -> Model:
 def segments(
     ground: GroundImage, model: Model, confidence: float, min_area: float, notes: DerivationNotes, name: str
 ) -> Segments:
-    """What a model finds in a picture, the surest first where things overlap. least: square metres."""
+    """Segment an image into a model's detections; of overlapping ones the most confident is on top.
+
+    min_area: square metres.
+    """
     detections: list[Detection] = []
     for column in starts(ground.rgb.shape[1], model.side):
         for row in starts(ground.rgb.shape[0], model.side):
             detections += _tile(ground.rgb, row, column, model, confidence)
     remaining = _drop_duplicates(detections)
     if not remaining:
-        raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {confidence:g}")
+        raise CannotConvert(
+            f"{name}: the model {model.name} finds nothing with a confidence of at least {confidence:g}"
+        )
     label = np.zeros(ground.valid.shape, np.int32)
     regions: list[Region] = []
     other = small = 0
@@ -90,13 +95,13 @@ def segments(
         attributes = {"area": round(area, 2), "model": model.name, **way_attributes(kind, mask, ground.resolution)}
         regions.append(Region(kind, round(one.score, 3), attributes))  # type: ignore[arg-type]
         window[mask] = len(regions)
-    notes.drop("things", other, f"{name}: of classes that the model's operator gave no kind")
-    notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m², or hidden by surer ones")
+    notes.drop("things", other, f"{name}: the classes of this model map them to no kind")
+    notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m², or hidden by more confident ones")
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 
 def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidence: float) -> list[Detection]:
-    """The detections in one tile, in the picture's pixels."""
+    """Return the detections in one tile, in the image's pixels."""
     side = model.side
     part = rgb[row : row + side, column : column + side]
     image = np.full((side, side, 3), PAD, np.float32)
@@ -121,7 +126,7 @@ def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidenc
 
 
 def _decode_rows(rows: Array | None, coefficients: int, model: Model) -> tuple[Array, Array, NDArray[np.int64], Array]:
-    """(boxes [n, 4], scores [n], classes [n], mask coefficients [n, m]) of a model's first output."""
+    """Parse a model's first output: (boxes [n, 4], scores [n], classes [n], mask coefficients [n, m])."""
     count = len(model.classes)
     plain, older = 4 + count + coefficients, 5 + count + coefficients
     if rows is not None:
@@ -135,24 +140,24 @@ def _decode_rows(rows: Array | None, coefficients: int, model: Model) -> tuple[A
                 return table[:, :4], chances.max(axis=1), kinds, table[:, first + count :]
     shape = "no table" if rows is None else str(rows.shape)
     raise CannotConvert(
-        f"the model {model.name} is not of the YOLO family, or has other than {count} classes: it gives {shape}, and "
-        f"{plain} or {older} values a box were expected"
+        f"the model {model.name} is not of the YOLO family, or does not have {count} classes: it returns {shape}, "
+        f"expected {plain} or {older} values per box"
     )
 
 
 def _mask(weights: Array, prototypes: Array, side: int, box: tuple[float, float, float, float]) -> NDArray[np.bool_]:
-    """The pixels of a box that belong to the thing."""
+    """Return the mask of a detection within its box."""
     import cv2
 
     count, h, w = prototypes.shape
     low = (weights @ prototypes.reshape(count, -1)).reshape(h, w)
     full = cv2.resize(np.ascontiguousarray(low, np.float32), (side, side), interpolation=cv2.INTER_LINEAR)
     x0, y0, x1, y1 = int(box[0]), int(box[1]), int(np.ceil(box[2])), int(np.ceil(box[3]))
-    return np.asarray(full[y0:y1, x0:x1] > 0.0)  # the sigmoid is above a half where its argument is above 0
+    return np.asarray(full[y0:y1, x0:x1] > 0.0)  # the sigmoid is above 0.5 if its argument is above 0
 
 
 def _drop_duplicates(detections: list[Detection]) -> list[Detection]:
-    """Non-maximum suppression over all tiles, class by class; the surest first."""
+    """Non-maximum suppression over all tiles, class by class; highest score first."""
     import cv2
 
     if not detections:

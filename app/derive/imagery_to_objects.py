@@ -1,4 +1,4 @@
-"""Imagery -> objects: what a picture from above, or a floor plan, shows, as polygons; paths with their middle lines."""
+"""Imagery -> objects: polygons from an aerial image or a floor plan; paths with their centrelines."""
 
 from __future__ import annotations
 
@@ -20,27 +20,31 @@ from app.model.layers import Layers, Part, PartKey
 from app.parameters import parameter
 
 NAME = "imagery"
-"""The family under which these objects stand."""
+"""Family and part name of these objects."""
 
 Row = tuple[str, Any, dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters(Segmentation):
-    """How a picture becomes objects."""
+    """Parameters of imagery_to_objects."""
 
     outline_tolerance: float | None = parameter(
-        None, "how far outlines may be from the pixels'; default: one pixel", minimum=0.0, maximum=100.0, unit="m"
+        None,
+        "maximum distance of outlines from the pixel edges; default: one pixel",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m",
     )
 
 
 @derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=30.0)
 def imagery_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """What a picture shows as objects: fields, trees, vegetation, paths, roads, buildings; of a plan walls and floors.
+    """Objects in an image: fields, trees, vegetation, paths, roads, buildings; for a floor plan walls and floors.
 
-    Polygons with a ``confidence`` of 0 to 1, told by shape and shade; a path or road also has its middle line, of kind
-    ``path`` with a ``width``, which objects_to_topology makes a network of. They are anchored as the picture is. Raises
-    CannotConvert where nothing can be told.
+    Polygons with a ``confidence`` of 0 to 1, classified by shape and shade; a path or road also has its centreline, of
+    kind ``path`` with a ``width``, from which objects_to_topology derives a network. They have the image's anchor.
+    Raises CannotConvert if nothing is recognised.
     """
     parts: dict[PartKey, Part] = {}
     for key, picture in select_pictures(layers, parameters.picture).items():
@@ -53,19 +57,21 @@ def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Derivation
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
             rows = _regions(segment_picture(on, picture, parameters, method, notes, name), on, parameters)
         if not rows:
-            raise CannotConvert(f"{name} shows nothing that can be told: try other clusters, or another segmentation")
+            raise CannotConvert(f"{name} shows no recognisable object: set other clusters, or another segmentation")
         if on is not None and on.on_earth and on.frame is not None:
             geometry = np.array([g for _, g, _ in rows], object)
             back = shapely.set_precision(on.frame.geometries_to_wgs84(geometry), 1e-12, mode="pointwise")
             rows = [(i, g, properties) for (i, _, properties), g in zip(rows, back, strict=True)]
-        notes.warn("the objects are guessed from a picture: look at them before a robot goes by them", where=key.name)
+        notes.warn(
+            "objects were detected automatically in an image: review them before robots use them", where=key.name
+        )
         objects = features(rows, "wgs84" if on is not None and on.on_earth else "local")
         parts[PartKey("objects", key.level, NAME)] = objects
     return Layers(parts, layers.datum, layers.levels)
 
 
 def _regions(segments: Segments, on: GroundImage, parameters: Parameters) -> list[Row]:
-    """Each region as a polygon, then the middle lines of paths and roads, in the local frame."""
+    """Convert each region to a polygon, then add the centrelines of paths and roads, in the local frame."""
     tolerance = on.resolution if parameters.outline_tolerance is None else parameters.outline_tolerance
     shapes = polygons(segments.label, on.transform, tolerance)
     rows: list[Row] = []
@@ -78,7 +84,7 @@ def _regions(segments: Segments, on: GroundImage, parameters: Parameters) -> lis
 
 
 def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict[int, Any]:
-    """The area of each label, simplified, in metres."""
+    """Return the area of each label, simplified, in metres."""
     from rasterio.features import shapes
     from rasterio.transform import Affine
 
@@ -98,7 +104,7 @@ def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict
 
 
 def _middles(segments: Segments, on: GroundImage) -> list[Row]:
-    """The middle lines of paths and roads, joined where these meet."""
+    """Return the centrelines of paths and roads, joined at their crossings."""
     from app.derive import _kernels_space, _skeleton
 
     path_labels = [k for k, region in enumerate(segments.regions, 1) if region.kind in ("path", "road")]
@@ -133,7 +139,7 @@ def _middles(segments: Segments, on: GroundImage) -> list[Row]:
 
 
 def _plan(grid: OccupancyGrid, parameters: Parameters) -> list[Row]:
-    """The walls and the floors of a plan's grid."""
+    """Return the walls and the floors of a floor plan's grid."""
     x, y, _ = grid.origin
     r = grid.resolution
     tolerance = r / 2 if parameters.outline_tolerance is None else parameters.outline_tolerance

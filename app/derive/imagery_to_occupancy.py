@@ -1,4 +1,4 @@
-"""Imagery -> occupancy: a picture from above, or a floor plan, as a grid to plan on where there is no better map."""
+"""Imagery -> occupancy: a grid from an aerial image or a floor plan, for planning without a better map."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ OBSTACLES = frozenset({"tree", "vegetation", "building"})
 
 @dataclass(frozen=True, slots=True)
 class Parameters(Segmentation):
-    """How a picture becomes a grid."""
+    """Parameters of imagery_to_occupancy."""
 
 
 @derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0)
 def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """A picture as an occupancy grid: trees, vegetation, buildings and walls are occupied.
+    """Occupancy grid from an image: trees, vegetation, buildings and walls are occupied.
 
     Fields, paths, roads and a plan's rooms are free, everything else (also a model's ``area``) is unknown. The origin
-    is a whole multiple of the resolution, yaw 0. Raises CannotConvert where the picture shows nothing that can be told,
-    MissingDatum where it lies on earth and there is no datum.
+    is a multiple of the resolution, yaw 0. Raises CannotConvert if nothing is recognised in the image, MissingDatum if
+    it is anchored in WGS 84 and there is no datum.
     """
     parts: dict[PartKey, Part] = {}
     for key, picture in select_pictures(layers, parameters.picture).items():
         name = picture_label(key)
         if picture.crs != LOCAL and layers.frame is None:
-            raise MissingDatum('a grid lies in local metres: PATCH the environment with {"datum": {…}}')
+            raise MissingDatum('a grid needs a datum: PATCH the environment with {"datum": {…}}')
         method = choose_method(picture, parameters)
         if method == "plan":
             grid = plan_to_grid(picture, layers.frame, parameters, notes, name)
@@ -51,12 +51,12 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
             origin = (round(on.left, 9), round(bottom, 9), 0.0)
             grid = OccupancyGrid(np.ascontiguousarray(cells[::-1]), on.resolution, origin)
         if not (grid.cells == FREE).any():
-            raise CannotConvert(f"{name} shows nothing that is free: no field, path, road or room is told in it")
-        notes.warn("the grid is guessed from a picture: look at it before a robot drives by it", where=key.name)
+            raise CannotConvert(f"{name} shows no free ground: no field, path, road or room was detected")
+        notes.warn("the grid was detected automatically in an image: review it before robots use it", where=key.name)
         parts[PartKey("occupancy", key.level, MAP)] = grid
     return Layers(parts, layers.datum, layers.levels)
 
 
 def _value(kind: str) -> int:
-    """The cells of a region."""
+    """Return the cell value of a region."""
     return OCCUPIED if kind in OBSTACLES else UNKNOWN if kind == "area" else FREE

@@ -1,4 +1,4 @@
-"""Location -> occupancy: a blank grid of the fence, to draw on or to drive by GNSS alone."""
+"""Location -> occupancy: a grid of the fence without obstacles, to draw on or to drive by GNSS alone."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ class Parameters:
     last=True,
 )
 def location_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """A blank occupancy grid: free inside the fence, unknown outside; it knows of no obstacle.
+    """Empty occupancy grid of the fence: free inside, unknown outside, without obstacles.
 
-    The ground around objects of unknown extent is unknown. The origin is a whole multiple of the resolution, yaw 0.
-    Raises MissingLayer where there is a datum but no fence, or objects have solids that cannot be read; CannotConvert
-    where the grid would be too large.
+    The ground around objects of unknown extent is unknown. The origin is a multiple of the resolution, yaw 0. Raises
+    MissingLayer if there is a datum but no fence, or if objects have unreadable solids; CannotConvert if the grid would
+    be too large.
     """
     reading_notes = DerivationNotes()
     obstacles = sites(layers, reading_notes)
     unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
     if unreadable:
-        raise unreadable_error(unreadable, "a blank grid would call ground free that is not known")
+        raise unreadable_error(unreadable, "an empty grid would mark unknown ground as free")
     parts: dict[PartKey, Part] = {}
     for level, fence in fences(layers, notes.warn).items():
         frame = grid_frame(shapely.bounds(fence).tolist(), parameters.resolution, notes)
@@ -51,7 +51,7 @@ def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
             obstacles[level].draw_unknown(cells, frame)
         parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
     if not parts:
-        raise MissingLayer("a blank grid needs a fence: upload a datum.yaml with gnss_fence, or a drawing as location")
+        raise MissingLayer("an empty grid needs a fence: upload a datum.yaml with gnss_fence, or a drawing as location")
     notes.warnings += reading_notes.warnings
-    notes.warn("the grid is blank: it is free wherever the fence allows, and knows of no obstacle")
+    notes.warn("the grid is empty: everything inside the fence is free, and obstacles are missing")
     return Layers(parts, layers.datum, layers.levels)

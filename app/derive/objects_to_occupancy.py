@@ -1,4 +1,4 @@
-"""Objects -> occupancy: a world, a building or a town as the grid that a robot's laser would see, or a whole robot."""
+"""Objects -> occupancy: grid of a world, building or town, at one height or over a height band."""
 
 from __future__ import annotations
 
@@ -29,85 +29,83 @@ from app.parameters import parameter
 
 ENCLOSE = (
     "nothing encloses any ground; upload a fence (datum.yaml with gnss_fence, or a drawing with layer=location) or "
-    "floors, or ask with outside_free=true where robots may drive all around"
+    "floors, or set outside_free=true if robots may drive everywhere"
 )
-"""What to do where no ground is known to be free."""
+"""Advice if no ground is known to be free."""
 
 ALL_COVERED = (
-    "all of it is occupied or near objects of unknown extent; upload the files of their models, or ask with a smaller "
+    "all of it is occupied or near objects of unknown extent; upload the files of their models, or set a smaller "
     "unknown_radius"
 )
-"""What to do where no ground is left."""
+"""Advice if no free ground is left."""
 
 HEIGHT = 0.2
-"""Metres above the floor at which a slice is taken unless asked otherwise: a usual height of a robot's laser."""
+"""Default height of the slice above the floor in metres: a common height of robot laser scanners."""
 
 RESOLUTION = 0.05
-"""Metres a cell unless asked otherwise."""
+"""Default cell size in metres."""
 
 RESOLUTIONS = (RESOLUTION, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""What is taken where a finer one would give a grid that no robot loads."""
+"""Coarser cell sizes, used if the default one would give a grid that no robot loads."""
 
 DEFAULT_MAX_CELLS = 2**25
-"""Cells up to which the usual resolution is kept."""
+"""Maximum number of cells at the default resolution."""
 
 MAX_CELLS = 2**29
-"""Cells of a grid whatever was asked for: a byte each, and twice that while it is made."""
+"""Maximum number of cells of a grid: a byte each, and twice that while it is computed."""
 
 MAX_SIDE_CELLS = 32767
-"""Cells along a side: beyond it Nav2's map_server refuses the map."""
+"""Maximum number of cells along a side: Nav2's map_server rejects larger maps."""
 
 
 def cell_size() -> Any:
-    """The parameter ``resolution`` of the grids that are drawn."""
-    text = f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells"
+    """Return the field of the parameter ``resolution`` of drawn grids."""
+    text = f"size of a cell; default: {RESOLUTION}, or coarser to keep the grid below 2^25 cells"
     return parameter(None, text, minimum=1e-3, maximum=100.0, unit="m")
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """At which height, how fine, and how much is added around."""
+    """Parameters of objects_to_occupancy."""
 
     height: float | None = parameter(
         None,
-        f"a slice at this height above the level's floor; default: {HEIGHT}, as a laser sees",
+        f"height of the slice above the level's floor; default: {HEIGHT}, as a laser scanner sees",
         minimum=-1e4,
         maximum=1e4,
         unit="m",
     )
     band: tuple[float, float] | None = parameter(
         None,
-        "low,high: all that stands between two heights above the level's floor, instead of a slice",
+        "height range low,high above the level's floor, instead of a slice",
         minimum=-1e4,
         maximum=1e4,
         unit="m",
     )
     resolution: float | None = cell_size()
-    inflate: float = parameter(0.0, "how far obstacles are grown", minimum=0.0, maximum=100.0, unit="m")
-    padding: float = parameter(
-        1.0, "margin around everything, where no fence says how far the site reaches", minimum=0.0, maximum=1000.0
-    )
+    inflate: float = parameter(0.0, "distance by which obstacles are grown", minimum=0.0, maximum=100.0, unit="m")
+    padding: float = parameter(1.0, "margin around everything, if there is no fence", minimum=0.0, maximum=1000.0)
     outside_free: bool = parameter(
-        False, "whether ground that neither floor, fence nor closed walls surround is free, too, and not unknown"
+        False, "whether ground outside floors, fence and closed walls is free instead of unknown"
     )
     surroundings: float = parameter(
         DEFAULT_SURROUNDINGS_METRES,
-        "radius of unknown ground around a solid that cannot be read (a mesh that was not uploaded)",
+        "radius of unknown ground around an unreadable solid (a mesh that was not uploaded)",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
     )
     unknown_radius: float = parameter(
         UNKNOWN_RADIUS_METRES,
-        "radius of unknown ground around an object of unknown extent (a model that says neither shapes nor a size, a "
-        "table or building that is a point, an invalid pose, an OpenStreetMap area whose rings do not close)",
+        "radius of unknown ground around an object of unknown extent (a model with neither shapes nor a size, a table "
+        "or building that is a point, an invalid pose, an OpenStreetMap area whose rings do not close)",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
     )
-    doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
-    visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
-    world: str | None = parameter(None, "which of several worlds; default: gazebo…, else the shortest name")
+    doors: Literal["open", "closed"] = parameter("open", "whether robots can pass doors")
+    visuals: bool = parameter(False, "whether visual shapes without collision count as obstacles")
+    world: str | None = parameter(None, "world to use, if there are several; default: gazebo…, else the shortest name")
 
 
 @derives(
@@ -119,20 +117,22 @@ class Parameters:
     version=3,
 )
 def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """What stands on the ground at a height, as an occupancy grid for each level.
+    """Occupancy grid of each level from the obstacles at a height.
 
-    Solids are cut, footprints rasterised; every cell that an obstacle touches is occupied. Free: the floors where there
-    are any, else the fence, else what obstacles enclose; elsewhere unknown, as is the ground around solids that cannot
-    be read and objects of unknown extent. The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer
-    where nothing stands in a robot's way, or solids that cannot be read leave nothing known; MissingDatum where the
-    objects are places on earth and there is none.
+    Solids are cut and footprints rasterised; every cell that an obstacle touches is occupied. Free are the floors if
+    there are any, else the fence, else ground that obstacles enclose. Elsewhere, and around unreadable solids and
+    objects of unknown extent, cells are unknown. The origin is a multiple of the resolution, yaw 0. Raises MissingLayer
+    if there is no obstacle, or if unreadable solids leave nothing known; MissingDatum for WGS 84 coordinates without a
+    datum.
     """
     if parameters.height is not None and parameters.band is not None:
         raise Invalid("height and band exclude each other", [Problem("give height or band", where="band")])
     height = HEIGHT if parameters.height is None else parameters.height
     low, high = parameters.band or (height, height)
     if low > high:
-        raise Invalid("band: the low height comes first", [Problem("the low height comes first", where="band")])
+        raise Invalid(
+            "band must be low,high with low <= high", [Problem("must be low,high with low <= high", where="band")]
+        )
     closed, seen = parameters.doors == "closed", parameters.visuals
     obstacles = sites(
         layers,
@@ -160,13 +160,13 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
         band = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
         unreadable = [reason for site in obstacles.values() for reason in site.unreadable]
         if unreadable:
-            raise unreadable_error(unreadable, f"nothing that can be read stands in a robot's way {band}{extra}")
+            raise unreadable_error(unreadable, f"no readable object is an obstacle {band}{extra}")
         extra += "".join(
             f"; {one.count} {one.subject}: {one.why}" for one in notes.dropped if one.why != NOT_AN_OBSTACLE
         )
         raise MissingLayer(
-            f"no stored object stands in a robot's way {band}{extra}: ask for another height or band, or upload walls, "
-            "buildings, barriers, trees or a world with solids"
+            f"no stored object is an obstacle {band}{extra}: set another height or band, or upload walls, buildings, "
+            "barriers, trees or a world with solids"
         )
     return Layers(parts, layers.datum, layers.levels)
 
@@ -179,14 +179,14 @@ def _grid(
     level: str,
     notes: DerivationNotes,
 ) -> OccupancyGrid | None:
-    """A level's grid; None where nothing stands in the way and no floor says what is free."""
+    """Draw a level's grid; None if there are no obstacles and no floor states which ground is free."""
     low, high = band
     section = site.cut(low, high)
     if not section.count and (site.unreadable or not site.free):
         return None
     if not section.count:
-        rest = " but the ground around objects of unknown extent" if section.unknown else ""
-        notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free{rest}", where=level)
+        rest = " except the ground around objects of unknown extent" if section.unknown else ""
+        notes.warn(f"no obstacles on level {level}; all of its floor is free{rest}", where=level)
     box = section.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
     if box is None:
         return None
@@ -194,27 +194,30 @@ def _grid(
         pad = parameters.padding
         box = (box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad)
     elif section.count and not shapely.box(*(section.bounds() or box)).intersects(fence):
-        notes.warn(f"all obstacles of the level {level} lie outside the fence", where=level)
+        notes.warn(f"all obstacles of level {level} are outside the fence; none is drawn", where=level)
     frame = grid_frame(box, parameters.resolution, notes)
     cells = empty_cells(frame, fence, site.free)
     section.draw(cells, frame, low, high)
     if fence is None and not site.free and not parameters.outside_free:
         raster.flood(cells, FREE, UNKNOWN)
-        why = "neither floors nor a fence say how far the site reaches"
+        why = "there are neither floors nor a fence"
         notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
     enclosed = bool((cells == FREE).any())
     section.draw_unknown(cells, frame)
     raster.grow(cells, OCCUPIED, parameters.inflate / frame.resolution)
     if not (cells == FREE).any():
         if site.unreadable:
-            raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
+            raise unreadable_error(site.unreadable, f"no free ground of level {level} is known")
         todo = ALL_COVERED if enclosed and section.unknown else ENCLOSE
-        notes.warn(f"no cell of the level {level} is free: {todo}", where=level)
+        notes.warn(f"no cell of level {level} is free: {todo}", where=level)
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
 
 
 def grid_frame(box: tuple[float, ...], resolution: float | None, notes: DerivationNotes) -> RasterFrame:
-    """The grid around a box (min x, min y, max x, max y in metres). CannotConvert where it would be too large."""
+    """Return the frame of the grid of a box (min x, min y, max x, max y in metres).
+
+    Raises CannotConvert if it would be too large.
+    """
     low_x, low_y, high_x, high_y = box[:4]
     if resolution is not None:
         return raster.check_frame(
@@ -232,7 +235,7 @@ def grid_frame(box: tuple[float, ...], resolution: float | None, notes: Derivati
 
 
 def empty_cells(frame: RasterFrame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
-    """Cells, uint8 [height, width], that are free on the floors, within the fence, or all where there is neither."""
+    """Return cells, uint8 [height, width]: free on the floors, else within the fence, else unknown."""
     cells = np.full((frame.height, frame.width), FREE if fence is None and not free else UNKNOWN, np.uint8)
     inside = free
     if fence is not None:

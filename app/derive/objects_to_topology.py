@@ -1,4 +1,4 @@
-"""Drawn lines -> topology, so that a network drawn in Google Earth or QGIS can be had in a robot's format."""
+"""Drawn lines -> topology: a network drawn in Google Earth or QGIS for a robot's format."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from app.parameters import parameter
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """How lines become a network."""
+    """Parameters of objects_to_topology."""
 
     join: float = parameter(
-        network.JOIN, "vertices nearer than this become one node", minimum=0.0, maximum=100.0, unit="m"
+        network.JOIN, "distance below which vertices become one node", minimum=0.0, maximum=100.0, unit="m"
     )
-    outlines: bool = parameter(False, "whether the outlines of polygons are paths too")
+    outlines: bool = parameter(False, "whether outlines of polygons are paths, too")
 
 
 @derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=1.0)
 def objects_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:  # noqa: ARG001
-    """Drawn lines and points of interest as a network of nodes and directed edges.
+    """Network of nodes and directed edges from drawn lines and points of interest.
 
-    One network for each level, from all its drawings. Raises MissingLayer where there is nothing to make it from.
+    One network per level, from all its drawings. Raises MissingLayer if there are no lines or points of interest.
     """
     every = formats.all_formats().values()
     complete = {fmt.family for fmt in every if fmt.traits.own_network}
-    # Elsewhere a line is a path only where its kind says so: a building's walls and doors are lines, too.
+    # Elsewhere only lines of kind path are paths: walls and doors of buildings are lines, too.
     drawings = {name for fmt in every if fmt.traits.is_drawing for name in (fmt.name, fmt.family)}
     by_level: dict[str, list[tuple[str, Features]]] = {}
     for key, part in layers.vector("objects").items():
@@ -49,15 +49,15 @@ def objects_to_topology(layers: Layers, parameters: Parameters, notes: Derivatio
             parts[PartKey("topology", level, NETWORK)] = network_part
     if not parts:
         raise MissingLayer(
-            "a network can be made from drawn lines and points of interest, but the stored objects have none: upload "
-            "a network (tmap2, osm …) or a KML or GeoJSON drawing with paths as lines; where the paths were drawn as "
-            "polygons, ask with outlines=true"
+            "the stored objects have no drawn lines or points of interest to derive a network from: upload a network "
+            "(tmap2, osm …) or a KML or GeoJSON drawing with paths as lines; if the paths are drawn as polygons, set "
+            "outlines=true"
         )
     return Layers(parts, layers.datum, layers.levels)
 
 
 def _network(drawings: list[Features], layers: Layers, parameters: Parameters) -> Features:
-    """One network from several drawings, whose objects may share ids."""
+    """Build one network from several drawings, whose objects may share ids."""
     origins = tuple(i for part in drawings for i in part.ids)
     ids = iter(unique_ids(origins))
     renamed = [Features(tuple(next(ids) for _ in p.ids), p.geometry, p.properties, np.array(p.local)) for p in drawings]

@@ -22,43 +22,43 @@ from app.model.voxels import HALF, VoxelMap
 from app.parameters import parameter
 
 MAX_VOXELS = 2**25
-"""Occupied voxels (``Limits.voxels``)."""
+"""Maximum number of occupied voxels (``Limits.voxels``)."""
 
 DEFAULT_MAX_VOXELS = 2**23
-"""Voxels up to which the usual resolution is kept."""
+"""Maximum number of voxels at the default resolution."""
 
 RESOLUTION = 0.1
-"""Metres unless asked otherwise."""
+"""Default resolution in metres."""
 
 RESOLUTIONS = (RESOLUTION, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""What is taken where a finer one would give too many voxels."""
+"""Coarser resolutions, used if the default one would give too many voxels."""
 
 CELLS_PER_BLOCK = 2**22
-"""Cells of spans that are told apart at a time."""
+"""Number of cells of spans that are deduplicated at a time."""
 
 OCCUPIED = math.log(0.971 / (1.0 - 0.971))
-"""Log-odds of an occupied voxel: OctoMap's upper clamping value, as a ``.bt`` is read."""
+"""Log-odds of an occupied voxel: OctoMap's upper clamping value, as read from a ``.bt``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """How fine, and what of a solid."""
+    """Parameters of objects_to_voxels."""
 
     resolution: float | None = parameter(
         None,
-        f"metres an edge of the smallest voxel; default: {RESOLUTION}, or as much coarser as a large site needs",
+        f"edge length of the smallest voxel; default: {RESOLUTION}, or coarser for a large site",
         minimum=1e-3,
         maximum=100.0,
         unit="m",
     )
-    filled: bool = parameter(True, "whether the inside of closed solids is occupied, or only their surface")
-    extrude: float = parameter(2.5, "how high footprints are that do not say it", minimum=0.0, maximum=1000.0, unit="m")
-    doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
-    visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
-    world: str | None = parameter(None, "which of several worlds; default: gazebo…, else the shortest name")
+    filled: bool = parameter(True, "whether the inside of closed solids is occupied, instead of only their surface")
+    extrude: float = parameter(2.5, "height of footprints that state none", minimum=0.0, maximum=1000.0, unit="m")
+    doors: Literal["open", "closed"] = parameter("open", "whether robots can pass doors")
+    visuals: bool = parameter(False, "whether visual shapes without collision count as obstacles")
+    world: str | None = parameter(None, "world to use, if there are several; default: gazebo…, else the shortest name")
 
 
-@derives(  # last: they tell of no free space, so no grid is made of them where objects_to_occupancy refuses
+@derives(  # last: without free space, no grid is derived from them if objects_to_occupancy refuses
     gives="voxels",
     needs={"objects"},
     also=frozenset({"resources"}),
@@ -68,11 +68,11 @@ class Parameters:
     last=True,
 )
 def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """Solids and extruded footprints as occupied voxels, all levels in one map; nothing is said of free space.
+    """Solids and extruded footprints as occupied voxels, all levels in one map, without free space.
 
-    Every voxel that a surface touches is occupied, and with ``filled`` those whose middle lies inside. Raises
-    MissingLayer where nothing has a body, MissingDatum where the objects are places on earth and there is none,
-    CannotConvert where the map would be too large.
+    Every voxel that a surface touches is occupied, and with ``filled`` those whose centre is inside. Raises
+    MissingLayer if no object has a body, MissingDatum for WGS 84 coordinates without a datum, CannotConvert if the map
+    would be too large.
     """
     closed, seen = parameters.doors == "closed", parameters.visuals
     obstacles = sites(layers, notes, doors_closed=closed, visuals=seen, world=parameters.world)
@@ -93,7 +93,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationN
             "no stored object has a body: upload walls, buildings, barriers, trees or a world with solids"
         )
     if guessed:
-        notes.fill("height", parameters.extrude, f"{guessed} footprints do not say how high they are", "extrude")
+        notes.fill("height", parameters.extrude, f"{guessed} footprints state no height", "extrude")
     corners = np.concatenate(triangles)
     owner = np.repeat(np.arange(len(triangles)), [len(one) for one in triangles])
     made_of = _voxels(corners, owner, parameters, notes)
@@ -101,7 +101,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationN
 
 
 def _extrude_footprints(site: LevelObstacles, otherwise: float) -> tuple[list[Array], int]:
-    """The footprints as closed solids, and how many of them took the height from the parameter."""
+    """Convert the footprints to closed solids; also return how many used the default height."""
     out, without = [], 0
     for footprint, base, top in zip(site.footprints, site.base, site.top, strict=True):
         if not math.isfinite(base):
@@ -116,11 +116,13 @@ def _extrude_footprints(site: LevelObstacles, otherwise: float) -> tuple[list[Ar
 
 
 def _estimate_voxels(corners: Array, owner: NDArray[np.int64], resolution: float, *, filled: bool) -> float:
-    """About how many voxels: what lies in the solids, and one for each square of their surface."""
+    """Estimate the number of voxels: volume of the solids, and one voxel per square of their surface."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = np.cross(b - a, c - a)
     area = float(np.linalg.norm(normal, axis=1).sum()) / 2
-    middle = corners.reshape(-1, 3).mean(axis=0)  # near it the sums of large numbers stay small
+    middle = corners.reshape(-1, 3).mean(
+        axis=0
+    )  # relative to the objects, so that sums of large numbers keep their precision
     volume = np.abs(np.bincount(owner, np.einsum("ij,ij->i", a - middle, normal) / 6)).sum() if filled else 0.0
     return area / resolution**2 + float(volume) / resolution**3
 
@@ -142,8 +144,8 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
     if not _fits(low, high, edge):
         needed = max(map(abs, (*low, *high))) / (HALF - 1)
         raise CannotConvert(
-            f"an octree reaches {HALF * edge:g} m to each side at {edge:g} m, and the objects lie further from the "
-            f"origin: ask for a resolution of at least {needed:.3g} m, or set a datum nearer to them"
+            f"objects are farther from the origin than {HALF * edge:g} m, the range of an octree at {edge:g} m: set a "
+            f"resolution of at least {needed:.3g} m, or a datum nearer to them"
         )
     if _estimate_voxels(corners, owner, edge, filled=parameters.filled) > 4 * MAX_VOXELS:
         _raise_too_many(edge)
@@ -156,7 +158,7 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
         inside = _codes(raster.insides(corners, owner, frame, (levels[:-1] + levels[1:]) / 2), frame, first)
         codes = _distinct(np.concatenate([codes, inside]))
     if not len(codes):
-        raise MissingLayer("no stored object has a body of any extent")
+        raise MissingLayer("no stored object has a body with an extent: upload walls, buildings or a world with solids")
     depth = np.full(len(codes), voxels.DEPTH, np.uint8)
     return voxels.prune(VoxelMap(edge, depth, codes, np.full(len(codes), OCCUPIED, np.float32)))
 
@@ -166,7 +168,7 @@ def _fits(low: Sequence[float], high: Sequence[float], edge: float) -> bool:
 
 
 def _codes(spans: Iterable[Spans], frame: RasterFrame, first: int) -> voxels.Codes:
-    """The Morton codes of all cells of spans, each once, ascending."""
+    """Return the distinct Morton codes of all cells of spans, ascending."""
     x0, y0 = (round(v / frame.resolution) for v in frame.origin)
     out = np.empty(0, np.uint64)
     waiting: list[voxels.Codes] = []
@@ -188,7 +190,7 @@ def _codes(spans: Iterable[Spans], frame: RasterFrame, first: int) -> voxels.Cod
 
 
 def _distinct(codes: voxels.Codes) -> voxels.Codes:
-    """Each code once, ascending. By sorting: numpy.unique hashes, and Morton codes all meet in few of its buckets."""
+    """Return distinct codes, ascending. Sorts, because numpy.unique hashes Morton codes into few buckets."""
     ordered = np.sort(codes)
     new = np.ones(len(ordered), bool)
     np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
@@ -197,5 +199,5 @@ def _distinct(codes: voxels.Codes) -> voxels.Codes:
 
 def _raise_too_many(resolution: float) -> None:
     raise CannotConvert(
-        f"voxels of {resolution:g} m would be more than {MAX_VOXELS}: ask for a coarser resolution, or filled=false"
+        f"there would be more than {MAX_VOXELS} voxels of {resolution:g} m: use a coarser resolution, or filled=false"
     )

@@ -1,4 +1,4 @@
-"""Occupancy -> imagery: a plan drawn from the map, where nobody has photographed the place or drawn it."""
+"""Occupancy -> imagery: a floor plan drawn from the map, if there is no photograph or drawing."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from app.parameters import parameter
 
 NAME = "plan"
 MAX_PIXELS = 2**26
-GRID_PURPOSE = "what is where"
+GRID_PURPOSE = "obstacles"
 
 PAPER, INK, NOTHING = (246, 246, 242), (44, 46, 52), (205, 205, 205)
-"""Red, green, blue of free, occupied and unknown cells; costs between lie between paper and ink."""
+"""Red, green, blue of free, occupied and unknown cells; costs are shades between paper and ink."""
 
 COLOURS: Mapping[str, tuple[int, int, int]] = {
     "building": (178, 124, 104),
@@ -47,11 +47,11 @@ EDGE = (196, 64, 56)
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What is drawn, and how fine."""
+    """Parameters of occupancy_to_imagery."""
 
     grid: str | None = parameter(None, "name of the occupancy grid; default: `map`, or the only one")
     pixel: float | None = parameter(
-        None, "metres a pixel; default: the grid's cells, or as much coarser as keeps it below 2^26 pixels",
+        None, "size of a pixel; default: the grid's cells, or coarser to keep the image below 2^26 pixels",
         minimum=1e-3, maximum=100.0, unit="m",
     )  # fmt: skip
     draw_objects: bool = parameter(True, "whether buildings, trees, water, shelves … are drawn over the cells")
@@ -74,11 +74,11 @@ def _try(layers: Layers, parameters: Parameters) -> None:
     trial=_try,
 )
 def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """A plan in plain colours, drawn from the grid with objects and, if asked for, the network over it.
+    """Plan in plain colours, drawn from the grid, with objects and optionally the network over it.
 
-    Pixels [height, width, 4] red, green, blue, alpha, where unknown cells are transparent; in the local frame, along
-    the grid's axes. A pixel of several cells shows the one that matters most: occupied, then free. Raises what choosing
-    a grid raises, CannotConvert where the plan would have too many pixels.
+    Pixels [height, width, 4] red, green, blue, alpha, with transparent unknown cells; in the local frame, along the
+    grid's axes. A pixel of several cells shows occupied before free. Raises NotFound, MissingLayer or Ambiguous if no
+    grid can be selected, CannotConvert if the plan would have too many pixels.
     """
     parts: dict[PartKey, Part] = {}
     for key, stored in select_grids(layers, parameters.grid, GRID_PURPOSE).items():
@@ -87,7 +87,7 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Derivati
         cells = _coarser(grid.cells, step)
         size = grid.resolution * step
         if step > 1 and parameters.pixel is None:
-            notes.warn(f"a pixel is {step} cells wide, {size:g} m: drawn finer, the plan would be too large")
+            notes.warn(f"pixels are {step} cells wide, {size:g} m; a finer plan would be too large")
         pixels = _colour_cells(cells)
         frame = RasterFrame((0.0, 0.0), size, cells.shape[1], cells.shape[0])
         if parameters.draw_objects:
@@ -99,27 +99,29 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Derivati
         up = cells.shape[0] * size
         transform = (size * c, size * s, x - s * up, size * s, -size * c, y + c * up)
         parts[PartKey("imagery", key.level, NAME)] = GeoImage(np.ascontiguousarray(pixels[::-1]), transform)
-    notes.warn("the picture is a plan drawn from the map, no photograph")
+    notes.warn("the image is a plan drawn from the map, not a photograph")
     return Layers(parts, layers.datum, layers.levels)
 
 
 def _step(grid: OccupancyGrid, pixel: float | None, label: str) -> int:
-    """Cells along the side of a pixel."""
+    """Return the number of cells along the side of a pixel."""
     if pixel is not None:
         step = max(1, round(pixel / grid.resolution))
         if grid.width * grid.height / step**2 > MAX_PIXELS:
-            raise CannotConvert(f"a plan of {label} with {pixel:g} m a pixel would have more than {MAX_PIXELS} pixels")
+            raise CannotConvert(
+                f"a plan of {label} with {pixel:g} m per pixel would have more than {MAX_PIXELS} pixels: enlarge it"
+            )
         return step
     return max(1, math.ceil(math.sqrt(grid.width * grid.height / MAX_PIXELS)))
 
 
 def _coarser(cells: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-    """The greatest cost in each block of step × step cells; unknown only where all of them are."""
+    """Return the highest cost in each block of step × step cells; unknown only if all of them are."""
     if step == 1:
         return cells
     height, width = (-(-n // step) for n in cells.shape)
     out = np.full((height, width), UNKNOWN, np.uint8)
-    for first in range(step):  # row by row of each block: no copy of the whole grid
+    for first in range(step):  # row by row of each block, to avoid a copy of the grid
         rows = cells[first::step] + np.uint8(1)  # unknown becomes 0, costs 1 … 101
         rows = np.pad(rows, ((0, 0), (0, width * step - cells.shape[1]))).reshape(len(rows), width, step).max(axis=2)
         part = out[: len(rows)]
@@ -153,7 +155,7 @@ def _draw_objects(
         try:
             geometries = part.select(rows).in_local(layers.frame)
         except MissingDatum:
-            notes.drop("objects", len(rows), "they are places on earth, and there is no datum: not drawn on the plan")
+            notes.drop("objects", len(rows), "they have WGS 84 coordinates and there is no datum; not drawn")
             continue
         for row, geometry in zip(rows, geometries, strict=True):
             width = part.properties[row].get("width")
@@ -177,7 +179,7 @@ def _draw_network(
         try:
             geometries = edges.in_local(layers.frame)
         except MissingDatum:
-            notes.drop("edges", len(edges), "they are places on earth, and there is no datum: not drawn on the plan")
+            notes.drop("edges", len(edges), "they have WGS 84 coordinates and there is no datum; not drawn")
             continue
         _paint(pixels, list(geometries), EDGE, grid, frame)
 
@@ -185,7 +187,7 @@ def _draw_network(
 def _paint(
     pixels: NDArray[np.uint8], shapes: list[Any], colour: tuple[int, int, int], grid: OccupancyGrid, frame: RasterFrame
 ) -> None:
-    """Polygons filled, lines one pixel wide; points are nothing."""
+    """Draw geometries: polygons filled, lines one pixel wide; points are skipped."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     turn = np.array([[c, -s], [s, c]])

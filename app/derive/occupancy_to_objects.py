@@ -1,14 +1,14 @@
-"""Occupancy -> objects: a grid's obstacles as trees or posts, walls, and furniture, as far as their shapes tell.
+"""Occupancy -> objects: a grid's obstacles as trees or posts, walls and furniture, classified by shape.
 
-A piece of occupied cells that touch is
+A connected piece of occupied cells is
 
 ========= =============================================================================================================
-a post    where it is round (or, among trees, of any shape and no larger than a trunk), its inside unknown or not: a
-          laser sees only the rim
-a wall    where it is a straight piece no thicker than ``wall_width``; of other pieces all that is no thicker, each
-          straight edge of its middle line within ``tolerance`` one wall
-furniture where it is a rectangle that is thicker, up to the size that the context allows
-obstacle  else, as an outline within ``tolerance``
+a post    if it is round (or, among trees, of any shape and no larger than a trunk), its inside unknown or not: a laser
+          scanner sees only the rim
+a wall    if it is a straight piece no thicker than ``wall_width``; of other pieces all parts that are no thicker, each
+          straight edge of their centreline within ``tolerance`` one wall
+furniture if it is a rectangle that is thicker, up to the size that the context allows
+obstacle  otherwise, as an outline within ``tolerance``
 ========= =============================================================================================================
 
 Pieces around free cells are never solid. Cells count as occupied from the grid's ``occupied_thresh`` on; unknown cells
@@ -36,17 +36,17 @@ from app.model.selection import as_planned, grid_label, select_grids
 from app.parameters import parameter
 
 NAME = "occupancy"
-"""The family under which these objects stand."""
+"""Family and part name of these objects."""
 
 CELLS = 2**29
-"""Cells that are looked at."""
+"""Maximum number of cells that are processed."""
 
 Row = tuple[str, Any, dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What stands in such a place. Metres: heights, the widest post, the longest furniture, the largest trunk."""
+    """Typical sizes in a context, in metres: heights, the widest post, the longest furniture, the largest trunk."""
 
     post: str
     furniture: str
@@ -66,38 +66,44 @@ CONTEXTS: Mapping[str, Context] = {
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What the grid shows, and how exactly."""
+    """Parameters of occupancy_to_objects."""
 
     context: Literal["forest", "orchard", "office", "warehouse"] = parameter(
         "office",
-        "what stands there: what is round is a tree (forest, orchard) or a post, how high and large things are",
+        "kind of site; decides whether discs are trees (forest, orchard) or posts, and sizes of objects",
     )
-    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
+    grid: str | None = parameter(
+        None, "name of the grid; default: map, else the only one of a level that is no filter mask"
+    )
     minimum_size: float | None = parameter(
-        None, "what is less than this across is a speck; default: two cells", minimum=0.0, maximum=100.0, unit="m"
+        None,
+        "diameter below which a shape is dropped as a speck; default: two cells",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m",
     )
     height: float | None = parameter(
-        None, "how high all of it is; default: what the context says of each kind", minimum=1e-3, maximum=1e3, unit="m"
+        None, "height of all objects; default: the context's height of each kind", minimum=1e-3, maximum=1e3, unit="m"
     )
     tolerance: float | None = parameter(
         None,
-        "how far straight edges may be from the cells; default: one and a half cells",
+        "maximum distance of straight edges from the cells; default: one and a half cells",
         minimum=0.0,
         maximum=100.0,
         unit="m",
     )
     wall_width: float = parameter(
-        0.4, "what is thicker is no wall; at least three cells", minimum=0.0, maximum=10.0, unit="m"
+        0.4, "maximum thickness of a wall; at least three cells", minimum=0.0, maximum=10.0, unit="m"
     )
 
 
 @derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=2)
 def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """A grid's obstacles as objects: posts or trees, walls and furniture by their shapes, of the height of a context.
+    """Objects from a grid: posts or trees, walls and furniture by shape, with heights of a context.
 
-    In local metres with ``pose`` and ``shapes`` (cylinders, boxes) but where the outline is irregular, which has a
-    ``height`` alone. Walls are their middle lines with a ``width``. Raises CannotConvert where nothing is occupied or
-    nothing else is, NotFound or Ambiguous where the grid is not clear.
+    In local metres with ``pose`` and ``shapes`` (cylinders, boxes); irregular outlines have only a ``height``. Walls
+    are their centrelines with a ``width``. Raises CannotConvert if nothing or everything is occupied, NotFound or
+    Ambiguous if no grid can be selected.
     """
     parts: dict[PartKey, Part] = {}
     used: set[str] = set()
@@ -115,11 +121,14 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Derivati
         if parameters.height is None:
             value = CONTEXTS[parameters.context].heights[kind]
             notes.fill(
-                f"height of {kind}", value, f"a grid tells none; usual in the context {parameters.context}", "context"
+                f"height of {kind}",
+                value,
+                f"a grid has no heights; typical of the context {parameters.context}",
+                "context",
             )
     if parameters.height is not None:
-        notes.fill("height", parameters.height, "a grid does not say how high what it shows is", "height")
-    notes.warn(f"what the objects are is guessed from their shapes in the context {parameters.context}")
+        notes.fill("height", parameters.height, "a grid has no heights", "height")
+    notes.warn(f"kinds of objects were guessed from their shapes in the context {parameters.context}; review them")
     return Layers(parts, layers.datum, layers.levels)
 
 
@@ -144,19 +153,19 @@ def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: D
     count = len(shapes.discs) + len(shapes.boxes) + len(shapes.walls) + len(shapes.areas)
     if not count:
         raise CannotConvert(
-            f"{name} has nothing but {shapes.specks} specks less than {limit:g} m across: give a smaller minimum_size"
+            f"{name} has only {shapes.specks} specks less than {limit:g} m across: set a smaller minimum_size"
         )
     if count > MAX_FIGURES:
         raise CannotConvert(
-            f"{name} would be {count} objects, the limit is {MAX_FIGURES}: give a larger minimum_size than {limit:g} m"
+            f"{name} would be {count} objects, the maximum is {MAX_FIGURES}: set minimum_size above {limit:g} m"
         )
     return _rows(shapes, grid, context, parameters.height, floor)
 
 
 def _occupied_mask(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
-    """1 where something stands; CannotConvert where that is nowhere, or everywhere that is known."""
+    """Return 1 for occupied cells. Raises CannotConvert if there are none, or if all known cells are occupied."""
     if grid.cells.size > CELLS:
-        raise TooLarge(f"{name} has {grid.cells.size} cells; objects can be made of at most {CELLS}")
+        raise TooLarge(f"{name} has {grid.cells.size} cells, the maximum for deriving objects is {CELLS}")
     meaning = np.zeros(256, np.uint8)
     meaning[: OCCUPIED + 1] = np.arange(OCCUPIED + 1) / 100 >= grid.occupied_thresh
     meaning[FREE], meaning[OCCUPIED], meaning[UNKNOWN] = 0, 1, 0
@@ -165,15 +174,17 @@ def _occupied_mask(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
         counts = grid.counts()
         summary = ", ".join(f"{counts[n]} {n}" for n in ("free", "unknown", "other") if counts[n])
         raise CannotConvert(
-            f"{name} has no occupied cell ({summary}), so it shows no objects: upload one with obstacles"
+            f"{name} has no occupied cell ({summary}), so it shows no objects: upload a grid with obstacles"
         )
     if mask.all():
-        raise CannotConvert(f"{name} is occupied all over: it shows no objects that stand somewhere")
+        raise CannotConvert(
+            f"{name} is completely occupied, so it shows no separate objects: upload a grid with free space"
+        )
     return mask
 
 
 def _rows(shapes: MaskShapes, grid: OccupancyGrid, context: Context, height: float | None, floor: float) -> list[Row]:
-    """Posts, walls, furniture, obstacles, each numbered from 1, in the local frame."""
+    """Convert shapes to posts, walls, furniture and obstacles, each numbered from 1, in the local frame."""
     cell = grid.resolution
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)

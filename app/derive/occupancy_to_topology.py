@@ -1,10 +1,10 @@
-"""Occupancy -> topology: the network of ways that an occupancy grid leaves open to a round robot.
+"""Occupancy -> topology: the network of paths of a round robot through a grid's free space.
 
-Free space is where the robot's centre may be: cells that are farther than ``robot_radius`` from every obstacle, between
-cell centres, which is how Nav2's inflation layer tells a collision (InflationLayer::computeCost). Unknown cells and
-what is beyond the grid are obstacles. Every edge is a straight line that crosses such cells only, so it is
-collision-free in any format; its ``width`` is the free width at its narrowest cell. What free space connects is
-connected. Ids are made from places on a coarse raster, so that where a map does not change, most ids do not either.
+Free space is the set of cells for the robot's centre: those farther than ``robot_radius`` from every obstacle, between
+cell centres, as Nav2's inflation layer detects collisions (InflationLayer::computeCost). Unknown cells and everything
+beyond the grid are obstacles. Every edge is a straight line that crosses only such cells, so it is collision-free in
+any format; its ``width`` is the free width at its narrowest cell. Connected free space gives a connected network. Ids
+are derived from positions on a coarse raster, so that most ids stay if that part of the map does not change.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from app.derive._skeleton import FreeSpace, Graph
 
 RASTERS = (0.5, 0.1, 0.01)
-"""Metres: a node is named after its place on the first of these on which no other node has the same."""
+"""Raster sizes in metres: a node is named after its position on the first one that makes the name unique."""
 
 METHOD_PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "spacing": ("skeleton", "voronoi"),
@@ -40,81 +40,84 @@ METHOD_PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "max_edge": ("roadmap",),
     "seed": ("roadmap",),
 }
-"""Parameters that not every method has."""
+"""Parameters that apply to some methods only."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """How free space becomes a network."""
+    """Parameters of occupancy_to_topology."""
 
     method: Literal["skeleton", "roadmap", "voronoi"] = parameter(
         "skeleton",
-        "how ways are found: the middle lines of free space, with straight ways through the open (skeleton), random "
-        "samples joined where nothing is between (roadmap), or the lines that are farthest from all obstacles, also in "
-        "the open (voronoi, the generalised Voronoi diagram)",
+        "method; skeleton: centrelines of free space, with straight edges across open space; roadmap: "
+        "random samples joined by collision-free lines; voronoi: lines farthest from all obstacles, also in open space "
+        "(generalised Voronoi diagram)",
     )
-    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
+    grid: str | None = parameter(
+        None, "name of the grid; default: map, else the only one of a level that is no filter mask"
+    )
     robot_radius: float = parameter(
-        0.3, "radius of the robot: no edge is nearer to an obstacle", minimum=0.0, maximum=100.0, unit="m"
+        0.3, "radius of the robot; edges keep this distance from obstacles", minimum=0.0, maximum=100.0, unit="m"
     )
-    unknown: bool = parameter(False, "whether unknown cells may be driven through")
+    unknown: bool = parameter(False, "whether robots may drive through unknown cells")
     unknown_grey: Literal["unknown", "free"] = parameter(
         "unknown",
-        "what free cells of the grey 205 are: map_saver writes it for unknown, and a free_thresh of 0.25 calls it free",
+        "meaning of free cells with grey 205, which map_saver writes for unknown and a free_thresh of 0.25 reads as "
+        "free",
     )
     tolerance: float = parameter(
-        0.1, "how far straight edges may be from the skeleton or diagram", minimum=0.0, maximum=100.0, unit="m"
+        0.1, "maximum distance of straight edges from the skeleton or diagram", minimum=0.0, maximum=100.0, unit="m"
     )
     spur: float = parameter(
         0.5,
-        "dead ends of the skeleton that reach less than this beyond the free circle around their junction are cut",
+        "length below which dead ends are cut, measured beyond the free circle around their junction",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
     )
     island: float = parameter(
         2.0,
-        "free places less than this across that nothing connects to the rest are left out; the largest always stays",
+        "diameter below which isolated pieces of free space are dropped; the largest one always stays",
         minimum=0.0,
         maximum=1e6,
         unit="m",
     )
     spacing: float = parameter(
         1.5,
-        "skeleton, voronoi: longest distance of nodes along it (skeleton: and between nodes in the open); 0: only its "
-        "own corners",
+        "skeleton, voronoi: maximum distance of nodes along the lines (skeleton: and in open space); 0: nodes at "
+        "corners only",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
     )
     detour: float = parameter(
         1.2,
-        "skeleton with spacing: a straight way is added where the way around is more than this many times as long",
+        "skeleton with spacing: ratio of path length to straight line above which a straight edge is added",
         minimum=1.0,
         maximum=100.0,
     )
-    samples: int = parameter(1000, "roadmap: how many places are drawn", minimum=2, maximum=200_000)
-    neighbours: int = parameter(10, "roadmap: to how many of its nearest samples one is joined", minimum=1, maximum=64)
-    max_edge: float = parameter(5.0, "roadmap: longest edge between samples", minimum=0.01, maximum=1000.0, unit="m")
-    seed: int = parameter(0, "roadmap: another number draws other samples", minimum=0, maximum=2**31 - 1)
+    samples: int = parameter(1000, "roadmap: number of samples", minimum=2, maximum=200_000)
+    neighbours: int = parameter(10, "roadmap: number of nearest samples to join with", minimum=1, maximum=64)
+    max_edge: float = parameter(5.0, "roadmap: maximum length of an edge", minimum=0.01, maximum=1000.0, unit="m")
+    seed: int = parameter(0, "roadmap: seed of the samples", minimum=0, maximum=2**31 - 1)
 
 
 @derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0)
 def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """The ways through an occupancy grid's free space as a network of nodes and directed edges.
+    """Network of nodes and directed edges along the paths through a grid's free space.
 
-    One network for each level. Raises CannotConvert where a grid has no ways (nothing free, no obstacle, too narrow for
-    the robot), NotFound or Ambiguous where the grid is not clear, Invalid for parameters of another method.
+    One network per level. Raises CannotConvert if a grid has no paths (nothing free, no obstacle, too narrow for the
+    robot), NotFound or Ambiguous if no grid can be selected, Invalid for parameters of another method.
     """
     _check(parameters)
     parts: dict[PartKey, Part] = {}
-    for key, grid in select_grids(layers, parameters.grid, "ways").items():
+    for key, grid in select_grids(layers, parameters.grid, "paths").items():
         parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, grid_label(key))
     return Layers(parts, layers.datum, layers.levels)
 
 
 def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> Features:
-    """One grid's network. called: what errors call the grid."""
+    """Derive the network of one grid. called: name of the grid for messages."""
     from app.derive import _roadmap, _skeleton
 
     grid = _drop_unseen(grid, parameters, notes, called)
@@ -128,10 +131,10 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
         island=parameters.island / cell,
         voronoi=parameters.method == "voronoi",
     )
-    notes.drop("places", islands, f"{called}: under island={parameters.island:g} m across, no way to the rest")
+    notes.drop("places", islands, f"{called}: isolated and less than island={parameters.island:g} m across")
     count, _ = _skeleton.pieces(graph)
     if count > 1:
-        notes.warn(f"the network is in {count} pieces: no way that the robot fits joins them", where=called)
+        notes.warn(f"the network has {count} disconnected pieces; the robot does not fit between them", where=called)
     if parameters.method == "roadmap":
         graph, alone = _roadmap.roadmap(
             space,
@@ -141,7 +144,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
             max_edge=parameters.max_edge / cell,
             seed=parameters.seed,
         )
-        notes.drop("samples", alone, f"{called}: they see nothing to be joined to, or lie in places left out")
+        notes.drop("samples", alone, f"{called}: nothing to join them to, or in dropped places")
     elif parameters.method == "voronoi":
         graph = (
             _skeleton.divide_edges(graph, space, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
@@ -154,70 +157,75 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
     if not len(graph.edges):
         supply = "a smaller robot_radius, more samples" if parameters.method == "roadmap" else "a smaller robot_radius"
         if parameters.method != "roadmap" and not parameters.spacing:
-            supply = "a spacing above 0 (spacing=0 puts nodes at corners and crossings only), " + supply
+            supply = "a spacing above 0 (spacing=0 places nodes at corners and crossings only), " + supply
         raise CannotConvert(
-            f"{called} leaves {space.cells} cells to a robot of radius {parameters.robot_radius:g} m, too few for a "
-            f"way between two places: give {supply}, or a grid of more than one spot"
+            f"{called} has {space.cells} cells for a robot of radius {parameters.robot_radius:g} m, too few for a "
+            f"path: use {supply}, or a larger grid"
         )
     row, column, width = space.row, space.column, _widths(space, graph)
-    del space  # three bytes a cell, which the features may need
+    del space  # frees three bytes per cell, which the features may need
     return _features(grid, row, column, graph, width)
 
 
 def _drop_unseen(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> OccupancyGrid:
-    """The grid with its free cells of unknown's grey as unknown, unless they are to be free."""
+    """Return the grid with free cells of grey 205 as unknown, unless unknown_grey is free."""
     grey = unknown_grey(grid)
     if grey is None:
         return grid
     if parameters.unknown_grey == "free":
-        notes.warn(grey_warning(grid, grey, called, "ways may lead where nobody has been"))
+        notes.warn(grey_warning(grid, grey, called, "edges may lead through unexplored ground"))
         return grid
-    notes.warn(grey_warning(grid, grey, called, "no edges lead there; unknown_grey=free takes them as free"))
+    notes.warn(grey_warning(grid, grey, called, "no edges lead there; unknown_grey=free keeps them free"))
     return unknown_grey_as_unknown(grid)
 
 
 def _check(parameters: Parameters) -> None:
-    """Refuse what the chosen method would ignore."""
+    """Raise Invalid for parameters that the chosen method ignores."""
     changed = [f.name for f in fields(parameters) if getattr(parameters, f.name) != f.default]
     wrong = [n for n in changed if parameters.method not in METHOD_PARAMETERS.get(n, (parameters.method,))]
     if wrong:
         methods = {n: " or ".join(METHOD_PARAMETERS[n]) for n in wrong}
-        problems = [Problem(f"belongs to method={methods[n]}, not to {parameters.method}", where=n) for n in wrong]
+        problems = [Problem(f"applies only to method={methods[n]}, not to {parameters.method}", where=n) for n in wrong]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
 
 
 def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> FreeSpace:
-    """Where the robot may be; says what is wrong with a grid that has no such place, or nothing to go around."""
+    """Return the free space of the robot.
+
+    Raises CannotConvert if there is none, or if the grid has no obstacle.
+    """
     from app.derive import _skeleton
 
     if grid.cells.size >= 2**31 - 2 * (grid.width + grid.height):
-        raise TooLarge(f"{called} has {grid.cells.size} cells; a network can be made of at most 2^31")
+        raise TooLarge(f"{called} has {grid.cells.size} cells, the maximum for deriving a network is 2^31")
     free_cells = _skeleton.free_cells(grid, parameters.unknown)
     if free_cells is None:
         counts = grid.counts()
         summary = ", ".join(f"{counts[n]} {n}" for n in ("occupied", "unknown", "other") if counts[n])
-        hint = "; unknown=true drives through unknown cells" if counts["unknown"] and not parameters.unknown else ""
+        hint = (
+            "; unknown=true allows paths through unknown cells" if counts["unknown"] and not parameters.unknown else ""
+        )
         raise CannotConvert(
-            f"{called} has no free cell ({summary}), so there are no ways: upload a map with free space{hint}"
+            f"{called} has no free cell ({summary}), so there are no paths: upload a map with free space{hint}"
         )
     free, row, column = free_cells
     if free.shape == (grid.height + 2, grid.width + 2) and free[1:-1, 1:-1].all():
         raise CannotConvert(
-            f"{called} is free all over: without an obstacle nothing tells where ways are. Upload a map that has some, "
-            f"or the network itself"
+            f"{called} is completely free, and paths follow obstacles: upload a map with obstacles, or the network "
+            "itself"
         )
     space = _skeleton.space(free, row, column, parameters.robot_radius / grid.resolution)
     if not space.cells:
         widest = _skeleton.widest(space) * grid.resolution
         raise CannotConvert(
-            f"{called} has no place for a robot of radius {parameters.robot_radius:g} m: the farthest that a free cell "
-            f"is from obstacles is {widest:.3g} m. Give a robot_radius below that"
+            f"{called} is too narrow for a robot of radius {parameters.robot_radius:g} m: free cells are at most "
+            f"{widest:.3g} m from obstacles; use a robot_radius below that"
         )
     return space
 
 
 def _phase(grid: OccupancyGrid, space: FreeSpace, spacing: float) -> tuple[float, float]:
-    """Where a lattice that is fixed to the local frame begins in a space: row and column."""
+    """Return the row and column in a space at which a lattice fixed to the local frame begins."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     along, across = (c * x + s * y) / grid.resolution, (c * y - s * x) / grid.resolution
@@ -225,7 +233,7 @@ def _phase(grid: OccupancyGrid, space: FreeSpace, spacing: float) -> tuple[float
 
 
 def _widths(space: FreeSpace, graph: Graph) -> NDArray[np.float64]:
-    """The free width along each edge, in cells."""
+    """Compute the free width along each edge, in cells."""
     from app.derive import _kernels_space
 
     width = np.empty(len(graph.edges))
@@ -234,7 +242,7 @@ def _widths(space: FreeSpace, graph: Graph) -> NDArray[np.float64]:
 
 
 def _features(grid: OccupancyGrid, row: int, column: int, graph: Graph, width: NDArray[np.float64]) -> Features:
-    """Nodes, then edges, both ways each. row, column: the grid's cell at which the graph's (0, 0) lies."""
+    """Return nodes, then edges in both directions. row, column: the grid's cell at the graph's (0, 0)."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     u = (graph.nodes[:, 1] + column + 0.5) * grid.resolution
@@ -257,7 +265,7 @@ def _features(grid: OccupancyGrid, row: int, column: int, graph: Graph, width: N
 
 
 def _names(xy: NDArray[np.float64]) -> list[str]:
-    """A name for each place: ``p`` and its coordinates on the coarsest raster that tells it from all others."""
+    """Name each position: ``p`` and its coordinates on the coarsest raster that makes the name unique."""
     names = [""] * len(xy)
     left = np.arange(len(xy))
     for step in RASTERS:

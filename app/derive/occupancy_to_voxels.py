@@ -18,34 +18,32 @@ from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, morton
 from app.parameters import parameter
 
 MAX_LEAVES = 2**25
-"""Leaves (``Limits.voxels``)."""
+"""Maximum number of leaves (``Limits.voxels``)."""
 
 COLUMNS = 2**28
-"""Columns that are looked at (``Limits.pixels``)."""
+"""Maximum number of columns that are processed (``Limits.pixels``)."""
 
 ROWS_PER_BLOCK = 2**9
-"""Rows that are sampled at once."""
+"""Number of rows that are sampled at once."""
 
 NO_KNOWN_CELLS = (
-    "voxels are made of a grid's occupied and free cells, and the stored grids have none: upload an occupancy grid, an "
-    "octree or a point cloud"
+    "the stored grids have no occupied or free cells to derive voxels from: upload an occupancy grid, an octree or a "
+    "point cloud"
 )
 
 States = NDArray[np.uint8]
-"""0 unknown, 1 free, 2 occupied."""
+"""States: 0 unknown, 1 free, 2 occupied."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """How high and how fine."""
+    """Parameters of occupancy_to_voxels."""
 
-    height: float = parameter(
-        2.0, "how high what is occupied stands above the floor", minimum=1e-3, maximum=1e3, unit="m"
-    )
+    height: float = parameter(2.0, "height of occupied columns above the floor", minimum=1e-3, maximum=1e3, unit="m")
     resolution: float | None = parameter(
-        None, "metres an edge of the smallest voxel; default: the grid's", minimum=1e-3, maximum=1e3, unit="m"
+        None, "edge length of the smallest voxel; default: the grid's", minimum=1e-3, maximum=1e3, unit="m"
     )
-    free: bool = parameter(True, "whether free cells become free voxels of the same height, or stay unknown")
+    free: bool = parameter(True, "whether free cells become free voxels of the same height, instead of unknown")
 
 
 def _try(layers: Layers, parameters: Parameters) -> None:
@@ -59,17 +57,17 @@ def _try(layers: Layers, parameters: Parameters) -> None:
     for block in filled_blocks:
         if (
             np.count_nonzero(block.state) * (block.top - block.bottom) > MAX_LEAVES
-        ):  # so many, were all leaves the smallest
+        ):  # the count if all leaves were the smallest
             _cut_into_leaves(block)
 
 
 @derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0, version=2, trial=_try)
 def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """The extrusion of a grid: each occupied cell as a column from the level's floor up, each free one as free space.
+    """Voxels extruded from a grid: occupied cells become columns from the level's floor up, free cells free space.
 
-    One voxel map of its name for each grid; where a level has a grid ``map``, of that one alone, and never of costmap
-    filter masks. A cell that is turned or shifted against the voxels occupies all that it reaches into. Raises
-    MissingLayer where nothing is known, CannotConvert where the octree would be too large.
+    Each grid gives one voxel map of its name; if a level has a grid ``map``, only that one is used, and never costmap
+    filter masks. A cell that is rotated or shifted against the voxels occupies all voxels that it touches. Raises
+    MissingLayer if no cell is known, CannotConvert if the octree would be too large.
     """
     parts: dict[PartKey, Part] = {}
     for key, grid in _default_grids(layers).items():
@@ -80,19 +78,19 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Derivatio
             voxels = VoxelMap(block.edge, *_leaves(block))
             parts[PartKey("voxels", key.level, key.name)] = voxels
             if not voxels.leaf_counts()["occupied"]:
-                notes.warn(f"{key.name}: the grid has no occupied cell, so the voxels hold free space only")
+                notes.warn(f"{key.name}: the grid has no occupied cell; the voxels contain only free space")
     if not parts:
         raise MissingLayer(NO_KNOWN_CELLS)
-    notes.fill("height", parameters.height, "a grid does not say how high what it shows is", "height")
+    notes.fill("height", parameters.height, "a grid has no heights", "height")
     return Layers(parts, layers.datum, layers.levels)
 
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """The columns of one grid, all from one height to another.
+    """Columns of one grid, all from one height to another.
 
-    edge: metres an edge of the smallest voxel. corner: x and y of the first column, bottom and top: heights, in voxels
-    from the origin.
+    edge: edge length of the smallest voxel in metres. corner: x and y of the first column, bottom and top: heights, in
+    voxels from the origin.
     """
 
     name: str
@@ -104,7 +102,7 @@ class _Block:
 
 
 def _default_grids(layers: Layers) -> dict[PartKey, OccupancyGrid]:
-    """The grids to extrude."""
+    """Return the grids to extrude."""
     grids = layers.grids()
     candidates = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
     mains = {key.level for key in candidates if key.name == MAP}
@@ -112,7 +110,7 @@ def _default_grids(layers: Layers) -> dict[PartKey, OccupancyGrid]:
 
 
 def _grid_columns(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> _Block | None:
-    """A grid's columns; None where nothing is known. CannotConvert where they reach beyond an octree."""
+    """Return a grid's columns; None if no cell is known. Raises CannotConvert if they reach beyond an octree."""
     edge = parameters.resolution or grid.resolution
     state, corner = _columns(grid, edge, parameters.free, name)
     if not state.any():
@@ -121,14 +119,14 @@ def _grid_columns(grid: OccupancyGrid, parameters: Parameters, floor: float, nam
     top = bottom + max(1, round(parameters.height / edge))
     if min(*corner, bottom) < -HALF or max(corner[0] + state.shape[1], corner[1] + state.shape[0], top) > HALF:
         raise CannotConvert(
-            f"an octree of {edge:g} m voxels reaches {HALF * edge:g} m from the origin, the grid {name} goes beyond: "
-            "ask for a coarser resolution"
+            f"the grid {name} extends beyond {HALF * edge:g} m from the origin, the range of an octree of {edge:g} m "
+            "voxels: use a coarser resolution"
         )
     return _Block(name, edge, state, corner, bottom, top)
 
 
 def _states(grid: OccupancyGrid) -> States:
-    """What the cells mean; values between the thresholds are unknown."""
+    """Return the states of a grid's cells; values between the thresholds are unknown."""
     values = np.zeros(256, np.uint8)
     percent = np.arange(101) / 100
     values[:101][percent <= grid.free_thresh] = 1
@@ -138,8 +136,10 @@ def _states(grid: OccupancyGrid) -> States:
 
 
 def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[States, tuple[int, int]]:
-    """What stands in each column of voxels: uint8 [rows, columns], row 0 at the smallest y; and the first one's place,
-    x and y in voxels from the origin."""
+    """Return the state of each column of voxels: uint8 [rows, columns], row 0 at the smallest y.
+
+    Also returns the position of the first column, x and y in voxels from the origin.
+    """
     state = _states(grid)
     if not free:
         state[state == 1] = 0
@@ -154,8 +154,8 @@ def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[S
     width, height = max(1, right - left), max(1, top - bottom)
     if width * height > COLUMNS:
         raise CannotConvert(
-            f"the grid {name} would be {width} × {height} columns of voxels of {edge:g} m; the limit is {COLUMNS}: ask "
-            "for a coarser resolution"
+            f"the grid {name} would be {width} × {height} columns of voxels of {edge:g} m, the maximum is {COLUMNS}: "
+            "use a coarser resolution"
         )
     out = np.zeros((height, width), np.uint8)
     c, s = math.cos(yaw), math.sin(yaw)
@@ -171,8 +171,10 @@ def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[S
 
 
 def _splat(out: States, state: States, grid: OccupancyGrid, edge: float, corner: tuple[int, int]) -> None:
-    """Draw occupied cells into all columns that they reach into: their corners, and points between as far apart as half
-    a voxel at most."""
+    """Draw occupied cells into all columns that they touch.
+
+    Sampled are their corners, and points between at most half a voxel apart.
+    """
     v, u = np.nonzero(state == 2)
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
@@ -187,9 +189,10 @@ def _splat(out: States, state: States, grid: OccupancyGrid, edge: float, corner:
 
 
 def _cut_into_leaves(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
-    """The fewest leaves: squares of equal columns, cut into cubes between the two heights. CannotConvert if too many.
+    """Split columns into the fewest leaves: squares of equal columns, cut into cubes between the two heights.
 
-    For each size 2^j of cubes: j, where they begin above each of the squares (in units of their size), the squares.
+    For each size 2^j of cubes: j, their start above each of the squares (in units of their size), the squares. Raises
+    CannotConvert if there are too many.
     """
     pieces = _pieces(block.bottom + HALF, block.top + HALF)
     tallest = max(k for _, k in pieces)
@@ -204,7 +207,7 @@ def _cut_into_leaves(block: _Block) -> list[tuple[int, NDArray[np.int64], Square
             total += len(square[0]) * stack
             if total > MAX_LEAVES:
                 raise CannotConvert(
-                    f"the grid {block.name} would become more than {MAX_LEAVES} voxels: ask for a coarser resolution "
+                    f"the grid {block.name} would become more than {MAX_LEAVES} voxels: use a coarser resolution "
                     "or a smaller height"
                 )
             out.append((j, (start >> j) + np.arange(stack, dtype=np.int64), square))
@@ -212,11 +215,11 @@ def _cut_into_leaves(block: _Block) -> list[tuple[int, NDArray[np.int64], Square
 
 
 def _leaves(block: _Block) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
-    """Depth, code and log-odds of a block's leaves, in order."""
+    """Return depth, code and log-odds of a block's leaves, in order."""
     depths, codes, odds = [], [], []
     for j, z, (x, y, values) in _cut_into_leaves(block):
         n, stack = len(x), len(z)
-        # Of the squares as smallest voxels from the middle, so that their codes can be cut to the depth.
+        # centres of the squares in smallest voxels, so that their codes can be cut to the depth
         coordinates = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
         codes.append(morton(*coordinates) >> np.uint64(3 * j))
         depths.append(np.full(n * stack, DEPTH - j, np.uint8))
@@ -227,7 +230,7 @@ def _leaves(block: _Block) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArr
 
 
 def _pieces(start: int, end: int) -> list[tuple[int, int]]:
-    """A range of whole numbers as (start, k): 2^k of them from a multiple of 2^k on."""
+    """Split a range of integers into aligned pieces (start, k): 2^k of them from a multiple of 2^k on."""
     out = []
     while start < end:
         k = (start & -start).bit_length() - 1 if start else DEPTH - 1
@@ -242,7 +245,7 @@ Square = tuple[NDArray[np.int64], NDArray[np.int64], States]
 
 
 def _squares(state: States, corner: tuple[int, int], max_level: int) -> list[tuple[Square, Square]]:
-    """For each size 2^j up to 2^most: all aligned squares of known, equal columns, and those that lie in no larger one.
+    """For each size 2^j up to 2^most: all aligned squares of known, equal columns, and those in no larger one.
 
     A square is its x and y in units of its size, and its state. corner: x and y of the first column, from the tree's
     edge.
@@ -264,7 +267,7 @@ def _squares(state: States, corner: tuple[int, int], max_level: int) -> list[tup
 
 
 def _halve(state: States, corner: tuple[int, int]) -> tuple[States, tuple[int, int]]:
-    """Squares of twice the size: their state where all four quarters have it, else 0."""
+    """Merge squares to twice the size: their state if all four quarters share it, else 0."""
     x0, y0 = corner
     height, width = state.shape
     around = ((y0 & 1, (y0 + height) & 1), (x0 & 1, (x0 + width) & 1))

@@ -1,4 +1,4 @@
-"""Topology -> occupancy: what a network says can be driven on is free, what stands in the way is occupied."""
+"""Topology -> occupancy: edges of a network are free, objects are occupied."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from app.model.layers import MAP, Layers, Part, PartKey
 from app.parameters import parameter
 
 WIDTH = 1.0
-"""Metres of an edge of which nothing says how wide it is: a robot and some room."""
+"""Default width of an edge in metres: a robot and some clearance."""
 
 OF_HIGHWAY: Mapping[str, float] = {
     **dict.fromkeys(("motorway", "trunk"), 7.0),
@@ -33,30 +33,32 @@ OF_HIGHWAY: Mapping[str, float] = {
     **dict.fromkeys(("service", "track"), 3.0),
     **dict.fromkeys(("footway", "cycleway", "bridleway"), 2.0),
 }
-"""OpenStreetMap: metres of a way by its class, where neither a width nor lanes are said. They are on the narrow side,
-so that what is called free is road."""
+"""OpenStreetMap: default width in metres by class of the way, without width or lanes.
+
+The values are on the narrow side, so that free cells are road.
+"""
 
 MAX_WIDTH_METRES = 1000.0
-"""Metres of an edge's width: beyond it is a mistake."""
+"""Maximum plausible width of an edge in metres."""
 
 MARGIN = 1.0
-"""Metres of unknown ground around everything."""
+"""Margin of unknown ground around everything, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """How wide, how fine, and what counts."""
+    """Parameters of topology_to_occupancy."""
 
     edge_width: float | None = parameter(
         None,
-        f"width of edges that do not say theirs; default: {WIDTH}, of an OpenStreetMap way that of its class",
+        f"width of edges that state none; default: {WIDTH}, for an OpenStreetMap way that of its class",
         minimum=0.01,
         maximum=MAX_WIDTH_METRES,
         unit="m",
     )
     resolution: float | None = cell_size()
     stairs: bool = parameter(False, "whether edges over stairs are free ground")
-    obstacles: bool = parameter(True, "whether stored objects that stand in a robot's way are drawn as occupied")
+    obstacles: bool = parameter(True, "whether stored obstacles are drawn as occupied")
 
 
 @derives(
@@ -68,11 +70,11 @@ class Parameters:
     version=3,
 )
 def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """Free along a network's edges, as wide as they are; occupied where objects stand; elsewhere unknown.
+    """Occupancy grid of a network: free along its edges, occupied by objects, elsewhere unknown.
 
-    Objects win over edges, but in OpenStreetMap's passages through buildings. A fence cuts the free space. The origin
-    is a whole multiple of the resolution, yaw 0. Raises MissingLayer where no edge is to be driven on, MissingDatum for
-    places on earth without one, CannotConvert where the grid would be too large.
+    Edges have their own width. Objects override edges, except in OpenStreetMap's passages through buildings. A fence
+    limits the free space. The origin is a multiple of the resolution, yaw 0. Raises MissingLayer if no edge is
+    drivable, MissingDatum for WGS 84 coordinates without a datum, CannotConvert if the grid would be too large.
     """
     around = fences(layers, notes.warn)
     obstacles = _obstacles(layers, notes) if parameters.obstacles else {}
@@ -86,7 +88,9 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
         frame = grid_frame(
             (box[0] - MARGIN, box[1] - MARGIN, box[2] + MARGIN, box[3] + MARGIN), parameters.resolution, notes
         )
-        cells = empty_cells(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
+        cells = empty_cells(
+            frame, None, [shapely.Point(box[0], box[1])]
+        )  # a floor without an area: everything is unknown
         ground = open_ if fence is None else shapely.intersection(open_, fence)
         raster.paint(cells, raster.areas(ground, frame, touched=False), FREE)
         if level in obstacles:
@@ -99,17 +103,17 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivat
         parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
     if not parts:
         raise MissingLayer(
-            "free space is drawn along the edges of a network, and there are none to drive on: upload a network with "
-            "edges (where all of them go over stairs, ask with stairs=true)"
+            "the network has no drivable edges to draw free space along: upload a network with edges (if all of them "
+            "are stairs, set stairs=true)"
         )
-    notes.warn("free is what the network says can be driven on; what else is free is not known")
+    notes.warn("only the edges of the network are free; all other ground is unknown")
     return Layers(parts, layers.datum, layers.levels)
 
 
 def _free(
     layers: Layers, level: str, parameters: Parameters, notes: DerivationNotes
 ) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
-    """The ground of a level's edges in metres, polygons and lines: of usual ones, and of those through buildings."""
+    """Return the ground of a level's edges in metres, polygons and lines: of edges outdoors, and through buildings."""
     shapes: list[Any] = []
     through: list[bool] = []
     steps = flat = assumed = 0
@@ -130,14 +134,14 @@ def _free(
         buffers = shapely.buffer(lines, np.array(widths) / 2, quad_segs=4)
         good = ~shapely.is_empty(buffers)
         flat += int(np.count_nonzero(~good))
-        # The lines too: an edge narrower than a cell would have gaps.
+        # add the lines too: an edge narrower than a cell would have gaps
         shapes += [*buffers[good], *lines[good]]
         through += np.array(inner, bool)[good].tolist() * 2
     notes.drop("edges over stairs", steps, "wheels cannot climb them; see stairs")
-    notes.drop("edges without a course", flat, "they have no geometry")
+    notes.drop("edges without a geometry", flat, "their geometry is missing or empty")
     if assumed:
-        width_text = parameters.edge_width or f"{WIDTH} m, of a way that of its class"
-        notes.fill("width of edges", width_text, f"{assumed} edges do not say how wide they are", "edge_width")
+        width_text = parameters.edge_width or f"{WIDTH} m, for an OpenStreetMap way that of its class"
+        notes.fill("width of edges", width_text, f"{assumed} edges state no width", "edge_width")
     areas = np.empty(len(shapes), object)
     areas[:] = shapes
     chosen = np.array(through, bool)
@@ -165,9 +169,9 @@ def _tag(p: Properties, key: str) -> str:
 
 
 def _obstacles(layers: Layers, notes: DerivationNotes) -> dict[str, LevelObstacles]:
-    """What stands on each level; nothing where the objects are places on earth and there is no datum."""
+    """Return the obstacles of each level; none if the objects have WGS 84 coordinates and there is no datum."""
     try:
         return sites(layers, notes)
     except (MissingDatum, CannotConvert) as error:
-        notes.warn(f"objects are not drawn: {error.detail}")
+        notes.warn(f"objects are not drawn; {error.detail}")
         return {}

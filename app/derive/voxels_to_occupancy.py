@@ -16,38 +16,38 @@ from app.model.voxels import DEPTH, HALF, VoxelMap, gather
 from app.parameters import parameter
 
 MAX_CELLS = 2**28
-"""Cells of a grid whatever was asked for (``Limits.pixels``)."""
+"""Maximum number of cells of a grid (``Limits.pixels``)."""
 
 MAX_SIDE_CELLS = 32767
-"""Cells along a side: beyond it Nav2's map_server refuses the map."""
+"""Maximum number of cells along a side: Nav2's map_server rejects larger maps."""
 
 MAX_OCCUPIED_SHARE = 0.95
-"""From this share of occupied cells on the floor has probably been taken for an obstacle."""
+"""Share of occupied cells from which on the floor probably counts as an obstacle."""
 
 RANK = np.array([1, 0, 2], np.uint8)
-"""Of unknown, free, occupied: a coarser cell has the highest rank of what it covers, as in ``occupancy_grid``."""
+"""Rank of unknown, free, occupied: a coarser cell has the highest rank that it covers, as in ``occupancy_grid``."""
 
 VALUE = np.array([FREE, UNKNOWN, OCCUPIED], np.uint8)
-"""Of a rank, the cell's value."""
+"""Cell value by rank."""
 
 States = NDArray[np.uint8]
-"""0 unknown, 1 free, 2 occupied."""
+"""States: 0 unknown, 1 free, 2 occupied."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Which heights count, and how fine the grid is."""
+    """Parameters of voxels_to_occupancy."""
 
     band: tuple[float, float] | None = parameter(
         None,
-        "low,high: voxels between two heights above the level's floor; default: the full height",
+        "height range low,high above the level's floor; default: the full height",
         minimum=-1e5,
         maximum=1e5,
         unit="m",
     )
     resolution: float | None = parameter(
         None,
-        "metres a cell; default: the voxels'. A coarser cell is occupied if anything in it is, then unknown, then free",
+        "size of a cell; default: the voxels'. A coarser cell is occupied if any part is, else unknown, else free",
         minimum=1e-3,
         maximum=1e3,
         unit="m",
@@ -56,15 +56,15 @@ class Parameters:
 
 @derives(gives="occupancy", needs={"voxels"}, parameters=Parameters, cost=2.0)
 def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """The projection of a height band: occupied where any voxel of the column is, free where only free ones are.
+    """Projection of a height band: occupied if any voxel of the column is, free if all known ones are.
 
-    One grid of its name for each voxel map; around all its voxels whatever the band, so that the frame stays when the
-    band changes; yaw 0, the origin a whole multiple of the resolution. Raises MissingLayer where no voxel lies in the
-    band, CannotConvert where the grid would be too large or the band ends below its start.
+    Each voxel map becomes one grid of the same name; it covers all voxels whatever the band, so that the frame does not
+    change with the band; yaw 0, the origin a multiple of the resolution. Raises MissingLayer if no voxel is in the
+    band, CannotConvert if the grid would be too large or the band is not ascending.
     """
     if parameters.band is not None and not parameters.band[0] < parameters.band[1]:
         low, high = parameters.band
-        raise CannotConvert(f"a band goes from its lower to its higher end, got {low:g},{high:g}")
+        raise CannotConvert(f"band must be low,high with low < high, got {low:g},{high:g}")
     parts: dict[PartKey, Part] = {}
     seen: list[str] = []
     for key, part in layers.parts_of("voxels").items():
@@ -78,8 +78,8 @@ def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivatio
         parts[PartKey("occupancy", key.level, key.name)] = grid
         _report_doubts(key, part, grid, parameters, notes)
     if not parts:
-        why = f"no voxel lies in the band; there are: {'; '.join(seen)}" if seen else "the voxel maps hold no voxels"
-        raise MissingLayer(f"{why}. Ask with another band=low,high, or upload an octree or a point cloud")
+        why = f"no voxel is in the band; stored: {'; '.join(seen)}" if seen else "the voxel maps are empty"
+        raise MissingLayer(f"{why}: set another band=low,high, or upload an octree or a point cloud")
     return Layers(parts, layers.datum, layers.levels)
 
 
@@ -90,18 +90,18 @@ def _report_doubts(
     known_cells = counts["occupied"] + counts["free"]
     if parameters.band is None and counts["occupied"] >= MAX_OCCUPIED_SHARE * known_cells:
         notes.warn(
-            f"{key.name}: nearly every column has something in it, the floor too: ask with band=low,high for the "
-            "heights at which a robot meets it"
+            f"{key.name}: nearly every column is occupied, probably by the floor; set band=low,high to the heights of "
+            "obstacles for robots"
         )
     if not voxels.leaf_counts()["free"]:
-        notes.warn(f"{key.name}: the voxels tell of no free space, so whatever is not occupied is unknown")
+        notes.warn(f"{key.name}: the voxels contain no free space; all cells that are not occupied are unknown")
 
 
 def _project(voxels: VoxelMap, parameters: Parameters, floor: float) -> OccupancyGrid | None:
-    """The grid of a voxel map; None where nothing lies in the band. floor: metres above the local origin."""
+    """Convert a voxel map to a grid; None if nothing is in the band. floor: metres above the local origin."""
     edge = voxels.resolution
     bounds = [(int(low.min()), int(high.max())) for low, high in (voxels.axis(0), voxels.axis(1))]
-    _check_size([high - low for low, high in bounds], edge, "upload voxels of a coarser resolution or a smaller place")
+    _check_size([high - low for low, high in bounds], edge, "upload voxels of a coarser resolution or a smaller area")
     inside = np.ones(len(voxels), bool)
     if parameters.band is not None:
         low, high = voxels.axis(2)
@@ -121,7 +121,7 @@ def _project(voxels: VoxelMap, parameters: Parameters, floor: float) -> Occupanc
             (math.floor(_snap_to_integer(a * edge / size)), math.ceil(_snap_to_integer(b * edge / size)))
             for a, b in bounds
         ]
-        _check_size([last - begin for begin, last in spans], size, "ask with a coarser resolution")
+        _check_size([last - begin for begin, last in spans], size, "use a coarser resolution")
         for axis, source, span in ((1, bounds[0], spans[0]), (0, bounds[1], spans[1])):
             ranks = _resample(ranks, axis, source, span, size / edge)
         first = [begin for begin, _ in spans]
@@ -133,15 +133,15 @@ def _project(voxels: VoxelMap, parameters: Parameters, floor: float) -> Occupanc
 def _check_size(sides: list[int], edge: float, instead: str) -> None:
     if max(sides) > MAX_SIDE_CELLS or sides[0] * sides[1] > MAX_CELLS:
         raise CannotConvert(
-            f"{sides[0]} × {sides[1]} cells of {edge:g} m are more than a grid may have (a side of {MAX_SIDE_CELLS}, "
-            f"{MAX_CELLS} in all): {instead}"
+            f"the grid would have {sides[0]} × {sides[1]} cells of {edge:g} m, above the maximum of {MAX_SIDE_CELLS} "
+            f"per side and {MAX_CELLS} in total: {instead}"
         )
 
 
 def _columns(voxels: VoxelMap, inside: NDArray[np.bool_], bounds: list[tuple[int, int]]) -> States:
-    """What stands in each column of smallest voxels: uint8 [rows, columns], row 0 at the smallest y.
+    """Compute the state of each column of smallest voxels: uint8 [rows, columns], row 0 at the smallest y.
 
-    From the coarsest leaves down: each step doubles the picture and draws the leaves of the next depth into it, so a
+    From the coarsest leaves down: each step doubles the raster and draws the leaves of the next depth into it, so a
     large leaf costs no more than a small one.
     """
     window = [(low + HALF, high + HALF) for low, high in bounds]
@@ -167,10 +167,11 @@ def _columns(voxels: VoxelMap, inside: NDArray[np.bool_], bounds: list[tuple[int
 
 
 def _resample(ranks: States, axis: int, source: tuple[int, int], span: tuple[int, int], ratio: float) -> States:
-    """Cells of another size along one axis.
+    """Resample ranks to another cell size along one axis.
 
-    source: first and end of the cells that are there, counted from the origin; span: of the wanted ones, each ``ratio``
-    as long. A coarser cell has the highest of what it covers (nothing is unknown), a finer one what is at its middle.
+    source: first and end of the existing cells, counted from the origin. span: of the required ones, each ``ratio`` as
+    long. A coarser cell has the highest rank that it covers (missing cells are unknown), a finer one the rank at its
+    centre.
     """
     start, end = source
     number = np.arange(*span, dtype=np.float64)
@@ -194,7 +195,7 @@ def _resample(ranks: States, axis: int, source: tuple[int, int], span: tuple[int
 
 
 def _snap_to_integer(value: float) -> float:
-    """A whole number where it is one but for the rounding of a division."""
+    """Round a number that is an integer up to the rounding error of a division."""
     integer = round(value)
     return float(integer) if abs(value - integer) < 1e-6 else value
 

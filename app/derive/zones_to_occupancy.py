@@ -1,8 +1,8 @@
-"""Drawn zones -> Nav2's costmap filter masks, so that a keepout drawn in Google Earth or QGIS is had as keepout.yaml.
+"""Drawn zones -> Nav2's costmap filter masks, so that a keepout drawn in Google Earth or QGIS becomes keepout.yaml.
 
-Zones of kind ``keepout`` (and ``preferred``: lanes that robots should keep to) make the grid ``keepout``, those of kind
-``speed`` the grid ``speed``; what the cells mean goes with each grid (``app.model.masks``). Every cell that a zone
-touches is in it, so that nobody drives a little way into a keepout; a lane has only cells whose middle it holds.
+Zones of kind ``keepout`` (and ``preferred``: lanes that robots should use) give the grid ``keepout``, those of kind
+``speed`` the grid ``speed``; each grid carries the meaning of its cells (``app.model.masks``). Every cell that a zone
+touches is in it, so that robots never cut into a keepout; a lane has only cells whose centre it contains.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ LANES = frozenset({"preferred", "preferred_lane", "lane"})
 SPEEDS = frozenset({"speed", "speed_limit", "speed_zone"})
 
 RESOLUTION = 0.05
-"""Metres a cell where there is no map to take it from: what Nav2's maps usually have."""
+"""Default cell size in metres without a map: the usual one of Nav2's maps."""
 
 MAX_RESOLUTION_METRES = 1.0
 """Maximum size of a cell in metres that is chosen for large zones without a map."""
 
 MARGIN = 1.0
-"""Metres around the zones of a level without a map."""
+"""Margin around the zones of a level without a map, in metres."""
 
 STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Metres per second that one step of a cell may stand for: the finest one is taken that reaches the highest limit."""
+"""Metres per second of one step of a cell: the finest one that reaches the highest limit is used."""
 
 MAX_CELLS = 2**28
 _LIMIT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCII)
@@ -49,7 +49,7 @@ _LIMIT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCI
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """How fine the masks are, and what speed limits are said in."""
+    """Parameters of zones_to_occupancy."""
 
     resolution: float | None = parameter(
         None,
@@ -59,12 +59,12 @@ class Parameters:
         unit="m",
     )
     speed_in: Literal["percent", "m/s"] | None = parameter(
-        None, "what the cells of the speed mask stand for; default: m/s, or percent where every zone says percent"
+        None, "unit of the speed mask's cells; default: m/s, or percent if every zone uses percent"
     )
     max_speed: float | None = parameter(
-        None, "the robot's top speed, between limits in percent and in m/s", minimum=1e-3, maximum=1e3, unit="m/s"
+        None, "top speed of the robot, to convert between percent and m/s", minimum=1e-3, maximum=1e3, unit="m/s"
     )
-    lane_cost: int = parameter(50, "value of cells beside preferred lanes, where there are any", minimum=1, maximum=99)
+    lane_cost: int = parameter(50, "cost of cells outside preferred lanes, if there are lanes", minimum=1, maximum=99)
 
 
 @derives(
@@ -75,10 +75,10 @@ class Parameters:
     makes=frozenset({KEEPOUT, SPEED}),
 )
 def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """Keepout and speed zones as costmap filter masks, the grids keepout and speed, in the frame of the level's map.
+    """Costmap filter masks from keepout and speed zones: grids keepout and speed, in the frame of the level's map.
 
-    Raises MissingLayer where no zone is of these kinds, MissingDatum for zones on earth without a datum, CannotConvert
-    for masks that are too large or speeds that cannot be said.
+    Raises MissingLayer if there is no zone of these kinds, MissingDatum for WGS 84 zones without a datum, CannotConvert
+    for masks that are too large or speeds that cannot be converted.
     """
     parts: dict[PartKey, Part] = {}
     for level in dict.fromkeys(key.level for key in layers.vector("zones")):
@@ -94,7 +94,7 @@ def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivation
             _burn(cells, frame, lanes, [FREE] * len(lanes), touched=False)
             _burn(cells, frame, blocked, [OCCUPIED] * len(blocked), touched=True)
             if lanes:
-                notes.fill("cost beside preferred lanes", parameters.lane_cost, "no zone says it", "lane_cost")
+                notes.fill("cost beside preferred lanes", parameters.lane_cost, "zones do not state it", "lane_cost")
             parts[PartKey("occupancy", level, KEEPOUT)] = frame.grid(
                 cells, KEEPOUT, FilterInfo(masks.KEEPOUT, 0.0, 1.0)
             )
@@ -102,21 +102,21 @@ def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivation
         values, info = _limits(slow, parameters, notes) if slow else ([], None)
         if info is not None:
             cells = np.full((frame.height, frame.width), FREE, np.uint8)
-            # What is drawn last stands: of zones that overlap, the lowest limit.
+            # the last one drawn wins: of overlapping zones, the lowest limit
             order = sorted((k for k, v in enumerate(values) if v), key=lambda k: -values[k])
             _burn(cells, frame, [slow[k].shape for k in order], [values[k] for k in order], touched=True)
             parts[PartKey("occupancy", level, SPEED)] = frame.grid(cells, SPEED, info)
     if not parts:
         raise MissingLayer(
-            "masks are made of zones of kind keepout, preferred or speed (with a value), and there are none: upload a "
-            "drawing with layer=zones, or put zones of these kinds by an edit"
+            "no zones of kind keepout, preferred or speed (with a value) to derive masks from: upload a drawing with "
+            "layer=zones, or add such zones by an edit"
         )
     return Layers(parts, layers.datum, layers.levels)
 
 
 @dataclass(frozen=True, slots=True)
 class _Zone:
-    """A zone in local metres."""
+    """Zone in local metres."""
 
     id: str
     kind: str
@@ -126,7 +126,7 @@ class _Zone:
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """Where a mask lies: its lower left corner in metres, its cells."""
+    """Frame of a mask: its lower left corner in metres, its cells."""
 
     x: float
     y: float
@@ -135,7 +135,7 @@ class _Frame:
     height: int
 
     def grid(self, cells: NDArray[np.uint8], name: str, info: FilterInfo) -> OccupancyGrid:
-        """The mask; ``scale`` from white to black says each of its values."""
+        """Return the mask; ``scale`` gives each of its values from white to black."""
         properties = {masks.NAME: {"params": masks.params(name, info)}}
         return OccupancyGrid(cells, self.resolution, (self.x, self.y, 0.0), "scale", 1.0, 0.0, False, properties)
 
@@ -147,7 +147,7 @@ class _Frame:
 
 
 def _zones(layers: Layers, level: str, notes: DerivationNotes) -> list[_Zone]:
-    """The zones of a level that masks are made of, in the order of their parts and ids."""
+    """Return the zones of a level that masks are derived from, in the order of their parts and ids."""
     out = []
     other = expiring = flat = 0
     for part in layers.vector("zones", level).values():
@@ -159,10 +159,10 @@ def _zones(layers: Layers, level: str, notes: DerivationNotes) -> list[_Zone]:
             else:
                 expiring += p.get("expires") is not None and "overlay" not in p  # a closure ends by itself
                 out.append(zone)
-    notes.drop("zones of other kinds", other, "masks say keepout, preferred lanes and speed limits only")
+    notes.drop("zones of other kinds", other, "masks express only keepout, preferred lanes and speed limits")
     notes.drop("zones without an area", flat, "they are no polygons")
     if expiring:
-        notes.warn(f"{expiring} zones end at some time: the masks hold them until they are made anew")
+        notes.warn(f"{expiring} zones have an expiry; masks contain them until they are derived again")
     return out
 
 
@@ -177,7 +177,7 @@ def _shapes(part: Features, layers: Layers) -> Iterator[tuple[_Zone, Any]]:
 
 
 def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | None) -> _Frame:
-    """The map's frame where there is one (its cells, or its place in other cells), else one around the zones."""
+    """Return the map's frame if there is one (its cells, or its area in other cells), else one around the zones."""
     map_grid = layers.grids(level).get(PartKey("occupancy", level, MAP))
     if map_grid is not None and map_grid.origin[2] == 0.0 and resolution in (None, map_grid.resolution):
         return _Frame(map_grid.origin[0], map_grid.origin[1], map_grid.resolution, map_grid.width, map_grid.height)
@@ -193,12 +193,12 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
     end = [math.ceil(v / cell - 1e-6) for v in low_high[2:]]
     width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
     if width * height > MAX_CELLS:
-        raise CannotConvert(f"a mask of {width} × {height} cells is too large: ask for a coarser resolution")
+        raise CannotConvert(f"a mask of {width} × {height} cells is too large: use a coarser resolution")
     return _Frame(round(first[0] * cell, 9), round(first[1] * cell, 9), cell, width, height)
 
 
 def _coarse_enough(cell: float, low_high: Any) -> float:
-    """Double the size of a cell, up to COARSEST, until a mask of this extent has a bearable number of cells."""
+    """Double the cell size, up to MAX_RESOLUTION_METRES, until a mask of this extent is small enough."""
     width, height = float(low_high[2] - low_high[0]), float(low_high[3] - low_high[1])
     while (width / cell) * (height / cell) > MAX_CELLS / 4 and cell * 2.0 <= MAX_RESOLUTION_METRES:
         cell *= 2.0
@@ -209,12 +209,12 @@ def _report_outside(zones: list[_Zone], frame: _Frame, level: str, notes: Deriva
     box = frame.box()
     outside = [z.id for z in zones if not z.shape.intersects(box)]
     cut = sum(not box.covers(z.shape) for z in zones) - len(outside)
-    notes.drop("zones outside of the map", len(outside), f"the masks of {level} are as large as its map")
-    notes.drop("parts of zones outside of the map", cut, f"the masks of {level} are as large as its map")
+    notes.drop("zones outside of the map", len(outside), f"the masks of {level} cover only its map")
+    notes.drop("parts of zones outside of the map", cut, f"the masks of {level} cover only its map")
 
 
 def _burn(cells: NDArray[np.uint8], frame: _Frame, shapes: list[Any], values: list[int], *, touched: bool) -> None:
-    """Draw polygons into cells (row 0 at the bottom), one over the other."""
+    """Draw polygons into cells (row 0 at the bottom), later ones over earlier ones."""
     if not shapes:
         return
     from rasterio.features import rasterize
@@ -227,20 +227,21 @@ def _burn(cells: NDArray[np.uint8], frame: _Frame, shapes: list[Any], values: li
 
 
 def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) -> tuple[list[int], FilterInfo | None]:
-    """(the cell of each zone, 0 where it has no limit; what cells stand for, None where there is no limit at all).
+    """Return (the cell of each zone, 0 if it has no limit; the meaning of cells, None if there is no limit at all).
 
-    Limits are rounded down to what a cell can say, and never to 0, which would be none.
+    Limits are rounded down to what a cell can express, and never to 0, which would mean no limit.
     """
     limits = [_parse_limit(z) for z in zones]
-    notes.drop("speed zones without a limit", limits.count(None), "their value is no speed in m/s and no percentage")
+    notes.drop(
+        "speed zones without a limit", limits.count(None), "their value is neither a speed in m/s nor a percentage"
+    )
     valid_limits = [s for s in limits if s is not None]
     if not valid_limits:
         return [], None
     percent = parameters.speed_in == "percent" or (parameters.speed_in is None and all(p for _, p in valid_limits))
     if parameters.max_speed is None and any(p is not percent for _, p in valid_limits):
         raise CannotConvert(
-            "limits in percent and in m/s can only be brought together with the robot's top speed: ask with "
-            "max_speed=… (m/s)"
+            "limits in percent and in m/s need the robot's top speed to be combined: set max_speed=… (m/s)"
         )
     top = parameters.max_speed or 1.0
     exact: list[float | None] = []
@@ -265,15 +266,15 @@ def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) 
         rounded += abs(cell * step - value) > 1e-6
         values.append(cell)
     unit = "%" if percent else "m/s"
-    notes.drop("exact speed limits", rounded, f"a cell says multiples of {step:g} {unit}; limits are rounded down")
+    notes.drop("exact speed limits", rounded, f"cells store multiples of {step:g} {unit}; limits are rounded down")
     if stopped:
-        notes.warn(f"{stopped} speed zones have the limit 0, which Nav2 takes for none: they get {step:g} {unit}")
+        notes.warn(f"{stopped} speed zones have the limit 0, which means no limit in Nav2; they get {step:g} {unit}")
     kind = masks.SPEED_PERCENT if percent else masks.SPEED_METRES
     return values, FilterInfo(kind, 0.0, step) if any(values) else None
 
 
 def _parse_limit(zone: _Zone) -> tuple[float, bool] | None:
-    """A zone's limit and whether it is a percentage: a number is m/s, a text may name its unit."""
+    """Parse a zone's limit and whether it is a percentage: a number is m/s, a text may name its unit."""
     value = zone.value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return (float(value), False) if value >= 0 and math.isfinite(value) else None

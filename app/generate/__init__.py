@@ -1,8 +1,8 @@
-"""Generators: layers made up from parameters and a seed, for sites that are not mapped yet or do not exist.
+"""Generators: layers created from parameters and a seed, for sites that are not mapped yet or do not exist.
 
 A generator is one module with one function under ``@generates``; its parameters are a frozen dataclass. The same seed
-and parameters give the same layers on every machine: all chance comes from ``RandomSource``, and what went through a
-transcendental function is rounded before it is kept.
+and parameters give the same layers on every machine: all randomness comes from ``RandomSource``, and results of
+transcendental functions are rounded before they are stored.
 """
 
 from __future__ import annotations
@@ -23,37 +23,43 @@ from app.model.names import did_you_mean
 
 MAX_SEED = 2**63 - 1
 MAX_CELLS = 2**26
-"""Of a grid that is made up."""
+"""Default name of a generated grid."""
 
 MAX_OBJECTS = 200_000
 
 
 @dataclass(frozen=True, slots=True)
 class RandomSource:
-    """Where all chance of one generation comes from: streams by name, so that one part's draws shift no other's."""
+    """Source of all randomness of one generation: streams by name, so that draws of one part do not shift another's."""
 
     seed: int
     generator: str
 
     def stream(self, name: str) -> np.random.Generator:
-        """The stream of this name, from its beginning."""
+        """Return the stream of this name, from its beginning."""
         digest = hashlib.sha256(f"{self.seed}/{self.generator}/{name}".encode()).digest()
         return np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))
 
 
 Function = Callable[[Layers, Any, RandomSource, DerivationNotes], Layers]
-"""(what is there, parameters, chance, notes) -> the new parts. Pure but for the notes.
+"""Signature (existing parts, parameters, random source, notes) -> new parts. Pure except for the notes.
 
-What is there: the parts of the layers that it needs or looks at, with datum and levels. Parts of the result take the
-place of those with the same key; one that is passed on as it was given is left alone.
+Existing parts: those of the layers that the generator needs or reads, with datum and levels. Parts of the result
+replace those with the same key; a part that is returned unchanged is not stored again.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Generator:
-    """One way to make layers up. needs: layers that it works on and may replace. changes: layers that it works on where
-    they are there, one of them at least. also: those that it looks at where they are there (a fence). With neither
-    needs nor changes it makes a whole site, and takes the place of an earlier made-up one."""
+    """Generator of layers.
+
+    Attributes:
+        needs: layers that it works on and may replace.
+        changes: optional layers that it works on, of which at least one must exist.
+        also: optional layers that it reads (a fence).
+
+    With neither needs nor changes it generates a whole site, which replaces an earlier generated one.
+    """
 
     name: str
     title: str
@@ -67,16 +73,16 @@ class Generator:
 
     @property
     def reads(self) -> frozenset[Layer]:
-        """All layers that it looks at."""
+        """All layers that it reads."""
         return self.editable_layers | self.also
 
     @property
     def editable_layers(self) -> frozenset[Layer]:
-        """Layers that it may replace; empty where it makes a whole site."""
+        """Layers that it may replace; empty if it generates a whole site."""
         return self.needs | self.changes
 
     def as_dict(self) -> dict[str, Any]:
-        """The generator as clients see it."""
+        """Return the generator as clients see it."""
         return {
             "id": self.name,
             "title": self.title,
@@ -100,7 +106,7 @@ def generates(
     changes: frozenset[Layer] | set[Layer] = frozenset(),
     version: int = 1,
 ) -> Callable[[Function], Function]:
-    """Declare a function as a generator; its name is its id, its docstring's first line its title."""
+    """Register a function as a generator: its name is the id, the first line of its docstring the title."""
 
     def declare(function: Function) -> Function:
         name = function.__name__
@@ -113,22 +119,22 @@ def generates(
 
 
 def all_generators() -> Mapping[str, Generator]:
-    """Every generator by name, in alphabetical order."""
+    """Return all generators by name, in alphabetical order."""
     return _registry.all()
 
 
 def get_generator(name: str) -> Generator:
-    """NotFound, with the known ones, for a name that is none."""
+    """Return a generator. Raises NotFound, with the existing names, for an unknown name."""
     generators = all_generators()
     if name not in generators:
         raise NotFound(
-            f"there is no generator {name!r}{did_you_mean(name, generators)}; known ones: {', '.join(generators)}"
+            f"unknown generator {name!r}{did_you_mean(name, generators)}; available: {', '.join(generators)}"
         )
     return generators[name]
 
 
 def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, Any]:
-    """The generator and its parameters, before any work. NotFound, or Invalid with each wrong value."""
+    """Return the generator and its parameters, before any work. Raises NotFound, or Invalid with each wrong value."""
     generator = get_generator(name)
     if not 0 <= seed <= MAX_SEED:
         problem = f"must be from 0 to {MAX_SEED}, got {seed}"
@@ -137,37 +143,36 @@ def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, A
 
 
 def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: DerivationNotes) -> Layers:
-    """What the generator makes: only new parts, with the datum and the levels of the whole.
+    """Run a generator: return only new parts, with the datum and the levels of the whole.
 
-    Raises NotFound, Invalid, MissingLayer (with what it works on), CannotGenerate.
+    Raises NotFound, Invalid, MissingLayer (with the layers that it works on), CannotGenerate.
     """
     maker, options = check(name, seed, values)
     lacking = maker.needs - given.layers
     if lacking:
         raise MissingLayer(
-            f"{name} works on {', '.join(sorted(lacking))}, and there is none: upload a map or generate one first"
+            f"{name} needs {', '.join(sorted(lacking))}, which is missing: upload a map or generate a site"
         )
     if maker.changes and not maker.changes & given.layers:
         raise MissingLayer(
-            f"{name} works on {' or '.join(sorted(maker.changes))}, and there is none: upload a map or generate one "
-            "first"
+            f"{name} needs {' or '.join(sorted(maker.changes))}, which is missing: upload a map or generate a site"
         )
     generated_layers = maker.function(given, options, RandomSource(seed, name), notes)
     fresh = {k: p for k, p in generated_layers.parts.items() if given.parts.get(k) is not p and not is_empty(p)}
     if not fresh:
-        raise CannotGenerate(f"{name} made nothing with these parameters")
+        raise CannotGenerate(f"{name} generated nothing with these parameters: change them")
     unknown = {k.layer for k in fresh} - maker.gives
     if unknown:
-        raise ValueError(f"{name} made {', '.join(sorted(unknown))} and does not declare it")
+        raise ValueError(f"{name} generated {', '.join(sorted(unknown))}, which it does not declare")
     return Layers(fresh, given.datum or generated_layers.datum, generated_layers.levels)
 
 
 def step(
     name: str, seed: int, values: Mapping[str, Any], used: Mapping[PartKey, str], datum: Datum | None = None
 ) -> dict[str, Any]:
-    """How it was made, for provenance: enough to make it again.
+    """Return the provenance of a generation: enough to repeat it.
 
-    used: hashes of the parts that it was given. datum: the one that it made up.
+    used: hashes of the parts that it read. datum: the one that it created.
     """
     generator, options = check(name, seed, values)
     defaults = {p["name"]: p["default"] for p in parameters.describe(generator.parameters)}

@@ -1,4 +1,4 @@
-"""Cellular automata on arrays, and joining what they leave free.
+"""Cellular automata on arrays, and connection of the free space that they leave.
 
 Arrays are bool [rows, columns]; alive, or occupied, is True.
 """
@@ -14,7 +14,7 @@ Bool = NDArray[np.bool_]
 I64 = NDArray[np.int64]
 
 STRIP = 2**18
-"""Cells that are worked on at a time, so that they stay in the processor's cache."""
+"""Number of cells that are processed at a time, so that they stay in the processor's cache."""
 
 MAX_ROUNDS = 6
 
@@ -22,9 +22,11 @@ MAX_ROUNDS = 6
 def run_automaton(
     alive: Bool, born: Collection[int], stays: Collection[int], iterations: int, *, outside: bool
 ) -> Bool:
-    """The cells after so many steps. born, stays: numbers of living neighbours (of eight) with which a dead cell comes
-    alive, and a living one stays so. outside: whether what is beyond the border is alive. Ends early where nothing
-    changes any more."""
+    """Run a cellular automaton for a number of steps; ends early if nothing changes.
+
+    born, stays: numbers of living neighbours (of eight) with which a dead cell is born, and a living one survives.
+    outside: whether cells beyond the border are alive.
+    """
     height, width = alive.shape
     table = np.zeros(32, np.uint8)  # by the neighbours and itself, times two, and itself
     for n in range(9):
@@ -51,10 +53,10 @@ def run_automaton(
 
 
 def join_free_space(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: float) -> tuple[Bool, int, int]:
-    """Occupied cells between which free space is one piece: (cells, how many were filled, how many passages were cut).
+    """Connect free space to one piece: return (occupied cells, number of filled cells, number of passages cut).
 
-    rim: cells that stay occupied. radius: of a robot, in cells: places that hold it are joined by passages (cells wide)
-    if they have at least ``smallest`` cells for its middle. What is not joined to the largest place is filled.
+    rim: cells that stay occupied. radius: of a robot, in cells: places that it fits into are joined by passages (cells
+    wide) if they have at least ``smallest`` cells for its centre. Everything not joined to the largest place is filled.
     """
     import cv2
 
@@ -77,7 +79,7 @@ def join_free_space(occupied: Bool, rim: Bool, radius: float, passage: float, sm
         out = out & ~((cut > 0) & ~rim)
         if np.array_equal(before, out):
             break
-    # The largest place of the robot, and all that is free around it; the rest is filled.
+    # the robot's largest place and all free cells around it stay; the rest is filled
     label, sizes = _places(out, radius)
     if not sizes.any():
         label, sizes = _places(out, 0.0)
@@ -91,13 +93,13 @@ def join_free_space(occupied: Bool, rim: Bool, radius: float, passage: float, sm
 
 
 def _places(occupied: Bool, radius: float) -> tuple[NDArray[np.int32], I64]:
-    """Pieces of where a robot's middle may be, numbered from 1; how many cells each has (0 for the rest)."""
+    """Label the pieces of cells for a robot's centre, numbered from 1; also return each size (0 for the rest)."""
     import cv2
 
     free = (~occupied).astype(np.uint8)
     if radius > 0.0:
         away = cv2.distanceTransform(np.pad(free, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-        # From the middle of a cell to the border of the next obstacle, which is half a cell nearer than its middle.
+        # to the border of the next obstacle, which is half a cell nearer than its centre
         free = (np.asarray(away) - 0.5 > radius).astype(np.uint8)
     count, label = cv2.connectedComponents(free, connectivity=4)
     sizes = np.bincount(np.asarray(label).ravel(), minlength=count).astype(np.int64)
@@ -106,8 +108,10 @@ def _places(occupied: Bool, radius: float) -> tuple[NDArray[np.int32], I64]:
 
 
 def _shortest_path(label: NDArray[np.int32]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Lines (row, column to row, column) that join all labelled pieces to one, the shortest first (Kruskal): between
-    the nearest cells of pieces whose surroundings touch."""
+    """Return lines (row, column to row, column) that join all labelled pieces, the shortest first (Kruskal).
+
+    They connect the nearest cells of pieces whose surroundings touch.
+    """
     from scipy import ndimage
 
     near = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)

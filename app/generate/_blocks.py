@@ -1,31 +1,31 @@
 """A grammar for towns: from a boundary to streets, blocks, lots and buildings, by rules that are data.
 
-Rules are text, one a line (or between semicolons), ``#`` begins a comment::
+Rules are text, one per line (or separated by semicolons), ``#`` begins a comment::
 
-    town -> ring(main) quarter                       # the first rule's shape is what the boundary is
+    town -> ring(main) quarter                       # the first rule's shape is the boundary
     quarter : area > block -> cut(rand(0.4, 0.6), street) quarter quarter
     quarter : area <= block -> lots
-    lots : area > 600 -> cut(0.5, 0) lots lots       # of the rules that hold one is taken, by weight
+    lots : area > 600 -> cut(0.5, 0) lots lots       # one of the matching rules is drawn by weight
     lots : area <= 600 @ 3 -> inset(2) house
     lots : area <= 600 @ 1 -> garden
     house -> gable(rand(1, 3))
 
 Left of the arrow: a shape's name, a condition, a weight. Right of it one action and the names of the shapes that it
-makes. Expressions (``_expressions``) know the shape's ``area`` (m²), the ``length`` and ``width`` of the rectangle
-around it, its ``frontage`` (metres of its edge on a street), how ``deep`` it is in the rules, and constants.
+creates. Expressions (``_expressions``) can use the shape's ``area`` (m²), the ``length`` and ``width`` of the rectangle
+around it, its ``frontage`` (metres of its edge on a street), its recursion depth ``deep``, and constants.
 
 ========================== ============================================================================================
 ``ring(street) A``          a street along the inside of the shape's edge; A is what it encloses
-``cut(share, street) A B``  in two, across the longer side, at this share of it; a street of this width between, or none
-``inset(metres) A``         A is what lies farther from the edge
-``flat(storeys)``           a building with this roof; ``gable`` and ``hip`` stand on the largest rectangle that fits
+``cut(share, street) A B``  two parts, cut across the longer side at this share of it, with a street between (0: none)
+``inset(metres) A``         A is the area farther from the edge
+``flat(storeys)``           a building with this roof; ``gable`` and ``hip`` cover the largest rectangle that fits
 ``gable(…)``, ``hip(…)``
-``garden``, ``park``,       open ground, planted or paved; also where a rule leads to nothing else
+``garden``, ``park``,       open ground, planted or paved; also if a rule leads to nothing else
 ``square``
 ========================== ============================================================================================
 
 In the spirit of Wonka et al., Instant Architecture (2003), and Parish and Müller, Procedural Modeling of Cities (2001):
-lots are halved along the rectangle around them. What makes more shapes, or goes deeper, than is allowed is stopped.
+lots are halved along the rectangle around them. Rules with too many shapes, or too deep, raise CannotGenerate.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ MAX_SHAPES = 30_000
 MAX_DEPTH = 48
 MAX_TEXT_CHARACTERS, MAX_RULES = 20_000, 200
 MIN_AREA_M2 = 1.0
-"""Square metres: smaller pieces are left as they are."""
+"""Minimum area in square metres of a piece that is cut further."""
 
 MIN_CROSSING_METRES = 14.0
-"""Metres: a street ends at a crossing that is nearer than this, or farther from it."""
+"""Minimum distance in metres between the end of a street and the next crossing."""
 
 SHAPE_NAMES = frozenset({"area", "length", "width", "frontage", "deep"})
 ROOFS = ("flat", "gable", "hip")
@@ -61,7 +61,7 @@ ACTIONS: Mapping[str, tuple[int, int]] = {
     "inset": (1, 1),
     **dict.fromkeys(ROOFS, (1, 0)),
 }
-"""How many values and how many shapes each action takes."""
+"""Number of values and of shapes that each action takes."""
 
 _RULE = re.compile(r"\s*([a-z_][a-z0-9_]*)\s*(?::(.*))?", re.DOTALL)
 _ACTION = re.compile(r"\s*([a-z_][a-z0-9_]*)\s*(\(.*\))?([a-z0-9_\s]*)", re.DOTALL)
@@ -69,7 +69,7 @@ _ACTION = re.compile(r"\s*([a-z_][a-z0-9_]*)\s*(\(.*\))?([a-z0-9_\s]*)", re.DOTA
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One way on for a shape."""
+    """Action of a rule with its condition and weight."""
 
     condition: Expression | None
     weight: Expression | None
@@ -81,7 +81,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Grammar:
-    """Checked rules by shape. start: what the boundary is."""
+    """Checked rules by shape. start: shape of the boundary."""
 
     start: str
     rules: Mapping[str, tuple[Rule, ...]]
@@ -90,7 +90,7 @@ class Grammar:
 
 @dataclass(frozen=True, slots=True)
 class Street:
-    """A street's middle line and its width, houses to houses; metres."""
+    """Centreline of a street and its width between house fronts, in metres."""
 
     line: Any
     width: float
@@ -98,7 +98,7 @@ class Street:
 
 @dataclass(frozen=True, slots=True)
 class Lot:
-    """Ground that the rules end at. use: flat, gable or hip with storeys, or one of OPEN."""
+    """Ground that no rule divides further. use: flat, gable or hip with storeys, or one of OPEN."""
 
     area: Any
     use: str
@@ -107,7 +107,7 @@ class Lot:
 
 @dataclass(slots=True)
 class Town:
-    """What the rules make. blocks: the ground between streets. ends: of the streets."""
+    """Result of the rules. blocks: the ground between streets. ends: of the streets."""
 
     streets: list[Street] = field(default_factory=list)
     blocks: list[Any] = field(default_factory=list)
@@ -115,15 +115,18 @@ class Town:
     ends: list[tuple[float, float]] = field(default_factory=list)
 
     def street(self, line: Any, width: float) -> None:
-        """One more street."""
+        """Add a street."""
         self.streets.append(Street(line, width))
         self.ends += [(float(x), float(y)) for x, y in shapely.get_coordinates(line)[[0, -1]]]
 
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """whole: reaches to the middle of the streets around it; land: without them; front: a strip along the edge of its
-    block, once that has been cut into lots."""
+    """Shape of the grammar.
+
+    whole: reaches to the centre of the streets around it. land: without the streets. front: a strip along the edge of
+    its block, once the block has been cut into lots.
+    """
 
     name: str
     whole: Any
@@ -136,13 +139,13 @@ class _Shape:
 
 
 def parse(text: str, constants: Mapping[str, float]) -> Grammar:
-    """The grammar that these rules describe. Invalid names the rule and what is wrong with it."""
+    """Parse rules to a grammar. Raises Invalid, which names the rule and the problem."""
     if len(text) > MAX_TEXT_CHARACTERS:
-        raise_invalid(f"the rules have {len(text)} characters; the limit is {MAX_TEXT_CHARACTERS}", "rules")
+        raise_invalid(f"the rules have {len(text)} characters, the maximum is {MAX_TEXT_CHARACTERS}", "rules")
     statements = [s.strip() for line in text.splitlines() for s in line.partition("#")[0].split(";")]
     statements = [s for s in statements if s]
     if not 0 < len(statements) <= MAX_RULES:
-        raise_invalid(f"there are {len(statements)} rules; there must be 1 to {MAX_RULES}", "rules")
+        raise_invalid(f"there must be 1 to {MAX_RULES} rules, got {len(statements)}", "rules")
     names = frozenset({*SHAPE_NAMES, *constants})
     rules: dict[str, list[Rule]] = {}
     for k, statement in enumerate(statements):
@@ -152,10 +155,10 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
         match = _RULE.fullmatch(head)
         if not arrow or match is None:
             raise_invalid(
-                f"{statement[:60]!r} is no rule, such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", location
+                f"{statement[:60]!r} is not a rule such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", location
             )
         if match[2] is not None and not match[2].strip():
-            raise_invalid("a condition is missing behind :", location)
+            raise_invalid("missing condition after :", location)
         rule = _action(tail, names, location)
         rules.setdefault(match[1], []).append(
             Rule(
@@ -170,30 +173,28 @@ def parse(text: str, constants: Mapping[str, float]) -> Grammar:
         for rule_ in alternatives:
             for name in rule_.makes:
                 if name not in grammar.rules and name not in OPEN:
-                    raise_invalid(f"no rule says what becomes of {name!r}", rule_.location)
+                    raise_invalid(f"no rule for {name!r}", rule_.location)
     return grammar
 
 
 def _action(text: str, names: frozenset[str], location: str) -> tuple[str, tuple[Expression, ...], tuple[str, ...]]:
     match = _ACTION.fullmatch(text)
     if match is None:
-        raise_invalid(f"{text.strip()[:60]!r} is no action with the shapes it makes, such as cut(0.5, 8) a b", location)
+        raise_invalid(f"{text.strip()[:60]!r} is not an action with shapes, such as cut(0.5, 8) a b", location)
     name, inside, rest = match[1], match[2], tuple(match[3].split())
     if name not in ACTIONS:
         if inside is None and not rest:
             return "is", (), (name,)
-        raise_invalid(f"there is no action {name!r}; there are {', '.join(ACTIONS)}, or a shape's name alone", location)
+        raise_invalid(f"unknown action {name!r}: use one of {', '.join(ACTIONS)}, or a shape's name alone", location)
     values = tuple(_expressions.parse(one, names, location) for one in _split(inside or "()"))
     wants, makes = ACTIONS[name]
     if len(values) != wants or len(rest) != makes:
-        raise_invalid(
-            f"{name} takes {wants} values and makes {makes} shapes, got {len(values)} and {len(rest)}", location
-        )
+        raise_invalid(f"{name} takes {wants} values and {makes} shapes, got {len(values)} and {len(rest)}", location)
     return name, values, rest
 
 
 def _split(inside: str) -> list[str]:
-    """What stands between parentheses, cut at its outer commas."""
+    """Split the text between parentheses at its outer commas."""
     out, deep, start = [], 0, 1
     for k, sign in enumerate(inside):
         deep += (sign == "(") - (sign == ")")
@@ -204,13 +205,13 @@ def _split(inside: str) -> list[str]:
     return out
 
 
-# --- what they make ---------------------------------------------------------------------------------------------------
+# --- shapes -----------------------------------------------------------------------------------------------------
 
 
 def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
-    """The town that the rules make of a boundary (a polygon, metres).
+    """Apply the rules to a boundary (a polygon, metres).
 
-    CannotGenerate where they make too many shapes, go too deep, or ask for what cannot be.
+    Raises CannotGenerate if there are too many shapes, the rules recurse too deep, or an action is impossible.
     """
     town = Town()
     waiting = [_Shape(grammar.start, boundary, boundary, None, 0)]
@@ -219,7 +220,7 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
         shape = waiting.pop()
         shape_count += 1
         if shape_count > MAX_SHAPES:
-            _stop(f"the rules make more than {MAX_SHAPES} shapes", "rules")
+            _stop(f"the rules create more than {MAX_SHAPES} shapes", "rules")
         rules = grammar.rules.get(shape.name)
         if rules is None or shape.land.area < MIN_AREA_M2:
             _finish_lot(town, shape, shape.name if shape.name in OPEN else "garden")
@@ -230,8 +231,11 @@ def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
             _finish_lot(town, shape, "garden")
             continue
         if shape.deep >= MAX_DEPTH:
-            _stop(f"the rules go more than {MAX_DEPTH} deep: give {shape.name!r} an end", rule.location)
-        # The last one waits first, so that shapes are made from the first to the last.
+            _stop(
+                f"the rules recurse more than {MAX_DEPTH} levels deep: add a rule that ends {shape.name!r}",
+                rule.location,
+            )
+        # reversed, because the stack processes the last one first
         waiting += reversed(_apply_rule(town, shape, rule, [value(names, chance) for value in rule.values]))
     return town
 
@@ -248,7 +252,7 @@ def _finish_lot(town: Town, shape: _Shape, use: str, storeys: int = 0) -> None:
 
 
 class _ShapeVariables(dict[str, float]):
-    """What expressions know of a shape: constants, and its measures once they are asked for."""
+    """Variables of expressions: constants, and the shape's measures, computed on demand."""
 
     def __init__(self, constants: Mapping[str, float], shape: _Shape) -> None:
         super().__init__(constants)
@@ -271,7 +275,7 @@ class _ShapeVariables(dict[str, float]):
 
 
 def _strip(land: Any) -> Any:
-    """What lies within a centimetre of a block's edge."""
+    """Return the part of an area within a centimetre of a block's edge."""
     return shapely.buffer(shapely.boundary(land), 0.01, cap_style="flat", join_style="mitre")
 
 
@@ -291,33 +295,33 @@ def _choose_rule(rules: Sequence[Rule], names: Mapping[str, float], chance: np.r
 
 
 def _apply_rule(town: Town, shape: _Shape, rule: Rule, values: list[float]) -> list[_Shape]:
-    """The shapes that an action makes; buildings and open ground are done with."""
+    """Return the shapes that an action creates; buildings and open ground are final."""
     deep = shape.deep + 1
     if rule.action == "is":
         return [_Shape(rule.makes[0], shape.whole, shape.land, shape.front, deep)]
     if rule.action in ROOFS:
         storeys = math.floor(values[0] + 0.5)
         if not 1 <= storeys <= 100:
-            _stop(f"a building has 1 to 100 storeys, got {values[0]:g}", rule.location)
+            _stop(f"a building must have 1 to 100 storeys, got {values[0]:g}", rule.location)
         _finish_lot(town, shape, rule.action, storeys)
         return []
     if rule.action == "inset":
         return _inset(town, shape, rule, values[0], deep)
     width = values[-1]
     if width != 0 and not 1.0 <= width <= 200.0:
-        _stop(f"a street is 1 to 200 m wide, or 0 for none, got {width:g}", rule.location)
+        _stop(f"a street must be 1 to 200 m wide, or 0 for none, got {width:g}", rule.location)
     if width and shape.front is not None:
-        _stop("a street cannot lead through what has been cut into lots", rule.location)
+        _stop("a street cannot cross land that has been cut into lots", rule.location)
     if rule.action == "ring":
         return _ring(town, shape, rule, width, deep)
     if not 0.02 <= values[0] <= 0.98:
-        _stop(f"a share is from 0.02 to 0.98, got {values[0]:g}", rule.location)
+        _stop(f"a share must be from 0.02 to 0.98, got {values[0]:g}", rule.location)
     return _cut(town, shape, rule, values[0], width, deep)
 
 
 def _inset(town: Town, shape: _Shape, rule: Rule, metres: float, deep: int) -> list[_Shape]:
     if metres < 0:
-        _stop(f"an inset is not negative, got {metres:g}", rule.location)
+        _stop(f"an inset must not be negative, got {metres:g}", rule.location)
     front = shape.front
     if front is None:
         town.blocks.append(shape.land)
@@ -340,12 +344,12 @@ def _ring(town: Town, shape: _Shape, rule: Rule, width: float, deep: int) -> lis
         town.street(shapely.LineString(shapely.get_coordinates(block.exterior)), width)
         out += [_Shape(rule.makes[0], block, piece, None, deep) for piece in land]
     if not out:
-        _stop(f"there is no room for a ring of {width:g} m and anything in it", rule.location)
+        _stop(f"there is no room for a ring of {width:g} m and land inside it", rule.location)
     return out
 
 
 def _cut(town: Town, shape: _Shape, rule: Rule, share: float, width: float, deep: int) -> list[_Shape]:
-    """In two halves, each of which may be several pieces."""
+    """Cut an area in two halves, each of which may have several pieces."""
     (x, y), along, long, short = _box(shape.land)
     if width:
         share = _align_share(town, shape.land, share, width)
@@ -378,7 +382,7 @@ def _cut(town: Town, shape: _Shape, rule: Rule, share: float, width: float, deep
 
 
 def _align_share(town: Town, land: Any, share: float, width: float) -> float:
-    """A share at which a street meets those that end nearby, or keeps away from them."""
+    """Return a share at which a street meets those that end nearby, or keeps its distance."""
     (x, y), along, long, short = _box(land)
     near = []
     for px, py in town.ends:
@@ -397,7 +401,7 @@ def _align_share(town: Town, land: Any, share: float, width: float) -> float:
 
 
 def _box(area: Any) -> tuple[tuple[float, float], tuple[float, float], float, float]:
-    """Middle, direction of the longer side, length and width of the rectangle around an area."""
+    """Return centre, direction of the longer side, length and width of the rectangle around an area."""
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
     if len(corners) < 4:
         return (0.0, 0.0), (1.0, 0.0), 0.0, 0.0
@@ -416,7 +420,7 @@ def _mm(geometry: Any) -> Any:
 
 
 def _pieces(area: Any) -> list[Any]:
-    """The polygons of an area in whole millimetres, from the left and from below; slivers and holes are left out."""
+    """Return the polygons of an area in whole millimetres, from the left and from below, without slivers and holes."""
     out = []
     for part in shapely.get_parts(area):
         if part.geom_type != "Polygon" or part.area < MIN_AREA_M2:

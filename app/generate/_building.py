@@ -1,8 +1,8 @@
-"""Storeys of a building: rooms on both sides of a corridor, with walls, doors, a lift at the corridor's end.
+"""Storeys of a building: rooms on both sides of a corridor, with walls, doors, and a lift at the corridor's end.
 
-Drawn in metres with the corridor along u, then put to its ``Place``. Walls, doors, floors and the lift are objects in
-the words of Open-RMF's building maps (part ``openrmf``), with the solids that simulators and grids need; doors stand
-open. What stands in rooms keeps clear of the way from the door to the room's node.
+Drawn in metres with the corridor along u, then moved to its ``SiteFrame``. Walls, doors, floors and the lift are
+objects in the terms of Open-RMF's building maps (part ``openrmf``), with the solids that simulators and grids need;
+doors are open. Furniture keeps clear of the path from the door to the room's node.
 """
 
 from __future__ import annotations
@@ -21,18 +21,25 @@ from app.generate._site_frame import SiteFrame
 
 FAMILY = "openrmf"
 WALL, PARTITION, SHELL = 0.12, 0.1, 0.24
-"""Metres: thickness of a corridor's walls, of those between rooms, and of the outer ones."""
+"""Thickness in metres of a corridor's walls, of those between rooms, and of the outer ones."""
 
 DOOR_HEIGHT = 2.1
 
 SHAFT, CABIN, LIFT_DOOR = 2.4, 1.9, 1.2
-"""Metres: side of a lift's shaft, side of its cabin, width of its doors."""
+"""Side of a lift's shaft, side of its cabin, and width of its doors, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Storeys:
-    """Measures of a building, in metres. length: of the corridor; depth: of the rooms on each side of it; least and
-    most: widths of rooms; door: width of the rooms' doors; height: from floor to floor."""
+    """Measures of a building, in metres.
+
+    Attributes:
+        length: of the corridor.
+        depth: of the rooms on each side of it.
+        least, most: widths of rooms.
+        door: width of the rooms' doors.
+        height: from floor to floor.
+    """
 
     levels: int
     length: float
@@ -47,8 +54,14 @@ class Storeys:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A room. box: (u0, v0, u1, v1) inside its walls; door: u of its door; side: 1 where it lies above the corridor,
-    else -1; open: it has no wall to the corridor."""
+    """Room of a building.
+
+    Attributes:
+        box: (u0, v0, u1, v1) inside its walls.
+        door: u of its door.
+        side: 1 if it is above the corridor, else -1.
+        open: whether it has no wall to the corridor.
+    """
 
     name: str
     kind: str
@@ -60,18 +73,18 @@ class Room:
 
     @property
     def depth(self) -> float:
-        """Metres from the corridor's wall to the outer one."""
+        """Return the distance in metres from the corridor's wall to the outer one."""
         return self.box[3] - self.box[1]
 
     def position(self, along: float, inward: float) -> tuple[float, float]:
-        """A place by metres from its left wall, and from the corridor's side."""
+        """Return a point by metres from the room's left wall, and from the corridor's side."""
         v = self.box[1] + inward if self.side > 0 else self.box[3] - inward
         return self.box[0] + along, v
 
 
 @dataclass(slots=True)
 class Building:
-    """A building being drawn into a site."""
+    """Building that is being drawn into a site."""
 
     site: Site
     place: SiteFrame
@@ -81,7 +94,7 @@ class Building:
     _count: dict[str, int] = field(default_factory=dict)
 
     def number(self, kind: str) -> int:
-        """The next number of a kind of thing, from 1."""
+        """Return the next number of a kind of object, from 1."""
         self._count[kind] = self._count.get(kind, 0) + 1
         return self._count[kind]
 
@@ -95,7 +108,7 @@ class Building:
         thickness: float,
         openings: Iterable[tuple[float, float]] = (),
     ) -> None:
-        """A wall from a to b, without openings (middle, width), metres from a along it."""
+        """Add a wall from a to b, except openings (centre, width), metres from a along it."""
         length = math.dist(a, b)
         cuts = sorted((middle - width / 2, middle + width / 2) for middle, width in openings)
         starts = [0.0, *(end for _, end in cuts)]
@@ -103,7 +116,7 @@ class Building:
         for start, end in zip(starts, ends, strict=True):
             if end - start < 0.02:
                 continue
-            # Corners close where walls meet, so the ends of the whole wall reach half a wall farther.
+            # the ends of the complete wall extend by half a wall, so that corners close
             low = start - (thickness / 2 if start == 0.0 else 0.0)
             high = end + (thickness / 2 if end == length else 0.0)
             self._piece(level, _along(a, b, start), _along(a, b, end), start - low, high - end, thickness)
@@ -141,7 +154,7 @@ class Building:
     def door(
         self, level: str, name: str, middle: tuple[float, float], width: float, along: float, kind: str = "hinged"
     ) -> None:
-        """A door that stands open. along: the direction of its wall, radians in the drawing."""
+        """Add an open door. along: direction of its wall, radians in the drawing."""
         c, s = round(math.cos(along), 12), round(math.sin(along), 12)
         ends = [self.place.to_local(middle[0] + k * c * width / 2, middle[1] + k * s * width / 2) for k in (-1, 1)]
         x, y = self.place.to_local(*middle)
@@ -172,7 +185,7 @@ class Building:
         )
 
     def floor(self, level: str, area: Any, colour: str = "floor") -> None:
-        """A slab whose top is the level's elevation."""
+        """Add a slab with its top at the level's elevation."""
         polygon = self.place.geometry_to_local(area)
         x, y = (mm(v) for v in shapely.get_coordinates(shapely.centroid(polygon))[0])
         corners = shapely.get_coordinates(shapely.get_exterior_ring(polygon))[:-1] - np.array([x, y])
@@ -190,7 +203,7 @@ class Building:
         self.site.draw(polygon, colour, level=level)
 
     def lift(self, name: str, levels: Sequence[str], middle: tuple[float, float]) -> None:
-        """A lift that serves these levels, its doors towards larger u."""
+        """Add a lift that serves these levels, its doors towards larger u."""
         x, y = self.place.to_local(*middle)
         door = f"{name}_door"
         says = {
@@ -212,7 +225,7 @@ class Building:
             "reference_floor_name": levels[0],
         }
         plate = {"type": "box", "size": [CABIN, CABIN, 0.02], "pose": [0.0, 0.0, 0.01, 0.0, 0.0, 0.0], "visual": True}
-        # Its doors are on the side of its negative y, as the editor draws a new lift.
+        # its doors are on the side of negative y, as the editor draws a new lift
         self.site.add_object(
             f"{levels[0]}/lift/{name}",
             "lift",
@@ -226,10 +239,10 @@ class Building:
             openrmf={"says": {key: value for key, value in says.items() if key != "depth"}},
         )
 
-    # what stands in rooms
+    # objects in rooms
 
     def furnish(self, room: Room, goal: tuple[float, float]) -> Furniture:
-        """What may be put into a room whose node is at ``goal`` (metres along and inward)."""
+        """Return the furnisher of a room whose node is at ``goal`` (metres along and inward)."""
         along = room.door - room.box[0]
         path = shapely.LineString(
             [room.position(along, -PARTITION), room.position(along, self.radius + 0.5), room.position(*goal)]
@@ -238,7 +251,7 @@ class Building:
         return Furniture(self, room, shapely.buffer(path, keep, cap_style="square"))
 
     def charger(self, things: Furniture, goal: tuple[float, float]) -> None:
-        """A charger at the room's outer wall behind its node, and the place before it, where there is room."""
+        """Add a charger at the room's outer wall behind its node, and the place before it, if there is room."""
         room, depth, keep = things.room, 0.3, self.radius + 3 * self.site.resolution + 0.1
         inward = room.depth - 0.05 - depth - keep
         if inward < goal[1] + 0.3:
@@ -255,14 +268,14 @@ class Building:
 
 @dataclass(slots=True)
 class Furniture:
-    """Puts things into one room where there is place."""
+    """Furnisher that places objects into one room where there is free space."""
 
     building: Building
     room: Room
     occupied: Any
 
     def fits(self, area: Any) -> bool:
-        """Whether this area (drawn metres) is free and in the room."""
+        """Return whether this area (drawn metres) is free and in the room."""
         return bool(shapely.contains(shapely.box(*self.room.box), area)) and not shapely.intersects(self.occupied, area)
 
     def add_item(
@@ -276,7 +289,7 @@ class Furniture:
         style: str = "box",
         gap: float = 0.05,
     ) -> bool:
-        """A thing with its middle there, ``size`` along the corridor, inwards and up; False where there is no place.
+        """Place an object centred there, ``size`` along the corridor, inwards and up; False if there is no free space.
 
         style: ``box``; ``desk``: a top on two side panels; ``table``: a top on a foot; ``bed``: on a lower frame.
         """

@@ -1,4 +1,4 @@
-"""Cells that change: squares of one grid as cells of another, in metres, and in the open."""
+"""Changes of cells: map squares of one grid to cells of another and to metres, and find open cells."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ Cells = NDArray[np.int64]
 
 @dataclass(slots=True)
 class CellChange:
-    """What a level's obstacles cover no more, cover now, and covered before, as squares of ``size`` metres: int64 [n,
-    2], (column, row) from the local origin; of size 0 they are cells of the grid itself."""
+    """Changes of a level's obstacles as squares of ``size`` metres: freed, covered now, and covered before.
+
+    Each is int64 [n, 2], (column, row) from the local origin; with size 0 they are cells of the grid itself.
+    """
 
     size: float
     freed: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
@@ -27,7 +29,7 @@ class CellChange:
 
 
 def replace_cells(stored: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
-    """A stored grid with other cells; those of unknown's grey that stay unknown keep it."""
+    """Return a stored grid with other cells; cells of grey 205 that stay unknown keep it."""
     grey = unknown_grey(stored)
     new_cells = cells if grey is None else np.where(grey & (cells == UNKNOWN), np.uint8(FREE), cells)
     return replace(stored, cells=new_cells)
@@ -37,14 +39,14 @@ _BIAS, _SPAN = 2**30, 2**31
 
 
 def occupied_cells(grid: OccupancyGrid) -> Cells:
-    """The occupied cells of a derived grid (yaw 0, origin a multiple of the resolution) as sorted numbers."""
+    """Return the occupied cells of a derived grid (yaw 0, origin a multiple of the resolution) as sorted numbers."""
     row, column = np.nonzero(grid.cells == OCCUPIED)
     x, y = (round(v / grid.resolution) for v in grid.origin[:2])
     return np.sort(_pack_squares(np.stack([column + x, row + y], axis=1)))
 
 
 def _pack_squares(places: Cells) -> Cells:
-    """Each square (column, row) as one number."""
+    """Return each square (column, row) as one number."""
     return (places[:, 0].astype(np.int64) + _BIAS) * _SPAN + (places[:, 1].astype(np.int64) + _BIAS)
 
 
@@ -53,7 +55,7 @@ def unpack_squares(numbers: Cells) -> Cells:
 
 
 def grid_to_metres(grid: OccupancyGrid, at: Array) -> Array:
-    """Places in a grid, in columns and rows, as metres."""
+    """Convert positions in a grid, in columns and rows, to metres."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     u, v = at[:, 0] * grid.resolution, at[:, 1] * grid.resolution
@@ -61,7 +63,7 @@ def grid_to_metres(grid: OccupancyGrid, at: Array) -> Array:
 
 
 def metres_to_grid(grid: OccupancyGrid, at: Array) -> Array:
-    """Metres as columns and rows of a grid."""
+    """Convert metres to columns and rows of a grid."""
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     u, v = at[:, 0] - x, at[:, 1] - y
@@ -69,7 +71,7 @@ def metres_to_grid(grid: OccupancyGrid, at: Array) -> Array:
 
 
 def apply_change(grid: OccupancyGrid, change: CellChange) -> NDArray[np.uint8]:
-    """The cells with what the obstacles left free and what they cover now."""
+    """Return the cells after freeing what obstacles left and occupying what they cover now."""
     cells = grid.cells.copy()
     for places, value in ((change.freed, FREE), (change.filled, OCCUPIED)):
         at = _covered_cells(grid, change, places)
@@ -83,13 +85,13 @@ def apply_change(grid: OccupancyGrid, change: CellChange) -> NDArray[np.uint8]:
 
 
 def _covered_cells(grid: OccupancyGrid, change: CellChange, places: Cells) -> Cells:
-    """The cells of a grid that squares lie in; ``size`` 0: they are its own."""
+    """Return the cells of a grid in which squares are; ``size`` 0: they are its own."""
     if change.size == 0.0 or not len(places):
         return places
     offset = np.array(grid.origin[:2]) / change.size
     if grid.origin[2] == 0.0 and grid.resolution == change.size and (np.abs(offset - np.round(offset)) < 1e-6).all():
         return places - np.round(offset).astype(np.int64)
-    # Of the cells that the squares reach into those whose middle lies in one.
+    # of the cells that the squares touch, keep those whose centre is in one
     steps = max(2, math.ceil(2 * change.size / grid.resolution))
     inner = (np.arange(steps) + 0.5) / steps
     spread = np.stack(np.meshgrid(inner, inner), axis=-1).reshape(-1, 2)
@@ -102,7 +104,7 @@ def _covered_cells(grid: OccupancyGrid, change: CellChange, places: Cells) -> Ce
 
 
 def square_boxes(places: Cells, size: float, main: OccupancyGrid | None) -> NDArray[np.object_]:
-    """Squares as boxes of consecutive ones, in metres. size 0: they are cells of the grid."""
+    """Return squares as boxes of consecutive ones, in metres. size 0: they are cells of the grid."""
     if not len(places):
         return np.empty(0, object)
     order = np.lexsort((places[:, 0], places[:, 1]))
@@ -119,7 +121,7 @@ def square_boxes(places: Cells, size: float, main: OccupancyGrid | None) -> NDAr
 
 
 def open_cells(cells: NDArray[np.uint8], across: float) -> Cells:
-    """The cells around which it is free as far as half of a thing so large reaches: their numbers."""
+    """Return the numbers of cells that are free up to half the size of an object around them."""
     import cv2
 
     free = cells == FREE
@@ -134,7 +136,7 @@ def open_cells(cells: NDArray[np.uint8], across: float) -> Cells:
 
 
 def grid_window(cells: NDArray[np.uint8], x: int, y: int, w: int, h: int) -> tuple[slice, slice] | None:
-    """A window of the grid; None where it reaches beyond."""
+    """Return a window of the grid; None if it reaches beyond."""
     if x < 0 or y < 0 or x + w > cells.shape[1] or y + h > cells.shape[0]:
         return None
     return slice(y, y + h), slice(x, x + w)

@@ -1,7 +1,7 @@
-"""From a grid to a site: occupied cells become objects whose slice is that grid again, and the rest follows.
+"""Convert a grid to a site: occupied cells become objects whose slice is that grid again; the network follows.
 
-The outline of each piece of occupied cells is kept cell by cell: a box where the piece is a rectangle, else its outline
-extruded. Rows of the arrays are counted from below, as in ``OccupancyGrid``.
+The outline of each piece of occupied cells is exact: a box if the piece is a rectangle, else its extruded outline. Rows
+of the arrays are counted from below, as in ``OccupancyGrid``.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
 Bool = NDArray[np.bool_]
 
 BLOCK = 64
-"""Cells along a side of the pieces into which one with a long outline is cut: solids of many corners are slow."""
+"""Cells along a side of the pieces into which one with a long outline is cut: solids with many corners are slow."""
 
 LONG = 400
-"""Corners of such an outline."""
+"""Maximum number of corners of an outline that is not cut."""
 
 
 @dataclass(frozen=True, slots=True)
 class CellStyle:
-    """What occupied cells are: a kind, its height in metres and its colour in the picture."""
+    """Object of occupied cells: a kind, its height in metres and its colour in the image."""
 
     kind: str
     height: float
@@ -45,7 +45,7 @@ class CellStyle:
 
 @dataclass(frozen=True, slots=True)
 class GridFrame:
-    """Where a grid lies: its lower left corner in metres, metres a cell, cells along x and y."""
+    """Frame of a grid: its lower left corner in metres, metres per cell, cells along x and y."""
 
     x: float
     y: float
@@ -55,19 +55,19 @@ class GridFrame:
 
     @property
     def box(self) -> Any:
-        """Its outline, a polygon in metres."""
+        """Return its outline, a polygon in metres."""
         right, top = self.x + self.columns * self.resolution, self.y + self.rows * self.resolution
         return shapely.box(self.x, self.y, round(right, 3), round(top, 3))
 
 
 def site_grid_frame(site: Site, width: float, depth: float, resolution: float, *, step: int = 1) -> GridFrame:
-    """The grid of a site: around its fence where the environment has one, else width × depth metres from the origin.
+    """Return the frame of a site's grid: around the environment's fence, else width × depth metres from the origin.
 
-    step: the sides are whole numbers of so many cells. Raises CannotGenerate before anything is made: for too many
-    cells, or cells that are not whole millimetres, which is what coordinates are kept in.
+    step: the sides are multiples of this many cells. Raises CannotGenerate before any work for too many cells, or cells
+    that are not whole millimetres, the precision of stored coordinates.
     """
     if abs(resolution * 1000 - round(resolution * 1000)) > 1e-6:
-        raise invalid_option_error("resolution", f"must be whole millimetres, got {resolution:g} m")
+        raise invalid_option_error("resolution", f"must be in whole millimetres, got {resolution:g} m")
     size = resolution * step
     if width / size * (depth / size) * step * step > MAX_CELLS:
         raise invalid_option_error(
@@ -83,17 +83,17 @@ def site_grid_frame(site: Site, width: float, depth: float, resolution: float, *
     x, y = (math.floor(v / resolution + 1e-6) for v in (low_x, low_y))
     columns, rows = (math.ceil((v - o * resolution) / size - 1e-6) for v, o in ((high_x, x), (high_y, y)))
     if columns * rows * step * step > MAX_CELLS:
-        raise invalid_option_error(
-            "resolution", f"the fence would hold more than {MAX_CELLS} cells of {resolution:g} m"
-        )
+        raise invalid_option_error("resolution", f"the fence contains more than {MAX_CELLS} cells of {resolution:g} m")
     return GridFrame(round(x * resolution, 3), round(y * resolution, 3), resolution, columns * step, rows * step)
 
 
 def add_objects(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -> None:
-    """Put an object for each piece of occupied cells (joined by their sides), which all look the same."""
+    """Add an object for each piece of occupied cells (joined by their sides), all of the same look."""
     pieces = _pieces(occupied)
     if len(pieces) > MAX_OBJECTS:
-        raise CannotGenerate(f"the site would have {len(pieces)} objects, the limit is {MAX_OBJECTS}: make it smaller")
+        raise CannotGenerate(
+            f"the site would have {len(pieces)} objects, the maximum is {MAX_OBJECTS}: make it smaller"
+        )
     numbers: dict[str, int] = {}
     floor = site.elevation(GROUND)
     shapely.prepare(site.fence)
@@ -108,7 +108,7 @@ def add_objects(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -
             at = ((low_x + high_x) / 2, (low_y + high_y) / 2)
             size = [round(high_x - low_x, 3), round(high_y - low_y, 3), seen.height]
             solid: dict[str, Any] = {"type": "box", "size": size, "pose": [0.0, 0.0, seen.height / 2, 0.0, 0.0, 0.0]}
-            if any(round(v * 1000) % 2 for v in size[:2]):  # its middle is no whole millimetre: it stands at its corner
+            if any(round(v * 1000) % 2 for v in size[:2]):  # its centre is no whole millimetre: use its corner
                 at = (low_x, low_y)
                 solid["pose"][:2] = [round(v / 2, 4) for v in size[:2]]
             words: dict[str, Any] = {"size": size}
@@ -123,7 +123,7 @@ def add_objects(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -
 
 
 def finish_site(site: Site, options: SiteOptions, notes: DerivationNotes, *, ground: str) -> Layers:
-    """The site's layers with the network of its grid: the largest piece of what its robot can reach."""
+    """Return the site's layers with the network of its grid: the largest piece that its robot can reach."""
     layers = site.finish(ground=ground)
     grid = layers.parts[PartKey("occupancy", GROUND, MAP)]
     if not isinstance(grid, OccupancyGrid):
@@ -136,20 +136,20 @@ def finish_site(site: Site, options: SiteOptions, notes: DerivationNotes, *, gro
 
 
 def free_space_network(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
-    """The network of a grid's free space, one piece of it; None, with a warning, where a robot finds no way."""
+    """Return the network of a grid's free space, in one piece; None, with a warning, if a robot finds no path."""
     network_notes = DerivationNotes()
     spacing = max(1.5, 25 * grid.resolution)
     try:
         topology = network(grid, Parameters(robot_radius=radius, spacing=spacing), network_notes, "the grid")
     except CannotConvert as error:
-        notes.warn(f"there is no network: {error.detail}")
+        notes.warn(f"the site has no network; {error.detail}")
         return None
     notes.dropped += network_notes.dropped
     return _largest(topology, notes)
 
 
 def _largest(network: Features, notes: DerivationNotes) -> Features:
-    """The largest piece of a network, by its nodes."""
+    """Return the largest piece of a network, by its nodes."""
     place = network.index()
     parent = list(range(len(network)))
 
@@ -167,12 +167,12 @@ def _largest(network: Features, notes: DerivationNotes) -> Features:
     nodes = np.array([properties.get("kind") == "node" for properties in network.properties])
     components, counts = np.unique(roots[nodes], return_counts=True)
     mask = roots == components[int(np.argmax(counts))]
-    notes.drop("nodes", int(np.count_nonzero(nodes & ~mask)), "in places from which the robot finds no way to the rest")
+    notes.drop("nodes", int(np.count_nonzero(nodes & ~mask)), "not connected to the rest for this robot")
     return network.select(mask)
 
 
 def _pieces(occupied: Bool) -> list[Any]:
-    """The outline in cells of each piece, from below and from the left; those with long outlines in several."""
+    """Return the outline in cells of each piece, from below and from the left; long outlines in several pieces."""
     if not occupied.any():
         return []
     rows, columns = occupied.shape

@@ -1,4 +1,4 @@
-"""Edges of a network whose nodes are gone, and the pieces into which it falls."""
+"""Edges of a network whose nodes were deleted, and the pieces into which it splits."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from app.model.features import Features
 from app.model.layers import Layers, Part, PartKey
 
 
-# --- the network as a whole -------------------------------------------------------------------------------------------
+# --- the whole network ------------------------------------------------------------------------------------------
 def drop_unconnected(given: Layers, parts: dict[PartKey, Part], notes: DerivationNotes) -> dict[PartKey, Part]:
-    """Without edges whose nodes are gone, on whatever level they are; with a word on what hangs together no more."""
+    """Drop edges whose nodes were deleted, on any level; warn if the network splits into more pieces."""
     before = given.vector("topology")
     after: dict[PartKey, Features] = {}
     for key, part in before.items():
@@ -30,7 +30,7 @@ def drop_unconnected(given: Layers, parts: dict[PartKey, Part], notes: Derivatio
             for p in part.properties
         ]
         if any(lost):
-            notes.drop("edges", sum(lost), "an obstacle stands where they lead from or to")
+            notes.drop("edges", sum(lost), "an obstacle covers their start or end")
             after[key] = part.select(~np.array(lost))
         if after[key] is not before[key]:
             out[key] = after[key]
@@ -39,12 +39,12 @@ def drop_unconnected(given: Layers, parts: dict[PartKey, Part], notes: Derivatio
     }
     was, now = (_count_components(list(f.values()), used - removed) for f in (before, after))
     if now > was:
-        notes.warn(f"the network falls into {now} pieces, and was in {was}")
+        notes.warn(f"the network has {now} pieces now, {was} before")
     return out
 
 
 def _count_components(collections: Sequence[Features], nodes: set[str]) -> int:
-    """In how many pieces these nodes of a network are."""
+    """Count the pieces that these nodes of a network form."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

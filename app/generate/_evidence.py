@@ -1,7 +1,7 @@
-"""How sure a grid's known cells make an unknown one: walls that go on straight, and free cells between free cells.
+"""Confidence in an unknown cell from a grid's known ones: straight walls that continue, free cells between free cells.
 
-Nothing is extrapolated: what is beyond the known cells stays unknown. How often a cell is free that is surrounded so
-is counted in the grid itself, in holes that are cut into its known part and filled in again.
+Nothing is extrapolated: cells beyond the known ones stay unknown. How often a cell with given surroundings is free is
+counted in the grid itself, in holes that are cut into its known part and filled in again.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ RAYS = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
 NOTHING, SEES_FREE, SEES_OCCUPIED = 0, 1, 2
 
 SPAN_METRES = 3.0
-"""How far a cell looks for known ones, and how far a wall goes on, in metres."""
+"""Maximum distance to known cells, and maximum length by which a wall continues, in metres."""
 
 HOLES, MIN_CASES = 64, 50
-"""Holes that are cut into a grid, and cases below which a surrounding says nothing."""
+"""Number of holes that are cut into a grid, and minimum number of cases for a kind of surroundings."""
 
 EVERY = 3
-"""Of the cells of a hole one in so many is looked at: neighbours tell the same."""
+"""One in this many cells of a hole is evaluated: neighbours give the same result."""
 
 NEAR_METRES = (0.15, 0.5)
-"""Bounds of what is near and far of a known cell, in metres."""
+"""Distances in metres that separate near and far known cells."""
 
 WALL_RADIUS_METRES = 0.6
-"""How much of a wall is looked at to find its direction, in metres."""
+"""Length of a wall from which its direction is computed, in metres."""
 
 MAX_WIDTH_RATIO = 0.2
-"""Of the variances across and along what is a straight wall's end."""
+"""Minimum ratio of the variances along and across the end of a straight wall."""
 
 MAX_TURN = math.radians(8.0)
 MAX_ENDS = 20_000
@@ -47,7 +47,7 @@ MAX_ENDS = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What is known of a grid. occupied, known: bool [height, width]. cell: metres."""
+    """Known part of a grid. occupied, known: bool [height, width]. cell: metres."""
 
     occupied: Bool
     observed: Bool
@@ -58,7 +58,7 @@ class Grid:
 
 
 def walls(grid: Grid, target: Bool) -> Bool:
-    """The wanted cells over which a straight wall goes on from one known end to another."""
+    """Return the wanted cells over which a straight wall continues from one known end to another."""
     import cv2
 
     out = np.zeros(target.shape, np.uint8)
@@ -91,7 +91,7 @@ def walls(grid: Grid, target: Bool) -> Bool:
 
 
 def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:
-    """The direction (rows, columns) of what is occupied around each place, and whether it is a straight line."""
+    """Return the direction (rows, columns) of occupied cells around each position, and whether they form a line."""
     radius = max(2, round(WALL_RADIUS_METRES / grid.cell))
     padded = np.pad(grid.occupied, radius)
     offset = np.argwhere(np.ones((2 * radius + 1, 2 * radius + 1), bool)) - radius
@@ -118,10 +118,10 @@ def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:
 
 
 def surroundings(grid: Grid, at: Places) -> NDArray[np.int64]:
-    """A number for how places [n, 2] are surrounded, 0 where they are not between free cells.
+    """Classify the surroundings of positions [n, 2]; 0 if they are not between free cells.
 
-    It counts the lines through a place that see free cells on both sides, the rays that see occupied ones, and how far
-    the nearest known cell is.
+    The class counts the lines through a position with free cells on both sides, the rays that hit occupied ones, and
+    the distance of the nearest known cell.
     """
     limit = max(1, round(SPAN_METRES / grid.cell))
     height, width = grid.observed.shape
@@ -151,10 +151,9 @@ KINDS = 1 + 3 * 5 * 9
 
 
 def confidence(grid: Grid, side: float, draw: np.random.Generator) -> Array:
-    """For each kind of surroundings, the share of cells that are free in holes cut into the grid: float64 [KINDS].
+    """Return for each class of surroundings the share of free cells in holes cut into the grid: float64 [KINDS].
 
-    It is the lower end of the share's 95 % interval (Wilson), and 0 for kinds that hardly occur. side: of the holes,
-    metres.
+    It is the lower bound of the 95 % interval (Wilson), and 0 for rare classes. side: of the holes, metres.
     """
     free, count = np.zeros(KINDS), np.zeros(KINDS)
     for part, hole in _holes(grid, side, draw):
@@ -172,7 +171,7 @@ def confidence(grid: Grid, side: float, draw: np.random.Generator) -> Array:
 
 
 def _holes(grid: Grid, side: float, draw: np.random.Generator) -> Iterator[tuple[Grid, Bool]]:
-    """Places of the grid, each with a square hole around a known cell."""
+    """Yield positions of the grid, each with a square hole around a known cell."""
     indices = np.flatnonzero(grid.observed)
     half, margin = max(1, round(side / 2 / grid.cell)), round(SPAN_METRES / grid.cell)
     width = grid.observed.shape[1]

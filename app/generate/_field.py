@@ -1,7 +1,7 @@
-"""Fields: rows within any fence, along its longest side, and the network that robots in polytunnels have.
+"""Fields: rows within any fence, along its longest side, and the network that robots in polytunnels use.
 
 In a field's own frame u runs along the rows and v across them, from the longest side of the fence inwards. There is a
-yard along that side, then a lane, then rows with an aisle between each two. An aisle's nodes are called as in the
+yard along that side, then a lane, then rows with an aisle between each two. Nodes of an aisle are named as in the
 strawberry polytunnels of Riseholme: ``r1.5-ca`` (headland), ``-cb`` (row's end), ``-c0``, ``-c1`` …, ``-cy``, ``-cz``;
 edges along the row are ``row_traversal``, those from one aisle to the next ``row_change``, others ``move_base``.
 """
@@ -22,7 +22,7 @@ from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_opti
 from app.parameters import parameter
 
 MIN_AISLE_METRES = 2.0
-"""Metres that an aisle has at least between its headlands."""
+"""Minimum length of an aisle between its headlands, in metres."""
 
 MAX_ROWS = 500
 
@@ -33,23 +33,29 @@ class FieldOptions(SiteOptions):
 
     row_length: float | None = parameter(
         None,
-        "longest row; default: as long as the fence allows, 40 where there is none",
+        "maximum length of a row; default: as long as the fence allows, 40 without a fence",
         minimum=3.0,
         maximum=1000.0,
         unit="m",
     )
     headland: float = parameter(
-        5.0, "ground between a row's end and the fence, where robots turn", minimum=1.5, maximum=50.0, unit="m"
+        5.0,
+        "depth of the headland between a row's end and the fence, where robots turn",
+        minimum=1.5,
+        maximum=50.0,
+        unit="m",
     )
     yard: float = parameter(8.0, "depth of the yard along the longest side", minimum=6.0, maximum=50.0, unit="m")
-    docks: int = parameter(2, "charging docks in the yard", minimum=1, maximum=20)
-    node_spacing: float = parameter(3.0, "between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
+    docks: int = parameter(2, "number of charging docks in the yard", minimum=1, maximum=20)
+    node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
 
 
 @dataclass(slots=True)
 class Aisle:
-    """Where robots drive between two rows. low, high: its ends along u. west, east: whether a robot can change there
-    to the aisle before it."""
+    """Aisle between two rows. low, high: its ends along u.
+
+    west, east: whether a robot can change there to the aisle before it.
+    """
 
     name: str
     v: float
@@ -61,7 +67,7 @@ class Aisle:
 
 @dataclass(slots=True)
 class Row:
-    """What stands between two aisles. number: from 1 in its kind; low, high: its ends along u."""
+    """Row or other line between two aisles. number: from 1 in its kind. low, high: its ends along u."""
 
     number: int
     v: float
@@ -71,13 +77,13 @@ class Row:
 
     @property
     def length(self) -> float:
-        """Metres from end to end."""
+        """Length in metres."""
         return self.high - self.low
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A row to be, and the aisle behind it. kind: ``row``, or another one that is no row of plants (``legs``)."""
+    """Planned row, and the aisle behind it. kind: ``row``, or another one without plants (``legs``)."""
 
     kind: str
     number: int
@@ -86,7 +92,7 @@ class Line:
 
 @dataclass(slots=True)
 class Field:
-    """A field on a site. yaw: of the rows; origin: local metres of u = v = 0."""
+    """Field on a site. yaw: of the rows. origin: local metres of u = v = 0."""
 
     site: Site
     options: FieldOptions
@@ -96,33 +102,33 @@ class Field:
     aisles: list[Aisle] = field(default_factory=list)
 
     def to_local(self, u: float, v: float) -> tuple[float, float]:
-        """A place in local metres."""
+        """Return a position in local metres."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return mm(self.origin[0] + c * u - s * v), mm(self.origin[1] + s * u + c * v)
 
     def area(self, low_u: float, low_v: float, high_u: float, high_v: float) -> Any:
-        """A rectangle of the field, within the fence, in local metres."""
+        """Return a rectangle of the field, within the fence, in local metres."""
         corners = [self.to_local(u, v) for u, v in ((low_u, low_v), (high_u, low_v), (high_u, high_v), (low_u, high_v))]
         return round_geometry(shapely.intersection(shapely.Polygon(corners), self.site.fence))
 
     def strip(self, row: Row, width: float) -> Any:
-        """The ground of a row, in local metres."""
+        """Return the ground of a row, in local metres."""
         x, y = self.to_local((row.low + row.high) / 2, row.v)
         return rectangle(x, y, self.yaw, row.length, width)
 
     def line(self, row: Row) -> Any:
-        """A row's middle line, in local metres."""
+        """Return a row's centreline, in local metres."""
         return shapely.LineString([self.to_local(row.low, row.v), self.to_local(row.high, row.v)])
 
     def trim_after(self, kind: str) -> None:
-        """Leave away what comes after the last line of a kind."""
+        """Drop everything after the last line of a kind."""
         last = max((k for k, row in enumerate(self.rows) if row.kind == kind), default=-1)
         self.rows = self.rows[: last + 1]
         top = self.rows[-1].v if self.rows else 0.0
         self.aisles = [aisle for aisle in self.aisles if aisle.v < top or aisle is self.aisles[0]]
 
     def inner(self, margin: float) -> Any:
-        """What is left of the fence, in the field's frame, without a margin."""
+        """Return the fence without a margin, in the field's frame."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
 
         def turned(xy: Any) -> Any:
@@ -133,7 +139,7 @@ class Field:
 
 
 def number_rows(rows: int) -> list[Line]:
-    """Rows 1, 2, 3 … and the aisles behind them."""
+    """Yield rows 1, 2, 3 … and the aisles behind them."""
     return [Line("row", k, f"r{k}.5") for k in range(1, rows + 1)]
 
 
@@ -148,12 +154,16 @@ def open_field(
     word: str = "row_spacing",
     length: float = 40.0,
 ) -> Field:
-    """A field on the site, with the rows and aisles that its fence holds.
+    """Lay out a field on the site, with the rows and aisles that its fence can contain.
 
-    lines: what comes one after another, at most; row_count: how many of them make the site where there is no fence,
-    all where it is None and they were asked for. spacing: metres from one to the next. half: metres from a row's
-    middle to its side, all that jitters included; word: the parameter that decides it. Raises CannotGenerate where a
-    robot has no room.
+    Args:
+        lines: the sequence of lines, at most.
+        row_count: number of lines of a site without a fence; None: all, if they were requested.
+        spacing: metres from one to the next.
+        half: metres from a row's centre to its side, including all jitter.
+        word: the parameter that decides ``half``.
+
+    Raises CannotGenerate if a robot has no room.
     """
     margin = 2.0
     count = len(lines) if row_count is None else row_count
@@ -170,12 +180,12 @@ def open_field(
     _lay(out, lines, spacing, count_lost=row_count is None)
     nodes = 2 + 2 * options.docks + sum(len(stops(out, aisle)) for aisle in out.aisles[1:])
     if nodes > MAX_NODES - 200:
-        raise invalid_option_error("node_spacing", f"there would be {nodes} nodes; the limit is {MAX_NODES - 200}")
+        raise invalid_option_error("node_spacing", f"there would be {nodes} nodes, the maximum is {MAX_NODES - 200}")
     return out
 
 
 def _longest(fence: Any) -> tuple[float, tuple[float, float]]:
-    """(direction, start) of the fence's longest side, the inside on its left."""
+    """Return (direction, start) of the fence's longest side, with the inside on its left."""
     plain = shapely.orient_polygons(shapely.simplify(fence, 0.5))
     ring = shapely.get_coordinates(plain.exterior)
     step = np.diff(ring, axis=0)
@@ -185,12 +195,12 @@ def _longest(fence: Any) -> tuple[float, tuple[float, float]]:
 
 
 def _check_room(site: Site, options: FieldOptions, spacing: float, half: float, word: str) -> None:
-    """Whether a robot comes through between two rows, and around their ends."""
+    """Check that a robot fits between two rows, and around their ends."""
     needed = options.robot_radius + half + SLACK * site.resolution
     if spacing / 2 < needed:
         raise invalid_option_error(
             word,
-            f"{spacing:.2f} m from row to row leave no way for a robot of {options.robot_radius:g} m radius between "
+            f"{spacing:.2f} m from row to row are too narrow for a robot of {options.robot_radius:g} m radius between "
             f"rows that reach {half:.2f} m to the side: at least {2 * needed:.2f} m are needed with cells of "
             f"{site.resolution:g} m",
         )
@@ -201,19 +211,22 @@ def _check_room(site: Site, options: FieldOptions, spacing: float, half: float, 
 
 
 def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool) -> None:
-    """Rows and aisles, from the lane on as far as the fence reaches."""
+    """Return rows and aisles, from the lane up to the end of the fence."""
     options, site = out.options, out.site
     turn = options.headland / 2
     inner = out.inner(turn)
     drive = out.inner(options.robot_radius + SLACK * site.resolution)
     if inner.is_empty:
-        raise invalid_option_error("headland", f"the fence holds no field with a headland of {options.headland:g} m")
+        raise invalid_option_error(
+            "headland", f"the fence is too small for a field with a headland of {options.headland:g} m"
+        )
     v = max(options.yard, turn)
     lane = _widest_row(inner, v, None)
     if lane is None or lane[1] - lane[0] < options.headland + MIN_AISLE_METRES:
         raise invalid_option_error(
             "yard",
-            f"the fence has no lane of {options.headland + MIN_AISLE_METRES:g} m behind a yard of {options.yard:g} m",
+            f"the fence has no room for a lane of {options.headland + MIN_AISLE_METRES:g} m behind a yard of "
+            f"{options.yard:g} m",
         )
     lane = _longest_aisle(lane, options)
     out.aisles.append(Aisle("Lane", v, *lane))
@@ -243,13 +256,13 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool)
         v += spacing
     if not any(row.kind == "row" for row in out.rows):
         raise invalid_option_error(
-            "headland", "the fence holds no row: a smaller headland, yard or row_spacing is needed"
+            "headland", "the fence has no room for a row: use a smaller headland, yard or row_spacing"
         )
-    site.notes.drop("rows", left, "the fence holds no more, or no way leads to them within it")
+    site.notes.drop("rows", left, "the fence has no room for them, or no path to them")
 
 
 def _row(line: Line, v: float, before: Aisle, after: Aisle | None, inner: Any, turn: float) -> Row | None:
-    """The row between two aisles, a headland shorter than both."""
+    """Return the row between two aisles, a headland shorter than both."""
     low = before.low if after is None else max(before.low, after.low)
     high = before.high if after is None else min(before.high, after.high)
     span = _widest_row(inner, v, (low, high))
@@ -260,7 +273,7 @@ def _row(line: Line, v: float, before: Aisle, after: Aisle | None, inner: Any, t
 
 
 def _widest_row(area: Any, v: float, before: tuple[float, float] | None) -> tuple[float, float] | None:
-    """The longest piece of an area at a height v, or the one that has most in common with ``before``."""
+    """Return the longest piece of an area at a height v, or the one that overlaps most with ``before``."""
     low, _, high, _ = area.bounds
     cut = shapely.intersection(area, shapely.LineString([(low - 1, v), (high + 1, v)]))
     pieces = [p.bounds for p in shapely.get_parts(cut) if p.geom_type == "LineString" and p.length > 0]
@@ -275,7 +288,7 @@ def _widest_row(area: Any, v: float, before: tuple[float, float] | None) -> tupl
 def _longest_aisle(
     reach: tuple[float, float], options: FieldOptions, before: tuple[float, float] | None = None
 ) -> tuple[float, float]:
-    """An aisle for rows of the greatest length: from its beginning, or from where the one before begins."""
+    """Return an aisle for rows of maximum length: from its start, or from the start of the one before."""
     if options.row_length is None:
         return reach
     low = reach[0] if before is None else max(reach[0], before[0])
@@ -286,7 +299,7 @@ def _longest_aisle(
 
 
 def stops(out: Field, aisle: Aisle) -> list[tuple[str, float]]:
-    """An aisle's nodes and their u: headland, row's end, along the row, row's end, headland."""
+    """Return an aisle's nodes and their u: headland, row's end, along the row, row's end, headland."""
     turn = out.options.headland / 2
     first, last = aisle.low + turn, aisle.high - turn
     steps = max(1, round((last - first) / out.options.node_spacing))
@@ -304,9 +317,9 @@ def network(
     change: str = "row_change",
     one_way: bool = False,
 ) -> None:
-    """Edges of lane and aisles, and the nodes of both. on_lane: nodes that stand on the lane already, and their u.
+    """Add edges of lane and aisles, and the nodes of both. on_lane: nodes already on the lane, and their u.
 
-    one_way: aisles are driven in turns from low to high u and back, as far as one can come round both ends.
+    one_way: aisles are driven alternately from low to high u and back, as far as both ends are connected.
     """
     site, lane = out.site, out.aisles[0]
     at_ends = (("LaneWest", lane.low), ("LaneEast", lane.high))
@@ -333,12 +346,12 @@ def network(
 
 
 def _pitch(options: FieldOptions) -> float:
-    """Metres from one dock to the next."""
+    """Return the distance in metres from one dock to the next."""
     return mm(max(1.5, 2 * options.robot_radius + 0.6))
 
 
 def _lane_nodes(out: Field) -> dict[str, float]:
-    """u of the yard's nodes on the lane."""
+    """Return u of the yard's nodes on the lane."""
     lane, options = out.aisles[0], out.options
     pitch = _pitch(options)
     middle = mm((lane.low + lane.high + options.docks * pitch) / 2)
@@ -348,8 +361,10 @@ def _lane_nodes(out: Field) -> dict[str, float]:
 
 
 def yard(out: Field) -> dict[str, float]:
-    """The yard along the longest side: docks, a gate, a barn and a water tank, as far as there is room; its nodes on
-    the lane, and their u."""
+    """Add the yard along the longest side: docks, a gate, a barn and a water tank, as far as there is room.
+
+    Returns its nodes on the lane, and their u.
+    """
     site, options, lane = out.site, out.options, out.aisles[0]
     positions = _lane_nodes(out)
     radius = options.robot_radius
@@ -407,8 +422,7 @@ def yard(out: Field) -> dict[str, float]:
 
 
 def lowest(out: Field, u: float, margin: float) -> float | None:
-    """The lowest v below the lane that is straight ahead of it and at least a margin from the fence; None where the
-    lane itself is nearer."""
+    """Return the lowest v below the lane that is straight ahead and at least a margin from the fence; else None."""
     inner, top = out.inner(margin), out.aisles[0].v
     if inner.is_empty:
         return None
@@ -433,7 +447,7 @@ def ground(out: Field, *, field_colour: str, lane_colour: str = "path") -> None:
 
 
 def between(row: Row, step: float) -> list[float]:
-    """Places along a row, a step apart, the same distance left at both ends."""
+    """Return positions along a row, a step apart, with equal distances at both ends."""
     count = int(row.length / step + 1e-9)
     first = row.low + (row.length - count * step) / 2
     return [first + step * k for k in range(count + 1)]

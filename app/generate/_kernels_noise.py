@@ -1,12 +1,11 @@
-"""Gradient noise on a grid of points, as native code: Perlin's improved noise and simplex noise in two and three
-dimensions.
+"""Gradient noise on a grid of points, as native code: Perlin's improved noise and simplex noise in 2-D and 3-D.
 
 Sources: K. Perlin, Improving noise (SIGGRAPH 2002); S. Gustavson, Simplex noise demystified (2005). Only sums, products
 and comparisons: the same seed gives the same values on every machine. Each kernel adds ``amplitude`` times the noise,
 about -1 to 1, to ``out``. table: uint8 [512], a permutation of 0 to 255, twice.
 """
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ _Y2 = np.array([0.0, _R, 1.0, _R, 0.0, -_R, -1.0, -_R])
 _X3 = np.array([1.0, -1, 1, -1, 1, -1, 1, -1, 0, 0, 0, 0, 1, -1, 0, 0])
 _Y3 = np.array([1.0, 1, -1, -1, 0, 0, 0, 0, 1, -1, 1, -1, 1, 1, -1, -1])
 _Z3 = np.array([0.0, 0, 0, 0, 1, 1, -1, -1, 1, 1, -1, -1, 0, 0, 1, -1])
-"""Gradients: eight directions in the plane, the middles of a cube's edges in space (four of them twice)."""
+"""Gradients: eight directions in the plane, the edge centres of a cube in space (four of them twice)."""
 
 _SCALE2 = 1.4142135623730951
-"""Noise of unit gradients in the plane reaches half the diagonal of a square."""
+"""Scale to -1 … 1: noise of unit gradients in the plane reaches half the diagonal of a square."""
 
 _F2, _G2 = 0.3660254037844386, 0.21132486540518713
 _F3, _G3 = 1.0 / 3.0, 1.0 / 6.0
 _SIMPLEX2, _SIMPLEX3 = 99.2, 32.0
-"""What brings simplex noise to -1 … 1: of unit gradients in the plane, of edges' middles in space."""
+"""Scale of simplex noise to -1 … 1: for unit gradients in the plane, for edge centres in space."""
 
 
 @native
@@ -155,7 +154,7 @@ def simplex3(x: F64, y: F64, z: F64, table: U8, amplitude: float, out: F64) -> N
                 fi, fj, fk = math.floor(x[k] + skew), math.floor(y[r] + skew), math.floor(z[s] + skew)
                 back = (fi + fj + fk) * _G3
                 x0, y0, z0 = x[k] - (fi - back), y[r] - (fj - back), z[s] - (fk - back)
-                # The second and third corner: along the largest, then also along the second largest coordinate.
+                # second and third corner: along the largest, then also along the second largest coordinate
                 if x0 >= y0:
                     if y0 >= z0:
                         a, b, c, d, e, f = 1, 0, 0, 1, 1, 0
@@ -188,7 +187,7 @@ def simplex3(x: F64, y: F64, z: F64, table: U8, amplitude: float, out: F64) -> N
 
 
 def compile_all() -> None:
-    """Call every kernel once on a point."""
+    """Compile all kernels: call each one once on a point."""
     at, table = np.zeros(1), np.zeros(512, np.uint8)
     for flat in (perlin2, simplex2):
         flat(at, at, table, 1.0, np.zeros((1, 1)))

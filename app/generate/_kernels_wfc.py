@@ -1,16 +1,16 @@
-"""Wave-function collapse on any lattice, as native code: observe, propagate, and unmake what contradicts itself.
+"""Wave-function collapse on any lattice, as native code: observe, propagate, and repair contradictions.
 
-A place is one window of the lattice; its domain is the set of patterns that may still stand there, a bit each. A place
-is observed where the entropy of its domain is least, and what that rules out is propagated until every pattern has a
-partner in each neighbour (arc consistency). Where a place is left without a pattern, the places around it get back
-the domains they started from, a wider ring each time this happens there, and are made again from what is around them:
-local backtracking as in model synthesis (Merrell and Manocha, Model synthesis, TVCG 17, 2011).
+A place is one window of the lattice; its domain is the set of patterns that are still possible there, one bit each. The
+place with the lowest entropy is observed, and the consequences are propagated until every pattern has a partner in each
+neighbour (arc consistency). If no pattern is left for a place, the places around it get back their initial domains, in
+a wider ring each time this happens there, and are solved again: local backtracking as in model synthesis (Merrell and
+Manocha, Model synthesis, TVCG 17, 2011).
 
-Numbers are 64-bit integers throughout, so that the same seed gives the same result on every machine. The random
-numbers are SplitMix64's.
+Numbers are 64-bit integers throughout, so that the same seed gives the same result on every machine. Random numbers are
+those of SplitMix64.
 """
 
-# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return,call-overload,operator,misc"
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ONE = np.uint64(1)
 ZERO = np.uint64(0)
 
 DONE, IMPOSSIBLE, TIRED = 0, 1, 2
-"""How ``collapse`` ends: every place has a pattern; what is given contradicts itself; a limit is reached."""
+"""Results of ``collapse``: every place has a pattern; the initial domains are contradictory; a limit was reached."""
 
 _BITS = np.uint64(0x03F79D71B4CB0A89)
 _BIT = np.zeros(64, np.int64)
@@ -42,7 +42,7 @@ _GAMMA, _MIX1, _MIX2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5
 
 @native
 def _random(state: U64) -> int:
-    """The next number of SplitMix64, 0 to 2^53 - 1."""
+    """Return the next number of SplitMix64, 0 to 2^53 - 1."""
     state[0] = state[0] + _GAMMA
     z = state[0]
     z = (z ^ (z >> _S30)) * _MIX1
@@ -53,7 +53,7 @@ def _random(state: U64) -> int:
 
 @native
 def _entropy(domain: U64, weights: I64, heavy: I64, logs: I64) -> int:
-    """Entropy of a domain in units of 2^-20; -1 where at most one pattern is left."""
+    """Return the entropy of a domain in units of 2^-20; -1 if at most one pattern is left."""
     total, mean, count = np.int64(0), np.int64(0), 0
     for k in range(len(domain)):
         word = domain[k]
@@ -71,7 +71,7 @@ def _entropy(domain: U64, weights: I64, heavy: I64, logs: I64) -> int:
 
 @native
 def _push(keys: I64, positions: I64, size: int, key: int, place: int) -> int:
-    """Onto a binary heap; its new size."""
+    """Push onto a binary heap; return its new size."""
     i = size
     while i > 0:
         up = (i - 1) >> 1
@@ -85,7 +85,7 @@ def _push(keys: I64, positions: I64, size: int, key: int, place: int) -> int:
 
 @native
 def _pop(keys: I64, positions: I64, size: int) -> int:
-    """The first of a heap goes to its end; the new size."""
+    """Pop a heap: move its first element to the end; return the new size."""
     first_key, first = keys[0], positions[0]
     size -= 1
     key, place = keys[size], positions[size]
@@ -107,7 +107,7 @@ def _pop(keys: I64, positions: I64, size: int) -> int:
 
 @native
 def _single_pattern(domain: U64) -> int:
-    """The only pattern of a domain, or -1 where there are several, -2 where there is none."""
+    """Return the only pattern of a domain, or -1 if there are several, -2 if there is none."""
     tile = np.int64(-2)
     for k in range(len(domain)):
         word = domain[k]
@@ -122,7 +122,7 @@ def _single_pattern(domain: U64) -> int:
 def _observe(
     domain: U64, weights: I64, tile: I64, shares: I64, placed: I64, totals: I64, balance: int, state: U64, chance: I64
 ) -> int:
-    """One pattern of a domain, by weight; patterns that were placed too often by now weigh less, and the other way."""
+    """Draw one pattern of a domain by weight; patterns placed too often so far weigh less, too rare ones more."""
     total = np.int64(0)
     count = 0
     for k in range(len(domain)):
@@ -132,7 +132,7 @@ def _observe(
             p = (k << 6) + _BIT[np.int64((low * _BITS) >> _S58)]
             share = weights[p] << 10
             if balance >= 0:
-                # What patterns with this tile should be by now over what they are, both plus a start of some places.
+                # expected over actual count of patterns with this tile, both plus an offset of some places
                 c = tile[p]
                 should = shares[c] * totals[0] // totals[1] + balance
                 ratio = min(max((should << 10) // (placed[c] + balance), 1 << 6), 1 << 14)
@@ -157,7 +157,7 @@ def _observe(
 
 @native
 def _revise(domain: U64, a: int, b: int, allowed: U64, union: U64) -> int:
-    """Take from b's domain what has no partner in a's: 0 nothing changed, 1 changed, -1 nothing would be left."""
+    """Remove patterns from b's domain without partner in a's: 0 unchanged, 1 changed, -1 none would be left."""
     words = domain.shape[1]
     for j in range(words):
         union[j] = ZERO
@@ -205,22 +205,30 @@ def collapse(
     settings: I64,
     report: I64,
 ) -> int:
-    """Give every place one pattern, in place; DONE, IMPOSSIBLE or TIRED.
+    """Give every place one pattern, in place; return DONE, IMPOSSIBLE or TIRED.
 
-    domain: uint64 [n, words], what may stand at each place now. initial: the same at the start, what a place gets back
-    when it is unmade; wider: what else it may then get where that does not help, [n, words] or of no length.
-    neighbours: [n, 4], -1 for none; direction d and d ^ 1 are opposite. allowed: [4, patterns, words]. weights, heavy
-    (weight times its logarithm, as logs): [patterns]. tile: [patterns], what is balanced. logs: of 0 to the sum of the
-    weights, times 2^20. noise: [n], against ties. state: the random numbers'. hits: [n], how often a place was left
-    without a pattern. start: the places whose domains are to be propagated first. counted: [n], whether a place counts
-    for the balance. settings: balance (0: none, else places that smooth it), most repairs, first radius of a repair,
-    steps after which it is tired, whether nothing was observed before, whether row by row. report: repairs, the place
-    of the first contradiction, places widened, steps.
+    Args:
+        domain: uint64 [n, words], patterns still possible at each place.
+        initial: the same at the start, restored when a place is reset.
+        wider: further patterns that a place then gets if that does not help, [n, words] or of length 0.
+        neighbours: [n, 4], -1 for none; direction d and d ^ 1 are opposite.
+        allowed: [4, patterns, words].
+        weights, heavy: [patterns]; heavy is weight times its logarithm, as logs.
+        tile: [patterns], the tile that is balanced.
+        logs: of 0 to the sum of the weights, times 2^20.
+        noise: [n], to break ties.
+        state: state of the random numbers.
+        hits: [n], how often no pattern was left for a place.
+        start: the places whose domains are propagated first.
+        counted: [n], whether a place counts for the balance.
+        settings: balance (0: none, else number of smoothing places), maximum repairs, first radius of a repair, maximum
+            steps, whether nothing was observed before, whether row by row.
+        report: output: repairs, the place of the first contradiction, places widened, steps.
     """
     n, words = domain.shape
     balance, max_repairs, radius0, work = settings[0], settings[1], settings[2], settings[3]
     scan = settings[5] != 0
-    fresh = settings[4] != 0  # nothing was observed so far: what contradicts itself was given so
+    fresh = settings[4] != 0  # nothing was observed so far: the input is contradictory
     patterns = len(weights)
     placed, shares = np.zeros(patterns, np.int64), np.zeros(patterns, np.int64)
     totals = np.zeros(2, np.int64)
@@ -259,7 +267,7 @@ def collapse(
     block = np.empty(n, np.int64)
     observed = False
     while True:
-        # What is known is propagated.
+        # propagate known patterns
         while size > 0:
             a = queue[head]
             head = head + 1 if head < n else 0
@@ -293,7 +301,7 @@ def collapse(
                     if key != current[b]:
                         current[b] = key
                         if heap + 1 >= len(keys):
-                            # Stale entries are dropped before the heap grows.
+                            # drop stale entries before the heap grows
                             fresh_size = 0
                             for i in range(heap):
                                 if current[places[i]] == keys[i]:
@@ -307,7 +315,7 @@ def collapse(
                         heap = _push(keys, places, heap, key, b)
             if broken < 0:
                 continue
-            # A contradiction: what is around it is unmade.
+            # contradiction: reset the places around it
             report[0] += 1
             if report[1] < 0:
                 report[1] = broken
@@ -380,7 +388,7 @@ def collapse(
                         size += 1
         if report[3] > work:
             return TIRED
-        # The place of least entropy is observed.
+        # observe the place with the lowest entropy
         cell = -1
         while heap > 0 and cell < 0:
             heap = _pop(keys, places, heap)
@@ -403,7 +411,7 @@ def collapse(
 
 
 def compile_all() -> None:
-    """Call every kernel once on a tiny lattice."""
+    """Compile all kernels: call each one once on a tiny lattice."""
     one = np.ones((2, 1), np.uint64)
     for wider in (one, one[:0]):
         collapse(

@@ -1,34 +1,34 @@
-"""L-systems: bracketed, parametric and stochastic rewriting, and the turtle that draws what comes out.
+"""L-systems: bracketed, parametric and stochastic rewriting, and the turtle that draws the result.
 
-Rules are text, one statement a line (or between semicolons); a line that leaves a bracket open goes on in the next one;
+Rules are text, one statement per line (or separated by semicolons); a line with an open bracket continues on the next;
 ``#`` begins a comment::
 
     taper = 0.7                                     # a constant
     axiom: !(0.05) F(0.5) A(1, 0.05)
     A(l, w) : l > 0.2 -> F(l, w * taper) [ +(rand(20, 40)) A(l * 0.6, w * taper) ] /(137.5) A(l * 0.8, w * taper)
-    A(l, w) : l <= 0.2 @ 3 -> L(0.1)                # of the rules that apply one is taken, this one with weight 3
+    A(l, w) : l <= 0.2 @ 3 -> L(0.1)                # one of the matching rules is drawn, this one with weight 3
     A(l, w) : l <= 0.2 @ 1 -> O(0.03)
 
-A symbol is one letter or sign, with its values in parentheses. A rule holds for the symbol with as many values as it
-names, where its condition is true; a symbol that no rule holds for stays. Expressions: ``_expressions``. The turtle
-starts at the origin and looks up (z), and knows
+A symbol is one letter or sign, with its values in parentheses. A rule applies to the symbol with as many values as it
+names, if its condition is true; symbols without a matching rule stay. Expressions: ``_expressions``. The turtle starts
+at the origin and looks up (z); its symbols are
 
 =================== ================================================= ==========================================
-``F(length, r)``    goes forward and draws, its radius becoming ``r`` left out: ``length`` of the system, radius kept
+``F(length, r)``    goes forward and draws, its radius becoming ``r`` default: ``length`` of the system, radius kept
 ``f(length)``       goes forward and draws nothing
-``+(a)``, ``-(a)``  turns left, right by degrees                      left out: the system's ``angle``
+``+(a)``, ``-(a)``  turns left, right by degrees                      default: the system's ``angle``
 ``&(a)``, ``^(a)``  pitches down, up
 ``\\(a)``, ``/(a)``  rolls left, right
 ``|``               turns round
 ``$``               rolls until its left side is level
 ``!(r)``            sets the radius in metres
-``[``, ``]``        remembers where it is, and goes back there
+``[``, ``]``        saves its position, and returns to it
 ``L(size)``         a leaf of this length
 ``O(radius)``       a fruit
 =================== ================================================= ==========================================
 
 Source: Prusinkiewicz and Lindenmayer, The Algorithmic Beauty of Plants (1990), chapter 1 (their signs, and their
-meaning of parametric and stochastic rules). A system that grows beyond a stated bound is stopped while it grows.
+meaning of parametric and stochastic rules). A system that exceeds a limit raises CannotGenerate while it grows.
 """
 
 from __future__ import annotations
@@ -45,29 +45,29 @@ from app.generate import _expressions
 from app.generate._expressions import Expression, raise_invalid
 
 MAX_SYMBOLS = 100_000
-"""Of a system at any time."""
+"""Maximum number of symbols of a system at any time."""
 
 MAX_WORK = 2_500_000
-"""Symbols that are rewritten, of all plants of one generation together."""
+"""Maximum number of rewritten symbols, for all plants of one generation together."""
 
 MAX_DRAWN = 20_000
-"""Branches, leaves and fruit of one plant."""
+"""Maximum number of branches, leaves and fruit of one plant."""
 
 MAX_TEXT_CHARACTERS, MAX_RULES, MAX_WORDS = 20_000, 200, 500
-"""Characters of rules, statements, and symbols on one side of a rule."""
+"""Maximum number of characters of rules, of statements, and of symbols on one side of a rule."""
 
 MAX_ITERATIONS = 40
 MAX_DEPTH = 200
-"""Brackets within each other."""
+"""Maximum depth of nested brackets."""
 
 MAX_PLANT_METRES = 1000.0
-"""Metres that a plant may reach from its root."""
+"""Maximum distance of a plant from its root, in metres."""
 
 TURTLE: Mapping[str, tuple[int, int]] = {
     "F": (0, 2), "f": (0, 1), "L": (0, 1), "O": (0, 1), "!": (1, 1), "|": (0, 0), "$": (0, 0), "[": (0, 0), "]": (0, 0),
     **dict.fromkeys("+-&^\\/", (0, 1)),
 }  # fmt: skip
-"""The signs that the turtle knows, and how many values each takes."""
+"""Signs of the turtle, and the numbers of values that each takes."""
 
 _LETTER = re.compile(r"[A-Za-z]")
 _CONSTANT = re.compile(r"\s*([A-Za-z_][A-Za-z0-9_]*)\s*=(?!=)(.*)", re.DOTALL)
@@ -76,17 +76,17 @@ _RULE = re.compile(r"\s*([A-Za-z])\s*(?:\(([^()]*)\))?\s*(?::(.*))?\s*", re.DOTA
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 Symbol = tuple[str, tuple[float, ...]]
-"""A letter or sign with its values."""
+"""Letter or sign with its values."""
 
 Word = tuple[str, tuple[Expression, ...]]
-"""The same in a rule, before its values are known."""
+"""Symbol of a rule, with expressions instead of values."""
 
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One way to rewrite a symbol. names: of its values. location: its statement."""
+    """Rule that rewrites a symbol. names: of its values. location: its statement."""
 
     symbol: str
     names: tuple[str, ...]
@@ -98,7 +98,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """A checked L-system. constants: by name."""
+    """Checked L-system. constants: by name."""
 
     axiom: tuple[Word, ...]
     rules: Mapping[tuple[str, int], tuple[Rule, ...]]
@@ -107,7 +107,7 @@ class System:
 
 @dataclass(slots=True)
 class Budget:
-    """What one generation may still rewrite."""
+    """Number of symbols that one generation may still rewrite."""
 
     left: int = MAX_WORK
 
@@ -116,12 +116,12 @@ class Budget:
 
 
 def parse(text: str) -> System:
-    """The system that these rules describe. Invalid names the statement and what is wrong with it."""
+    """Parse rules to an L-system. Raises Invalid, which names the statement and the problem."""
     if len(text) > MAX_TEXT_CHARACTERS:
-        raise_invalid(f"the rules have {len(text)} characters; the limit is {MAX_TEXT_CHARACTERS}", "rules")
+        raise_invalid(f"the rules have {len(text)} characters, the maximum is {MAX_TEXT_CHARACTERS}", "rules")
     statements = _statements(text)
     if len(statements) > MAX_RULES:
-        raise_invalid(f"there are {len(statements)} statements; the limit is {MAX_RULES}", "rules")
+        raise_invalid(f"there are {len(statements)} statements, the maximum is {MAX_RULES}", "rules")
     constants: dict[str, float] = {}
     axiom: tuple[Word, ...] | None = None
     rules: dict[tuple[str, int], list[Rule]] = {}
@@ -134,25 +134,25 @@ def parse(text: str) -> System:
             rules.setdefault((rule.symbol, len(rule.names)), []).append(rule)
         elif match := _AXIOM.fullmatch(statement):
             if axiom is not None:
-                raise_invalid("there is an axiom already", location)
+                raise_invalid("duplicate axiom", location)
             axiom = _parse_words(match[1], frozenset(constants), location)
         elif match := _CONSTANT.fullmatch(statement):
             if match[1] in constants:
-                raise_invalid(f"{match[1]!r} has a value already", location)
+                raise_invalid(f"duplicate constant {match[1]!r}", location)
             if "rand" in match[2]:
-                raise_invalid("a constant cannot be drawn by chance: put rand into a rule", location)
+                raise_invalid("a constant must not be random: use rand in a rule", location)
             constants[match[1]] = _expressions.parse(match[2], frozenset(constants), location)(constants, never)
         else:
             raise_invalid(f"{statement[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", location)
     if axiom is None:
-        raise_invalid("an axiom is missing: axiom: F A(1)", "rules")
+        raise_invalid("missing axiom, such as axiom: F A(1)", "rules")
     system = System(axiom, {key: tuple(match) for key, match in rules.items()}, constants)
     _check_symbols(system)
     return system
 
 
 def _statements(text: str) -> list[str]:
-    """The statements without comments; lines are joined while a bracket is open."""
+    """Split the text into statements without comments; lines are joined while a bracket is open."""
     out: list[str] = []
     open_ = 0
     for line in text.splitlines():
@@ -170,21 +170,21 @@ def _rule(head: str, tail: str, constants: Mapping[str, float], location: str) -
     head, at, chance = head.partition("@")
     match = _RULE.fullmatch(head)
     if match is None:
-        raise_invalid(f"{head.strip()[:60]!r} is no symbol with names, such as A(l, w) : l > 1 @ 2", location)
+        raise_invalid(f"{head.strip()[:60]!r} is not a symbol with names, such as A(l, w) : l > 1 @ 2", location)
     names = tuple(part.strip() for part in match[2].split(",")) if match[2] and match[2].strip() else ()
     if not all(_NAME.fullmatch(name) for name in names) or len(set(names)) != len(names) or len(names) > 8:
         raise_invalid(f"({match[2]}) must be up to 8 different names", location)
     scope = frozenset({*constants, *names})
     condition_text = match[3] or ""
     if match[3] is not None and not condition_text.strip():
-        raise_invalid("a condition is missing behind :", location)
+        raise_invalid("missing condition after :", location)
     condition = _expressions.parse(condition_text, scope, location) if condition_text.strip() else None
     weight = _expressions.parse(chance, scope, location) if at else None
     return Rule(match[1], names, condition, weight, _parse_words(tail, scope, location), location)
 
 
 def _parse_words(text: str, names: frozenset[str], location: str) -> tuple[Word, ...]:
-    """Symbols with the expressions of their values; brackets must come in pairs."""
+    """Parse symbols with the expressions of their values; brackets must be balanced."""
     out: list[Word] = []
     at = open_ = 0
     while at < len(text):
@@ -194,7 +194,7 @@ def _parse_words(text: str, names: frozenset[str], location: str) -> tuple[Word,
             continue
         if not (_LETTER.fullmatch(letter) or letter in TURTLE):
             raise_invalid(
-                f"{letter!r} is no symbol: letters and {' '.join(s for s in TURTLE if not s.isalpha())} are", location
+                f"unknown symbol {letter!r}: use letters and {' '.join(s for s in TURTLE if not s.isalpha())}", location
             )
         open_ += (letter == "[") - (letter == "]")
         if open_ < 0:
@@ -213,7 +213,7 @@ def _parse_words(text: str, names: frozenset[str], location: str) -> tuple[Word,
 
 
 def _inside(text: str, at: int, location: str) -> tuple[list[str], int]:
-    """The values behind an opening parenthesis, cut at their commas, and where they end."""
+    """Split the values after an opening parenthesis at their commas; also return where they end."""
     start, deep, out = at, 0, []
     while at < len(text):
         sign = text[at]
@@ -229,7 +229,7 @@ def _inside(text: str, at: int, location: str) -> tuple[list[str], int]:
 
 
 def _check_symbols(system: System) -> None:
-    """Every letter has a meaning: a rule for as many values, or the turtle's."""
+    """Check that every letter has a meaning: a rule for as many values, or the turtle's."""
     sides = [("axiom", system.axiom), *((r.location, r.after) for rules in system.rules.values() for r in rules)]
     for location, words in sides:
         for letter, values in words:
@@ -240,14 +240,17 @@ def _check_symbols(system: System) -> None:
             takes += [f"{minimum} to {maximum}" if minimum < maximum else str(minimum)] if letter in TURTLE else []
             if takes:
                 raise_invalid(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", location)
-            raise_invalid(f"no rule says what becomes of {letter}, and the turtle does not know it", location)
+            raise_invalid(f"no rule for {letter}, and it is no symbol of the turtle", location)
 
 
 # --- rewriting -------------------------------------------------------------------------------------------------------
 
 
 def expand(system: System, iterations: int, chance: np.random.Generator, budget: Budget | None = None) -> list[Symbol]:
-    """The symbols after so many rounds of rewriting. CannotGenerate where they become too many, and when."""
+    """Rewrite the axiom for a number of rounds.
+
+    Raises CannotGenerate, with the round, if there are too many symbols.
+    """
     budget = budget or Budget()
     symbols = _produce_symbols(system.axiom, system.constants, chance)
     for k in range(iterations):
@@ -262,7 +265,7 @@ def expand(system: System, iterations: int, chance: np.random.Generator, budget:
                 changed = True
                 out += after
             if len(out) > MAX_SYMBOLS:
-                _explodes(f"has more than {MAX_SYMBOLS} symbols after {k} of {iterations} rounds and before the next")
+                _explodes(f"has more than {MAX_SYMBOLS} symbols after {k} of {iterations} rounds")
         budget.left -= len(symbols)
         if budget.left < 0:
             _explodes(f"has taken {MAX_WORK} symbols to rewrite after {k + 1} of {iterations} rounds")
@@ -282,7 +285,7 @@ def _produce_symbols(words: Iterable[Word], names: Mapping[str, float], chance: 
 
 
 def _rewrite(system: System, rules: Sequence[Rule], symbol: Symbol, chance: np.random.Generator) -> list[Symbol] | None:
-    """What becomes of a symbol; None where no rule holds."""
+    """Return the replacement of a symbol; None if no rule applies."""
     names = dict(system.constants)
     holding: list[Rule] = []
     for rule in rules:
@@ -315,8 +318,10 @@ def _rewrite(system: System, rules: Sequence[Rule], symbol: Symbol, chance: np.r
 
 @dataclass(slots=True)
 class Drawing:
-    """What the turtle drew, in metres. Each branch: (start, end, radius at the start, at the end, left, up); each leaf:
-    (place, heading, left, length); each fruit: (place, radius). stem: length of what was drawn before the first fork.
+    """Result of the turtle, in metres.
+
+    Each branch: (start, end, radius at the start, at the end, left, up); each leaf: (position, heading, left, length);
+    each fruit: (position, radius). stem: length drawn before the first fork.
     """
 
     branches: list[tuple[Vector, Vector, float, float, Vector, Vector]] = field(default_factory=list)
@@ -335,9 +340,9 @@ class _State:
 
 
 def draw(symbols: Iterable[Symbol], *, angle: float, length: float, radius: float) -> Drawing:
-    """Follow the turtle. angle (degrees), length and radius (metres) hold where a symbol says none.
+    """Follow the turtle. angle (degrees), length and radius (metres): defaults of symbols without values.
 
-    CannotGenerate where there is too much to draw, or it leads too far away.
+    Raises CannotGenerate if there is too much to draw, or the plant reaches too far.
     """
     out = Drawing()
     now = _State((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), radius)
@@ -367,7 +372,7 @@ def draw(symbols: Iterable[Symbol], *, angle: float, length: float, radius: floa
             forked = forked or bool(out.branches)
             stack.append(_State(now.at, now.h, now.l, now.u, now.radius))
             if len(stack) > MAX_DEPTH:
-                _beyond(f"has more than {MAX_DEPTH} brackets within each other")
+                _beyond(f"has more than {MAX_DEPTH} nested brackets")
         elif letter == "]":
             now = stack.pop()
         elif letter == "L":
@@ -394,8 +399,8 @@ def _combine(a: Vector, c: float, b: Vector, s: float) -> Vector:
 
 
 def _turn(now: _State, sign: str, degrees: float) -> None:
-    """Left and right about the up axis, down and up about the left one; rolling left the left side goes down."""
-    # Rounded, so that the last bit of a machine's sine shows nowhere.
+    """Rotate: left and right about the up axis, down and up about the left one; rolling left lowers the left side."""
+    # rounded, so that the last bit of a machine's sine has no effect
     a = math.radians(math.remainder(degrees, 360.0))
     c, s = round(math.cos(a), 12), round(math.sin(a), 12)
     if sign in "-^\\":
@@ -409,7 +414,7 @@ def _turn(now: _State, sign: str, degrees: float) -> None:
 
 
 def _level(now: _State) -> None:
-    """Roll until the left axis is horizontal; straight up or down it stays."""
+    """Roll until the left axis is horizontal; pointing straight up or down changes nothing."""
     x, y, _ = now.h
     flat = math.sqrt(x * x + y * y)
     if flat > 1e-9:

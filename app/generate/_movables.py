@@ -1,4 +1,4 @@
-"""Things that may be moved: shifted and turned, in rows, back to where nothing else is."""
+"""Movable objects: shift and turn them, detect rows, and put back those that collide."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from app.model.layers import Layers, PartKey
 Array = NDArray[np.float64]
 
 ROW = 3
-"""Things in a row, at least."""
+"""Minimum number of objects in a row."""
 
 
 @dataclass(slots=True)
 class Movable:
-    """One object, or piece of a grid. at: its middle. body: the ground it covers (metres). row: its row, or -1.
+    """One object, or piece of a grid. at: its centre. body: the ground it covers (metres). row: its row, or -1.
 
-    moved: (dx, dy, turn); None: it stays for good. gone: whether it is missing.
+    moved: (dx, dy, turn); None: it never moves. gone: whether it is removed.
     """
 
     place: tuple[PartKey, int] | int
@@ -40,13 +40,13 @@ class Movable:
         return self.gone or (self.moved is not None and any(self.moved))
 
     def now(self) -> Any:
-        """The ground it covers now."""
+        """Return the ground that it covers now."""
         return self.body if self.moved is None or not any(self.moved) else move_shape(self.body, self.at, self.moved)
 
 
 # --- objects ----------------------------------------------------------------------------------------------------------
 def move_shape(shape: Any, around: tuple[float, float], by: tuple[float, float, float]) -> Any:
-    """A shape turned around a point and shifted, in whole millimetres; heights stay."""
+    """Turn a shape around a point and shift it, in whole millimetres; heights stay."""
     dx, dy, turn = by
     c, s = math.cos(turn), math.sin(turn)
     x, y = around
@@ -60,7 +60,7 @@ def move_shape(shape: Any, around: tuple[float, float], by: tuple[float, float, 
 
 
 def changed_features(part: Features, things: dict[int, Movable], given: Layers) -> Features:
-    """A part with its objects where they are now, and without those that are gone."""
+    """Return a part with its objects at their current positions, without removed ones."""
     metres = part.in_local(given.frame).copy()
     geometry = part.geometry.copy()
     properties = list(part.properties)
@@ -85,7 +85,7 @@ def changed_features(part: Features, things: dict[int, Movable], given: Layers) 
 
 
 def append_rows(before: Features | None, rows: list[tuple[str, Any, dict[str, Any]]]) -> Features:
-    """New rows behind what is there."""
+    """Return new rows with numbers after the existing ones."""
     fresh = features(rows, "local")
     if before is None:
         return fresh
@@ -96,10 +96,10 @@ def append_rows(before: Features | None, rows: list[tuple[str, Any, dict[str, An
 
 
 def find_rows(at: Array) -> NDArray[np.int64]:
-    """The row of each of the places [n, 2], from 0; -1: it is in none.
+    """Return the row of each of the positions [n, 2], from 0; -1 if it is in none.
 
-    Rows run in the direction in which most things have their nearest neighbour; a row ends sideways where there is a
-    gap of more than half the usual distance to it.
+    Rows run in the direction in which most objects have their nearest neighbour; a row ends sideways at a gap of more
+    than half the median distance to it.
     """
     from scipy.spatial import cKDTree
 
@@ -118,7 +118,7 @@ def find_rows(at: Array) -> NDArray[np.int64]:
     best = int(np.argmax(smooth))
     if smooth[best] < max(ROW, 0.4 * mask.sum()):
         return out
-    # The mean of directions that are 180 degrees apart is half the mean of their doubles.
+    # the mean of directions that are 180 degrees apart is half the mean of their doubles
     close = mask & (np.abs((angle / math.pi * 36 - best - 0.5 + 18) % 36 - 18) <= 1.5)
     double = 2 * angle[close]
     direction = math.atan2(float(np.sin(double).sum()), float(np.cos(double).sum())) / 2
@@ -133,7 +133,7 @@ def find_rows(at: Array) -> NDArray[np.int64]:
 
 
 def separate(things: Sequence[Movable]) -> int:
-    """Put back what has come to stand in others and did not before: how many things."""
+    """Put back objects that now overlap others and did not before; return their number."""
     present_things = [t for t in things if not t.gone]
     before = np.array([t.body for t in present_things], object)
     put = 0

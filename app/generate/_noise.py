@@ -17,7 +17,7 @@ Kind = Literal["perlin", "simplex"]
 class Fractal:
     """Noise in octaves: each is ``lacunarity`` times as fine as the one before, and ``persistence`` times as strong.
 
-    feature: metres (or whatever the points are in) from one hill of the coarsest octave to the next, about.
+    feature: approximate distance between hills of the coarsest octave, in the unit of the points (metres).
     """
 
     kind: Kind = "simplex"
@@ -28,12 +28,12 @@ class Fractal:
 
     @property
     def total(self) -> float:
-        """What the octaves reach together."""
+        """Sum of the octaves' amplitudes."""
         return float(sum(self.persistence**k for k in range(self.octaves)))
 
 
 def noise2(x: Array, y: Array, fractal: Fractal, draw: np.random.Generator) -> Array:
-    """Values from -1 to 1 at all points of two axes: float64 [len(y), len(x)]. draw: decides which noise it is."""
+    """Return values from -1 to 1 at all points of two axes: float64 [len(y), len(x)]. draw: selects the noise."""
     from app.generate import _kernels_noise as kernels
 
     kernel = kernels.perlin2 if fractal.kind == "perlin" else kernels.simplex2
@@ -44,7 +44,7 @@ def noise2(x: Array, y: Array, fractal: Fractal, draw: np.random.Generator) -> A
 
 
 def noise3(x: Array, y: Array, z: Array, fractal: Fractal, draw: np.random.Generator) -> Array:
-    """Values from -1 to 1 at all points of three axes: float64 [len(z), len(y), len(x)]."""
+    """Return values from -1 to 1 at all points of three axes: float64 [len(z), len(y), len(x)]."""
     from app.generate import _kernels_noise as kernels
 
     kernel = kernels.perlin3 if fractal.kind == "perlin" else kernels.simplex3
@@ -55,7 +55,7 @@ def noise3(x: Array, y: Array, z: Array, fractal: Fractal, draw: np.random.Gener
 
 
 def _octaves(fractal: Fractal, draw: np.random.Generator) -> list[tuple[float, float, list[float], NDArray[np.uint8]]]:
-    """(points' scale, strength, where it begins, permutation) of each octave: none shares its lattice with another."""
+    """Yield (scale, amplitude, offset, permutation) of each octave: none shares its lattice with another."""
     out = []
     for k in range(fractal.octaves):
         order = np.argsort(draw.random(256), kind="stable").astype(np.uint8)

@@ -1,7 +1,7 @@
 """Plants for sites: species as L-systems, grown into meshes that simulators show.
 
-A plant is a mesh of wood (branches as tapering prisms) and one of green (leaves), in OBJ, which nothing collides with,
-and a cylinder that robots do collide with: its trunk, or of a bush nearly all of it. Sites call ``grow_plants`` for a
+A plant consists of a mesh of wood (branches as tapering prisms) and one of green (leaves), in OBJ and without
+collision, and a cylinder that robots collide with: its trunk, or almost all of a bush. Sites call ``grow_plants`` for a
 few plants of a species and place them scaled and turned as often as they like.
 """
 
@@ -22,15 +22,15 @@ Array = NDArray[np.float64]
 
 MAX_VARIANTS = 16
 VERTEX_DECIMALS = 4
-"""Decimals of a metre that are kept of a mesh's vertices: it hides the last bits of a machine's sine, and no twig."""
+"""Decimals of a metre of a mesh's vertices: coarse enough to hide the last bits of a machine's sine, fine for twigs."""
 
 MIN_BRANCH_METRES = 0.001
-"""Radius in metres of the thinnest twig that is drawn."""
+"""Radius of the thinnest drawn twig in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Species:
-    """A kind of plant. rules and iterations: its L-system. body: what of it a robot collides with."""
+    """Species of plant. rules and iterations: its L-system. body: the part that a robot collides with."""
 
     kind: str
     rules: str
@@ -94,16 +94,15 @@ SPECIES: Mapping[str, Species] = {
     "bush": Species("bush", BUSH, 12, "crown"),
     "pine": Species("tree", PINE, 22),
 }
-"""The species that sites know, in sizes as they stand: a spindle of 3 m, a vine of 1.7 m, a bush of 1 m, a pine of
-7 m."""
+"""Species that sites can use, in natural sizes: a spindle of 3 m, a vine of 1.7 m, a bush of 1 m, a pine of 7 m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """A grown plant with its root at the origin, metres.
+    """Grown plant with its root at the origin, in metres.
 
     files: its meshes by path among the resources. body: radius and height of the cylinder that robots collide with.
-    height: of its top; spread: how far it reaches from its stem.
+    height: of its top. spread: its maximum distance from the stem.
     """
 
     name: str
@@ -115,7 +114,7 @@ class Plant:
     meshes: tuple[tuple[str, tuple[float, float, float]], ...]
 
     def shapes(self, scale: float = 1.0) -> list[dict[str, Any]]:
-        """The plant's solids (``app.model.solids``), ``scale`` times its size: the cylinder, then what is only seen."""
+        """Return the plant's solids (``app.model.solids``), scaled: the cylinder, then the visual shapes."""
         radius, length = (round(v * scale, 3) for v in self.body)
         pose = [0.0, 0.0, round(length / 2, 4), 0.0, 0.0, 0.0]
         out: list[dict[str, Any]] = [
@@ -128,7 +127,7 @@ class Plant:
 
 
 def grow_plants(species: str, count: int, source: RandomSource) -> list[Plant]:
-    """So many different plants of a species of ``SPECIES``; the same for the same source."""
+    """Grow a number of different plants of a species of ``SPECIES``; the same for the same random source."""
     plant_species = SPECIES[species]
     system = _lsystem.parse(plant_species.rules)
     budget = _lsystem.Budget()
@@ -150,12 +149,12 @@ def grow(
     length: float = 0.1,
     radius: float = 0.01,
 ) -> Plant:
-    """A plant of an L-system. name: of its folder. CannotGenerate where the system explodes or draws nothing."""
+    """Grow a plant of an L-system. name: of its directory. Raises CannotGenerate if it explodes or draws nothing."""
     symbols = _lsystem.expand(system, species.iterations, chance, budget)
     drawing = _lsystem.draw(symbols, angle=angle, length=length, radius=radius)
     if not drawing.branches:
-        problem = "the L-system draws no branch: there is no F after its rounds"
-        raise CannotGenerate(f"{problem}; give more rounds, or draw in its rules", [Problem(problem, where="rules")])
+        problem = "the L-system draws no branch: its result contains no F"
+        raise CannotGenerate(f"{problem}; use more rounds, or draw in its rules", [Problem(problem, where="rules")])
     wood = _prisms(drawing.branches)
     green = _blades(drawing.leaves)
     fruit = _balls(drawing.fruit)
@@ -187,7 +186,7 @@ _NONE: Array = np.empty((0, 3, 3))
 
 
 def _prisms(branches: Sequence[Any]) -> Array:
-    """Branches as closed tapering prisms of 3, 5 or 8 sides: float64 [n, 3, 3], counter-clockwise from outside."""
+    """Return branches as closed tapering prisms of 3, 5 or 8 sides: float64 [n, 3, 3], outside counter-clockwise."""
     if not branches:
         return _NONE
     start, end, left, up = (np.array([b[k] for b in branches], np.float64) for k in (0, 1, 4, 5))
@@ -205,7 +204,7 @@ def _prisms(branches: Sequence[Any]) -> Array:
             continue
         turn = [2.0 * math.pi * k / sides for k in range(sides)]
         around = np.array([(round(math.cos(a), 12), round(math.sin(a), 12)) for a in turn])
-        # From left to up it turns counter-clockwise, seen from the tip.
+        # from left to up is counter-clockwise, seen from the tip
         rim = left[chosen, None] * around[None, :, :1] + up[chosen, None] * around[None, :, 1:]
         low = start[chosen, None] + rim * radii[chosen, None, None, 0]
         high = end[chosen, None] + rim * radii[chosen, None, None, 1]
@@ -219,7 +218,7 @@ def _prisms(branches: Sequence[Any]) -> Array:
 
 
 def _blades(leaves: Sequence[Any]) -> Array:
-    """Leaves as rhombs, seen from both sides."""
+    """Return leaves as rhombs, visible from both sides."""
     if not leaves:
         return _NONE
     at, heading, left = (np.array([leaf[k] for leaf in leaves], np.float64) for k in (0, 1, 2))
@@ -231,7 +230,7 @@ def _blades(leaves: Sequence[Any]) -> Array:
 
 
 def _balls(fruit: Sequence[Any]) -> Array:
-    """Fruit as octahedra that hang from their place."""
+    """Return fruit as octahedra that hang from their position."""
     if not fruit:
         return _NONE
     radius = np.array([f[1] for f in fruit], np.float64)[:, None, None, None]
@@ -247,14 +246,14 @@ def _balls(fruit: Sequence[Any]) -> Array:
 
 
 def _round_triangles(triangles: Array) -> Array:
-    """To a tenth of a millimetre; triangles that have no area then are left out."""
+    """Round to a tenth of a millimetre; triangles without area are dropped."""
     out = np.round(triangles, VERTEX_DECIMALS) + 0.0
     normal = np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0])
     return np.asarray(out[(normal != 0).any(axis=1)], np.float64)
 
 
 def obj(triangles: Array, name: str) -> bytes:
-    """Triangles float64 [n, 3, 3] as an OBJ file, equal corners once."""
+    """Write triangles float64 [n, 3, 3] as an OBJ file, equal vertices once."""
     fine = np.round(triangles.reshape(-1, 3) * 10**VERTEX_DECIMALS).astype(np.int64)
     corners, index = np.unique(fine, axis=0, return_inverse=True)
     index = index.reshape(-1, 3) + 1
@@ -265,12 +264,12 @@ def obj(triangles: Array, name: str) -> bytes:
 
 
 def _decimal(steps: int) -> str:
-    """A whole number of the finest steps, in metres and without needless zeros."""
+    """Write an integer of the finest steps in metres, without trailing zeros."""
     sign, steps = ("-", -steps) if steps < 0 else ("", steps)
     integer, rest = divmod(steps, 10**VERTEX_DECIMALS)
     return f"{sign}{integer}.{rest:0{VERTEX_DECIMALS}d}".rstrip("0").rstrip(".")
 
 
 def mesh_files(plants: Iterable[Plant]) -> dict[str, bytes]:
-    """The meshes of all these plants: what ``Resources`` of a site hold."""
+    """Return the meshes of all these plants: the content of a site's ``Resources``."""
     return {path: data for plant in plants for path, data in sorted(plant.files.items())}

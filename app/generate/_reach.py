@@ -1,4 +1,4 @@
-"""Where a robot gets: the free space of a grid, the room along lines, the nodes that are reached."""
+"""Reach of a robot: the free space of a grid, the clearance along lines, the reachable nodes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from app.model.raster import RasterFrame
 Array = NDArray[np.float64]
 
 MAX_CLEARANCE_METRES = 20.0
-"""Metres of free width beyond which an edge is not looked at."""
+"""Maximum free width in metres that is measured."""
 
 
 def keep_largest_space(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
-    """Cells of which only the largest piece of free ones (joined by their sides) is free, the others unknown; and how
-    many these were."""
+    """Keep the largest piece of free cells (joined by their sides); set others to unknown and return their number."""
     import cv2
 
     free = cells == FREE
@@ -36,10 +35,10 @@ def keep_largest_space(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int
 
 
 def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArray[np.bool_]:
-    """Which lines and points (metres) a robot of a radius can take: bool [n].
+    """Return which lines and points (metres) a robot of a radius can follow: bool [n].
 
-    Every cell that it touches lies in the grid, and farther than the radius from any that is not free, middle to
-    middle: it is outside of the inflated obstacles. The grid's yaw is 0.
+    Every cell on them is in the grid, and farther than the radius from any cell that is not free, between centres: it
+    is outside of inflated obstacles. The grid's yaw is 0.
     """
     import cv2
 
@@ -51,7 +50,7 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
     good = np.ones(len(lines), bool)
     outside = ((cells < 0) | (cells > [grid.width, grid.height])).any(axis=1)
     good[owner[outside]] = False
-    # Consecutive vertices, and each vertex with itself, so that points count too.
+    # consecutive vertices, and each vertex with itself, so that points count too
     same = owner[1:] == owner[:-1]
     edges = np.concatenate([np.stack([at[:-1], at[1:]], axis=1)[same], np.stack([at, at], axis=1)])
     number = np.concatenate([owner[:-1][same], owner])
@@ -63,9 +62,9 @@ def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArra
 
 
 def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
-    """Metres of free width along lines, at most MAX_CLEARANCE_METRES: float64 [n].
+    """Return the free width along lines in metres, at most MAX_CLEARANCE_METRES: float64 [n].
 
-    That is twice the distance to the nearest cell that is not free, rounded down to centimetres.
+    It is twice the distance to the nearest cell that is not free, rounded down to centimetres.
     """
     out = np.full(len(lines), MAX_CLEARANCE_METRES)
     if not len(lines):
@@ -85,7 +84,7 @@ def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
 
 
 def unreachable_nodes(names: Sequence[str], edges: Iterable[tuple[str, str]]) -> list[str]:
-    """The nodes to which no way leads from the first one."""
+    """Return the nodes that no path reaches from the first one."""
     following: dict[str, list[str]] = {name: [] for name in names}
     for a, b in edges:
         following[a].append(b)

@@ -1,11 +1,11 @@
-"""What all sites share: from a fence, solids, marks and a network to layers that agree with each other.
+"""Site builder: from a fence, solids, marks and a network to layers that agree with each other.
 
-A generator puts objects with their solids, nodes, edges, zones and coloured ground into a ``Site``; ``finish`` makes of
-it the location, the objects, the grid (the slice of these very solids), the network, the zones and a picture seen from
-above, and refuses what does not fit together. Metres of the local frame everywhere; heights too are those of the local
-frame, so what stands on a level begins at that level's elevation.
+A generator adds objects with their solids, nodes, edges, zones and coloured ground to a ``Site``; ``finish`` creates
+the location, the objects, the grid (the slice of these very solids), the network, the zones and an image seen from
+above, and rejects contradictions. All coordinates are metres of the local frame, heights too: objects on a level start
+at that level's elevation.
 
-Numbers that are kept are whole millimetres and microradians: the last bit of a sine differs between machines.
+Stored numbers are whole millimetres and microradians, because the last bit of a sine differs between machines.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from app.parameters import parameter
 Array = NDArray[np.float64]
 
 NAME = "generated"
-"""The family of the objects and files of a site."""
+"""Family of the objects and files of a site."""
 
 PICTURE = "satellite"
 
 DATUM = Datum(latitude=52.4205, longitude=5.6132)
-"""Where a site lies when nobody says so: farmland in Flevoland, the Netherlands."""
+"""Default datum of a site: farmland in Flevoland, the Netherlands."""
 
 HEIGHT = 0.2
 RESOLUTIONS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 DEFAULT_MAX_CELLS = 2**22
-"""Cells of a grid, and pixels of a picture, up to which the finest of these is taken unless asked otherwise."""
+"""Maximum number of cells of a grid, and pixels of an image, at the finest default resolution."""
 
 SLACK = 1.5
-"""Cells by which a way and an obstacle may come nearer to each other in a grid than they are."""
+"""Margin in cells by which discretisation brings a path and an obstacle closer together."""
 
 MAX_NODES = 20_000
 
@@ -86,7 +86,7 @@ COLOURS: Mapping[str, tuple[int, int, int]] = {
     "water": (82, 122, 150),
     "furniture": (150, 120, 92),
 }
-"""What a picture is painted with: red, green, blue."""
+"""Colours of the image: red, green, blue."""
 
 _NUMBER = {name: k for k, name in enumerate(COLOURS)}
 
@@ -103,19 +103,19 @@ class SiteOptions:
         unit="°",
     )
     robot_radius: float = parameter(
-        0.3, "of the largest robot: no edge comes nearer to an obstacle", minimum=0.05, maximum=5.0, unit="m"
+        0.3, "radius of the largest robot; edges keep this distance from obstacles", minimum=0.05, maximum=5.0, unit="m"
     )
     height: float = parameter(
         HEIGHT,
-        "height above the floor at which the grid is the slice of the world",
+        "height above the floor of the slice that becomes the grid",
         minimum=0.01,
         maximum=3.0,
         unit="m",
     )
     resolution: float | None = parameter(
         None,
-        f"metres a cell; default: {RESOLUTIONS[0]}, or coarser where a grid would have more than 2^22 cells and "
-        "still shows the ways",
+        f"size of a cell; default: {RESOLUTIONS[0]}, or coarser if a grid would have more than 2^22 cells and still "
+        "shows the paths",
         minimum=0.01,
         maximum=2.0,
         unit="m",
@@ -123,20 +123,20 @@ class SiteOptions:
 
 
 def rgb(colour: str) -> list[float]:
-    """A colour of COLOURS as shapes have it."""
+    """Return a colour of COLOURS as in shapes."""
     return [round(v / 255, 3) for v in COLOURS[colour]]
 
 
 def invalid_option_error(where: str, problem: str) -> CannotGenerate:
-    """The error for one parameter."""
+    """Return the error for one parameter."""
     return CannotGenerate(f"{where}: {problem}", [Problem(problem, where=where)])
 
 
 class Site:
-    """A site on its way to layers.
+    """Site under construction.
 
-    datum: where it lies. fence: the polygon within which it lies (metres), the environment's or the generator's own;
-    is_given tells which, once ``set_fence`` was called. coloured: solids that say no colour have their object's.
+    datum: its position. fence: the polygon that contains it (metres), the environment's or the generator's own;
+    is_given states which, after ``set_fence``. coloured: solids without colour have their object's.
     """
 
     def __init__(
@@ -167,10 +167,10 @@ class Site:
     # --- the ground --------------------------------------------------------------------------------------------------
 
     def set_fence(self, area: Any, *, room: float = math.inf) -> Any:
-        """The fence: the environment's where it has one (the largest of several polygons), else ``area``.
+        """Set the fence: the environment's if there is one (the largest of several polygons), else ``area``.
 
-        area: a polygon in metres. room: metres between a robot on its way and what stands beside it, at the narrowest:
-        the cells are fine enough to show it. Raises CannotGenerate where a grid of it would be too large.
+        area: a polygon in metres. room: minimum distance in metres between a robot on its path and objects beside it:
+        the cells are fine enough to show it. Raises CannotGenerate if a grid of it would be too large.
         """
         self._room = room
         stored_fence = fences(self.given, self.notes.warn).get(GROUND)
@@ -178,7 +178,7 @@ class Site:
             pieces = [p for p in shapely.get_parts(stored_fence) if p.geom_type == "Polygon"]
             pieces.sort(key=lambda p: (-p.area, *p.bounds))
             if len(pieces) > 1:
-                self.notes.drop("polygons of the fence", len(pieces) - 1, "the site lies in the largest one")
+                self.notes.drop("polygons of the fence", len(pieces) - 1, "the site is in the largest one")
             self.fence, self.is_given = pieces[0], True
         else:
             self.fence = shapely.orient_polygons(round_geometry(area))
@@ -187,7 +187,7 @@ class Site:
 
     @property
     def resolution(self) -> float:
-        """Metres a cell. CannotGenerate where there would be too many cells."""
+        """Return the cell size in metres. Raises CannotGenerate if there would be too many cells."""
         box = self.fence.bounds
         easy = next((r for r in RESOLUTIONS if _cells(box, r) <= DEFAULT_MAX_CELLS), RESOLUTIONS[-1])
         fine = max((r for r in RESOLUTIONS if SLACK * r <= self._room + 1e-9), default=RESOLUTIONS[0])
@@ -196,16 +196,16 @@ class Site:
             side = f"{box[2] - box[0]:.0f} × {box[3] - box[1]:.0f} m"
             raise invalid_option_error(
                 "resolution",
-                f"{side} on {len(self.levels)} levels would be more than {MAX_CELLS} cells of {size:g} m: ask for a "
+                f"{side} on {len(self.levels)} levels would be more than {MAX_CELLS} cells of {size:g} m: use a "
                 "coarser resolution or a smaller site",
             )
         return size
 
     def draw(self, shape: Any, colour: str, *, level: str = GROUND) -> None:
-        """Paint ground on the picture, over what is there already. shape: polygons or lines."""
+        """Paint ground in the image, over previous paint. shape: polygons or lines."""
         self._ground.setdefault(level, []).append((_NUMBER[colour], _coordinates_list(shape)))
 
-    # --- what stands there -------------------------------------------------------------------------------------------
+    # --- objects ----------------------------------------------------------------------------------------------------
 
     def add_object(
         self,
@@ -221,10 +221,10 @@ class Site:
         family: str = NAME,
         **words: Any,
     ) -> None:
-        """An object. shapes: its solids (``app.model.solids``), in the frame of its pose (x, y, z, yaw).
+        """Add an object. shapes: its solids (``app.model.solids``), in the frame of its pose (x, y, z, yaw).
 
-        colour: of its geometry in the picture, or of ``seen`` where that is another one (a crown over a trunk).
-        family: the name of its part, for formats that look among their own (walls, doors and lifts: ``openrmf``).
+        colour: of its geometry in the image, or of ``seen`` if that differs (a crown over a trunk). family: the name of
+        its part, for formats that read only their own (walls, doors and lifts: ``openrmf``).
         """
         self._count += 1
         if self._count > MAX_OBJECTS:
@@ -253,7 +253,7 @@ class Site:
         level: str = GROUND,
         **words: Any,
     ) -> None:
-        """A box on the ground: at (x, y) its middle, size (x, y, z), base metres above the level's floor."""
+        """Add a box on the ground: centre (x, y), size (x, y, z), base in metres above the level's floor."""
         x, y, z = (mm(v) for v in size)
         shape: dict[str, Any] = {"type": "box", "size": [x, y, z], "pose": [0.0, 0.0, mm(z / 2), 0.0, 0.0, 0.0]}
         self.add_object(
@@ -278,7 +278,7 @@ class Site:
         level: str = GROUND,
         **words: Any,
     ) -> None:
-        """An upright cylinder on the ground at (x, y)."""
+        """Add an upright cylinder on the ground at (x, y)."""
         r, h = mm(radius), mm(height)
         shape = {"type": "cylinder", "radius": r, "length": h, "pose": [0.0, 0.0, mm(h / 2), 0.0, 0.0, 0.0]}
         point = shapely.Point(at[0], at[1])
@@ -287,23 +287,23 @@ class Site:
         self.add_object(i, kind, point, shapes=[shape], pose=pose, level=level, **words)
 
     def mark(self, i: str, kind: str, geometry: Any, *, level: str = GROUND, **words: Any) -> None:
-        """Something without a body: a region, a point of interest."""
+        """Add an object without a body: a region, a point of interest."""
         self.add_object(i, kind, geometry, level=level, **words)
 
     def zone(self, i: str, kind: str, polygon: Any, *, level: str = GROUND, **words: Any) -> None:
-        """A zone: keepout, speed …"""
+        """Add a zone: keepout, speed …"""
         self._zones.setdefault(level, []).append((i, round_geometry(polygon), {"kind": kind, **words}))
 
     def elevation(self, level: str) -> float:
-        """Metres of a level's floor."""
+        """Return the elevation of a level's floor in metres."""
         return next(candidate.elevation for candidate in self.levels if candidate.name == level)
 
     # --- the network -------------------------------------------------------------------------------------------------
 
     def node(self, name: str, at: Sequence[float], *, yaw: float = 0.0, level: str = GROUND, **words: Any) -> str:
-        """A node under its name, which is its id."""
+        """Add a node; its name is its id."""
         if name in self._nodes or name in self._edges:
-            raise ValueError(f"two nodes are called {name}")
+            raise ValueError(f"duplicate node name {name!r}")
         if len(self._nodes) >= MAX_NODES:
             raise CannotGenerate(f"the network has more than {MAX_NODES} nodes: make the site smaller")
         properties = {"kind": "node", "name": name, "orientation": orientation(yaw), **words}
@@ -321,32 +321,34 @@ class Site:
         bends: Sequence[Sequence[float]] = (),
         **words: Any,
     ) -> None:
-        """An edge from a to b, and one back; bends: points between. Where the levels differ it is a lift or stairs,
-        and no grid is asked."""
+        """Add an edge from a to b, and one back. bends: points between.
+
+        Between levels it is a lift or stairs, and is not checked against a grid.
+        """
         at = [self._nodes[a][1], *((mm(x), mm(y)) for x, y in bends), self._nodes[b][1]]
         for source, target, line in ((a, b, at), (b, a, at[::-1])) if both else ((a, b, at),):
             i = f"{source}_{target}"
             if i in self._edges or i in self._nodes:
-                raise ValueError(f"two edges are called {i}")
+                raise ValueError(f"duplicate edge id {i!r}")
             properties: dict[str, Any] = {"kind": "edge", "source": source, "target": target, "action": action, **words}
             if speed is not None:
                 properties["speed_limit"] = speed
             self._edges[i] = (source, target, shapely.LineString(line), properties)
 
     def position(self, name: str) -> tuple[float, float]:
-        """Where a node stands."""
+        """Return the position of a node."""
         return self._nodes[name][1]
 
-    # --- all of it together ------------------------------------------------------------------------------------------
+    # --- result -----------------------------------------------------------------------------------------------------
 
     def finish(self, *, ground: str = "grass") -> Layers:
-        """The layers. ground: colour of what nothing was painted on.
+        """Return the layers. ground: colour of unpainted ground.
 
-        Raises CannotGenerate where nothing stands in a robot's way at the height of the slice. An edge that no robot
-        can take, or a node that cannot be reached, is a mistake of the generator: RuntimeError.
+        Raises CannotGenerate if there is no obstacle at the height of the slice. An edge that a robot cannot follow, or
+        a node that cannot be reached, is an error of the generator: RuntimeError.
         """
         if self.fence is None:
-            raise ValueError("bounded() was not called")
+            raise ValueError("call set_fence() first")
         parts: dict[PartKey, Part] = {k: p for k, p in self.given.parts.items() if k.layer == "location"}
         if not self.is_given:
             ring = [("fence", self.fence, {"kind": "fence"})]
@@ -378,10 +380,10 @@ class Site:
         return Layers(dict(sorted(parts.items())), self.datum, self.levels)
 
     def _grids(self, parts: Mapping[PartKey, Part]) -> dict[PartKey, Part]:
-        """The slice of the objects on each level, of which one connected piece stays free."""
+        """Return the slice of the objects on each level, of which one connected piece stays free."""
         resolution = self.resolution
         if self.options.resolution is None and resolution != RESOLUTIONS[0]:
-            why = f"{RESOLUTIONS[0]} m would be more than {DEFAULT_MAX_CELLS} cells; a finer one can be asked for"
+            why = f"{RESOLUTIONS[0]} m would be more than {DEFAULT_MAX_CELLS} cells; a finer one can be set"
             self.notes.fill("resolution", resolution, why)
         grid_parameters = Parameters(height=self.options.height, resolution=resolution)
         grid_notes = DerivationNotes()
@@ -400,9 +402,7 @@ class Site:
             cells, closed = keep_largest_space(grid.cells)
             if closed:
                 area = round(closed * grid.resolution**2, 2)
-                self.notes.drop(
-                    "free cells", closed, f"{area:g} m² that no way leads to count as unknown on {key.level}"
-                )
+                self.notes.drop("free cells", closed, f"{area:g} m² on {key.level} cannot be reached; they are unknown")
             properties = {"slice": {"of": "objects", "height": self.options.height}}
             out[PartKey("occupancy", key.level, MAP)] = OccupancyGrid(
                 cells, grid.resolution, grid.origin, properties=properties
@@ -410,7 +410,7 @@ class Site:
         return out
 
     def _below_height(self, part: Features, z: float) -> Features:
-        """The objects without the solids that do not reach a height: crowns above a slice are most of a forest."""
+        """Return the objects without solids that do not reach a height: crowns above a slice are most of a forest."""
         solid_reader = solids.Solids(self.files)
         radii: dict[str, float] = {}
         rows: list[int] = []
@@ -430,7 +430,7 @@ class Site:
         return Features(tuple(part.ids[k] for k in rows), part.geometry[index], tuple(properties), part.local[index])
 
     def _check_zones(self) -> None:
-        """No edge leads through a keep-out zone."""
+        """Check that no edge leads through a keep-out zone."""
         for level, rows in self._zones.items():
             shut = [polygon for _, polygon, properties in rows if properties["kind"] == "keepout"]
             level_edges = [(i, e[2]) for i, e in self._edges.items() if self._nodes[e[0]][0] == level]
@@ -441,13 +441,16 @@ class Site:
                     raise RuntimeError(f"the edge {level_edges[int(hits[0])][0]} leads through a keep-out zone")
 
     def _check_edges(self, grids: Mapping[PartKey, Part]) -> dict[str, float]:
-        """Metres of free width of each edge. RuntimeError where a robot cannot take one, or come to a node."""
+        """Return the free width of each edge in metres.
+
+        Raises RuntimeError if a robot cannot follow one, or cannot reach a node.
+        """
         edges = [(a, b) for a, b, _, _ in self._edges.values()]
         for start, directed in ((0, edges), (1, [(b, a) for a, b in edges])):
             lost = unreachable_nodes(list(self._nodes), directed)
             if lost:
                 direction = "to" if start == 0 else "from"
-                raise RuntimeError(f"no way leads {direction} {len(lost)} of the nodes, as {', '.join(lost[:5])}")
+                raise RuntimeError(f"no path {direction} {len(lost)} of the nodes, such as {', '.join(lost[:5])}")
         out: dict[str, float] = {}
         for key, grid in grids.items():
             if not isinstance(grid, OccupancyGrid):
@@ -464,7 +467,7 @@ class Site:
         return out
 
     def _picture(self, level: str, ground: str) -> GeoImage:
-        """The level from above."""
+        """Paint the level from above."""
         box = self.fence.bounds
         resolution = next((r for r in RESOLUTIONS if _cells(box, r) <= DEFAULT_MAX_CELLS), RESOLUTIONS[-1])
         frame = RasterFrame.from_box(box, resolution)
@@ -489,23 +492,25 @@ def _cells(box: Sequence[float], resolution: float) -> float:
 
 
 def _datum(given: Layers, options: SiteOptions, notes: DerivationNotes) -> Datum:
-    """The environment's datum, else the one asked for, else DATUM."""
+    """Return the environment's datum, else the requested one, else DATUM."""
     option_datum = None if options.datum is None else Datum(options.datum[0], options.datum[1])
     if given.datum is not None:
         if option_datum is not None and (option_datum.latitude, option_datum.longitude) != (
             given.datum.latitude,
             given.datum.longitude,
         ):
-            reason = "the environment has a datum already: leave this out, or change the datum with PATCH"
+            reason = "the environment already has a datum: omit this, or change the datum with PATCH"
             raise Invalid(f"datum: {reason}", [Problem(reason, where="datum")])
         return given.datum
     if option_datum is None:
-        notes.fill("datum", DATUM.as_dict(), "neither the environment nor the parameter datum says where the site is")
+        notes.fill(
+            "datum", DATUM.as_dict(), "neither the environment nor the parameter datum states the site's position"
+        )
     return option_datum or DATUM
 
 
 def _reaches(shape: Mapping[str, Any], z: float, solid_reader: solids.Solids, radii: dict[str, float]) -> bool:
-    """Whether a shape may reach a height of its object's frame, whose z axis is upright: never False where it does."""
+    """Return whether a shape may reach a height in its object's frame (z upright); never False if it does."""
     kind = shape["type"]
     if kind == "box":
         radius = math.hypot(*shape["size"]) / 2
@@ -527,12 +532,12 @@ def _coordinates_list(shape: Any) -> list[Any]:
 
 
 def _plain(shape: Mapping[str, Any]) -> dict[str, Any]:
-    """A shape without a pose that says nothing."""
+    """Return whether a shape has no pose, or a neutral one."""
     return {key: value for key, value in shape.items() if key != "pose" or any(value)}
 
 
 def _runs(rows: Iterable[tuple[int, list[Any]]]) -> Iterable[tuple[int, list[Any]]]:
-    """Consecutive shapes of one colour together."""
+    """Group consecutive shapes of one colour."""
     current: tuple[int, list[Any]] | None = None
     for number, shapes in rows:
         if current is not None and current[0] == number:

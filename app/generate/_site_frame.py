@@ -1,4 +1,4 @@
-"""Where a site of a given size lies: at the origin, or inside the fence that its environment has."""
+"""Frame of a site of a given size: at the origin, or inside the environment's fence."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from app.generate._site import Site
 
 @dataclass(frozen=True, slots=True)
 class SiteFrame:
-    """The frame that a site was drawn in: its origin in local metres and its turn. sine, cosine: of the turn, rounded,
-    so that every machine puts everything at the same place."""
+    """Frame in which a site was drawn: its origin in local metres and its rotation.
+
+    sine, cosine: of the rotation, rounded, so that every machine gives the same positions.
+    """
 
     x: float = 0.0
     y: float = 0.0
@@ -26,11 +28,11 @@ class SiteFrame:
     cosine: float = 1.0
 
     def to_local(self, u: float, v: float) -> tuple[float, float]:
-        """Local metres of a drawn place."""
+        """Convert a drawn position to local metres."""
         return mm(self.x + self.cosine * u - self.sine * v), mm(self.y + self.sine * u + self.cosine * v)
 
     def geometry_to_local(self, geometry: Any) -> Any:
-        """A drawn geometry in local metres."""
+        """Convert a drawn geometry to local metres."""
         turn = np.array([[self.cosine, self.sine], [-self.sine, self.cosine]])
 
         def moved(xy: Any) -> Any:
@@ -41,11 +43,11 @@ class SiteFrame:
 
 
 def place_site(site: Site, width: float, depth: float, margin: float, room: float = math.inf) -> SiteFrame:
-    """Bound the site to a rectangle of this size and a margin around it, or put it into the fence that is given.
+    """Bound the site to a rectangle of this size with a margin around it, or place it into the given fence.
 
-    room: metres beside a robot at the narrowest (``Site.bounded``). The drawn rectangle reaches from (0, 0) to (width,
-    depth). In a given fence it lies along the fence's longer side where it fits, else across it or along the axes.
-    CannotGenerate where the fence has no room for it.
+    room: minimum distance in metres beside a robot (``Site.set_fence``). The drawn rectangle extends from (0, 0) to
+    (width, depth). In a given fence it is along the fence's longer side if it fits, else across it or along the axes.
+    Raises CannotGenerate if the fence has no room for it.
     """
     outline = shapely.box(-margin, -margin, width + margin, depth + margin)
     fence = site.set_fence(outline, room=room)
@@ -66,7 +68,7 @@ def place_site(site: Site, width: float, depth: float, margin: float, room: floa
 
 
 def _turns(fence: Any) -> list[float]:
-    """Directions to try: along the fence's longer side, across it, and the axes."""
+    """Yield directions to try: along the fence's longer side, across it, and the axes."""
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(fence))
     if len(corners) < 4:
         return [0.0]
@@ -78,7 +80,7 @@ def _turns(fence: Any) -> list[float]:
 
 
 def _middles(fence: Any) -> list[tuple[float, float]]:
-    """Places to try for the middle: the fence's own, and that of the largest circle in it."""
+    """Yield positions to try for the centre: the fence's own, and that of the largest circle in it."""
     circle = shapely.maximum_inscribed_circle(fence, tolerance=0.5)
     box = shapely.minimum_rotated_rectangle(fence)
     points = [shapely.centroid(box), shapely.centroid(fence), shapely.Point(shapely.get_coordinates(circle)[0])]

@@ -1,4 +1,4 @@
-"""Storeys of rooms along corridors: how wide the rooms are, their doors, the network, the zones."""
+"""Storeys of rooms along corridors: widths of rooms, doors, the network, the zones."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from app.model.layers import Layers
 from app.parameters import parameter
 
 RASTER = 0.8
-"""Metres: doors on both sides of the corridor stand on multiples of it, so that they face each other or stand apart."""
+"""Raster of door positions in metres: doors on both sides of the corridor either face each other or are apart."""
 
 ENTRANCE = 0.3
-"""Metres by which the entrance is at least narrower than the corridor."""
+"""Minimum difference in metres by which the entrance is narrower than the corridor."""
 
 APRON = 5.0
-"""Metres of paved ground before the entrance."""
+"""Depth of the paved ground before the entrance, in metres."""
 
 LOWEST = 2.4
 MAX_ROOMS = 5000
@@ -40,10 +40,10 @@ Furnish = Callable[[Furniture, Room, np.random.Generator], None]
 """Puts the things of a room into it."""
 
 Kinds = Callable[[int, int, list[float], np.random.Generator], list[str]]
-"""(level from 0, side, widths of the rooms, chance) -> what each room is."""
+"""Signature (level from 0, side, widths of the rooms, random generator) -> kind of each room."""
 
 NodeOf = Callable[[Room], tuple[float, float]]
-"""Where in a room its node stands: metres along and inward."""
+"""Signature for the position of a room's node: metres along and inward."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,17 +77,19 @@ def _measures(options: BuildingOptions) -> Storeys:
 
 
 def check(measures: Storeys, radius: float) -> None:
-    """Measures that do not go together are told before any work."""
+    """Check measures that exclude each other, before any work."""
     if measures.least > measures.most:
-        raise invalid_option_error("room_width", "the smaller width comes first")
+        raise invalid_option_error("room_width", "the smaller width must come first")
     if measures.least < measures.door + RASTER + 0.6:
         raise invalid_option_error(
-            "room_width", f"must be at least {measures.door + RASTER + 0.6:.2f} m, for a door to stand in it"
+            "room_width", f"must be at least {measures.door + RASTER + 0.6:.2f} m, to contain a door"
         )
     if measures.length < measures.least + 1.0:
         raise invalid_option_error("length", f"must be at least {measures.least + 1.0:.2f} m, for one room")
     if 2 * (measures.length / measures.least) * measures.levels > MAX_ROOMS:
-        raise CannotGenerate(f"the building would have more than {MAX_ROOMS} rooms: make it shorter, or rooms wider")
+        raise CannotGenerate(
+            f"the building would have more than {MAX_ROOMS} rooms: make it shorter, or its rooms wider"
+        )
     if measures.depth < 2 * radius + 2.0:
         raise invalid_option_error(
             "depth", f"rooms must be at least {2 * radius + 2.0:.2f} m deep, for a robot to turn"
@@ -97,7 +99,7 @@ def check(measures: Storeys, radius: float) -> None:
 
 
 def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
-    """Whether a robot passes the doors, once the grid's resolution is known."""
+    """Check that a robot passes the doors, with the known resolution of the grid."""
     need = 2 * radius + 2 * SLACK * site.resolution
     widths = {"door_width": measures.door, "corridor": measures.corridor - ENTRANCE}
     if measures.lift:
@@ -106,17 +108,17 @@ def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
         if width < need - 1e-9:
             label = {"robot_radius": "the lift's doors are", "corridor": "its entrance is"}.get(option, "it is")
             raise invalid_option_error(
-                option, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs {need:.2f} m here"
+                option, f"{label} {width:.3g} m wide; a robot of {radius:g} m needs at least {need:.2f} m"
             )
 
 
 def level_names(levels: int) -> list[str]:
-    """The names of a building's levels: the ground, then L2, L3 …"""
+    """Return the names of a building's levels: the ground, then L2, L3 …"""
     return [GROUND, *(f"L{k}" for k in range(2, levels + 1))]
 
 
 def building_levels(measures: Storeys) -> tuple[Level, ...]:
-    """The levels with their elevations."""
+    """Return the levels with their elevations."""
     return tuple(Level(name, mm(k * measures.height)) for k, name in enumerate(level_names(measures.levels)))
 
 
@@ -128,9 +130,9 @@ def build(
     kinds: Kinds,
     node_of: Callable[[Room], tuple[float, float]],
 ) -> Building:
-    """Shell, rooms, doors, lift and network of all levels. The rooms are still empty.
+    """Build shell, rooms, doors, lift and network of all levels; the rooms are still empty.
 
-    node_of: where in a room its node stands.
+    node_of: position of a room's node.
     """
     west = SHAFT if measures.lift else 0.0
     total, across = west + measures.length, 2 * measures.depth + measures.corridor
@@ -152,7 +154,7 @@ def build(
 
 
 def _storey(building: Building, k: int, level: str, west: float, chance: np.random.Generator, kinds: Kinds) -> None:
-    """Floor, walls, doors and rooms of one level."""
+    """Build floor, walls, doors and rooms of one level."""
     m, site = building.measures, building.site
     east, across = west + m.length, 2 * m.depth + m.corridor
     low, high = m.depth, m.depth + m.corridor
@@ -208,7 +210,7 @@ def _storey(building: Building, k: int, level: str, west: float, chance: np.rand
 
 
 def _widths(m: Storeys, chance: np.random.Generator) -> list[float]:
-    """Widths of the rooms along one side, together the corridor's length, in steps of a decimetre."""
+    """Draw widths of the rooms along one side; their sum is the corridor's length, in steps of a decimetre."""
     min_count, max_count = math.ceil(m.length / m.most - 1e-9), math.floor(m.length / m.least + 1e-9)
     if max_count < 1 or min_count > max_count:
         raise invalid_option_error(
@@ -217,7 +219,7 @@ def _widths(m: Storeys, chance: np.random.Generator) -> list[float]:
     count = int(chance.integers(min_count, max_count + 1))
     spare = m.length - count * m.least
     shares = chance.random(count) + 0.2
-    # What goes beyond the widest is given to the others.
+    # distribute what exceeds the maximum to the others
     extra = np.zeros(count)
     room = np.full(count, m.most - m.least)
     for _ in range(count):
@@ -233,7 +235,7 @@ def _widths(m: Storeys, chance: np.random.Generator) -> list[float]:
 
 
 def _door(low: float, high: float, used: Sequence[float]) -> float:
-    """A place for a door between two bounds, on the raster: where one stands opposite, else in the middle."""
+    """Choose a door position between two bounds, on the raster: opposite another door, else in the middle."""
     first, last = math.ceil(low / RASTER - 1e-9), math.floor(high / RASTER + 1e-9)
     places = [round(k * RASTER, 3) for k in range(first, last + 1)] or [round((low + high) / 2, 3)]
     facing = [at for at in places if at in used]
@@ -241,7 +243,7 @@ def _door(low: float, high: float, used: Sequence[float]) -> float:
 
 
 def _network(building: Building, k: int, level: str, west: float, node_of: NodeOf) -> None:
-    """The corridor's middle, and from it into each room and the lift."""
+    """Add the network: along the corridor, and from it into each room and the lift."""
     m, site, place = building.measures, building.site, building.place
     middle = m.depth + m.corridor / 2
     east = west + m.length
@@ -283,7 +285,7 @@ def _network(building: Building, k: int, level: str, west: float, node_of: NodeO
 
 
 def slow_zones(building: Building, speed: float = 0.5) -> None:
-    """Robots go slowly before the lift and at the entrance."""
+    """Add speed zones before the lift and at the entrance."""
     m, site, place = building.measures, building.site, building.place
     west = SHAFT if m.lift else 0.0
     low, high = m.depth, m.depth + m.corridor
@@ -302,7 +304,7 @@ def slow_zones(building: Building, speed: float = 0.5) -> None:
 
 
 def goal(room: Room, radius: float) -> tuple[float, float]:
-    """A room's node: straight in from the door, so that there is place for furniture on both sides."""
+    """Return a room's node: straight in from the door, so that furniture fits on both sides."""
     inward = max(radius + 0.9, 0.42 * room.depth)
     return room.door - room.box[0], min(inward, room.depth - radius - 0.5)
 
@@ -316,8 +318,11 @@ def build_site(
     furnish: Mapping[str, Furnish],
     charged: Callable[[int, Room], bool],
 ) -> Layers:
-    """A whole building with its network. kinds: see ``build``. furnish: by kind of room.
-    charged: whether a room (of the level of that number) has a charger for robots."""
+    """Build a complete building with its network.
+
+    kinds: see ``build``. furnish: adds a room's furniture; None: it stays empty. charged: whether a room (of the level
+    of that number) has a charger for robots.
+    """
     measures = _measures(options)
     check(measures, options.robot_radius)
     site = Site(given, options, notes, levels=building_levels(measures))

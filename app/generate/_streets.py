@@ -1,9 +1,10 @@
-"""Streets as a network: lanes that turn into each other at junctions, sidewalks around blocks, crossings between them.
+"""Streets as a network: lanes with turns at junctions, sidewalks around blocks, crossings between them.
 
-Traffic keeps to the right. A street between two junctions has a lane each way, in the middle of its half of the
-carriageway; from the end of each lane one may go on into every other lane that begins at the junction, and turn round
-only where the street ends. Sidewalks are ways around each block and along the town's edge, both ways; near junctions
-crossings join them over the street. At one place a sidewalk and a lane are joined, so that the network is one.
+Traffic keeps to the right. A street between two junctions has a lane in each direction, in the middle of its half of
+the carriageway; from the end of each lane edges lead into every other lane that begins at the junction; U-turns exist
+only at the end of a street. Sidewalks are paths around each block and along the town's edge, in both directions; near
+junctions crossings join them over the street. At one point a sidewalk and a lane are joined, so that the network is
+connected.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from app.generate._site import MAX_NODES, Site
 Point = tuple[float, float]
 
 DANGLE = 0.4
-"""Metres: pieces of a street beyond its last junction that are shorter come from rounding."""
+"""Length in metres below which pieces of a street beyond its last junction are rounding errors."""
 
 EXTEND = 0.05
 NODES = 8
-"""Nodes for each street between two junctions, about: ends of lanes and crossings, corners of blocks."""
+"""Approximate number of nodes per street between two junctions: ends of lanes and crossings, corners of blocks."""
 
 CORNER = math.radians(15.0)
 TOLERANCE = 1.0
@@ -38,7 +39,7 @@ TOLERANCE = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A street between two junctions. ends: numbers of its junctions; width: houses to houses."""
+    """Street between two junctions. ends: numbers of its junctions. width: between house fronts."""
 
     line: Any
     width: float
@@ -47,7 +48,7 @@ class Link:
 
 @dataclass(slots=True)
 class Loop:
-    """A sidewalk around a block. stops: (metres along it, name, place)."""
+    """Sidewalk around a block. stops: (metres along it, name, position)."""
 
     ring: Any
     stops: list[tuple[float, str, Point]] = field(default_factory=list)
@@ -55,26 +56,26 @@ class Loop:
 
 @dataclass(slots=True)
 class Streets:
-    """The streets of a town. junctions: their places; walk: width of a sidewalk."""
+    """Streets of a town. junctions: their positions. walk: width of a sidewalk."""
 
     links: list[Link]
     junctions: list[Point]
     walk: float
     loops: list[Loop] = field(default_factory=list)
     kept: list[Point] = field(default_factory=list)
-    """Places where nothing may stand: crossings and stops."""
+    """Return areas that must stay free of objects: crossings and stops."""
 
     def carriage(self, link: Link) -> float:
-        """Metres of a street between its sidewalks."""
+        """Return the width of a street between its sidewalks in metres."""
         return link.width - 2 * self.walk
 
     def links_at(self, junction: int) -> list[int]:
-        """The links at a junction; one that begins and ends there twice."""
+        """Return the links at a junction; a link that begins and ends there is listed twice."""
         return [k for k, link in enumerate(self.links) for end in link.ends if end == junction]
 
 
 def build_streets(streets: Sequence[Street], walk: float) -> Streets:
-    """Streets cut where they meet. walk: metres, at most a quarter of the narrowest street."""
+    """Cut streets at their intersections. walk: metres, at most a quarter of the narrowest street."""
     lines = [_longer(s.line) for s in streets]
     joined = shapely.line_merge(shapely.union_all(lines, grid_size=0.001))
     parts = [p for p in shapely.get_parts(joined) if p.geom_type == "LineString" and p.length > 0]
@@ -99,7 +100,7 @@ def build_streets(streets: Sequence[Street], walk: float) -> Streets:
 
 
 def _longer(line: Any) -> Any:
-    """Reaching a little beyond its ends, so that rounded ends still meet what they ended at."""
+    """Extend a line a little beyond its ends, so that rounded ends still meet the street at which they end."""
     at = shapely.get_coordinates(line)
     if (at[0] == at[-1]).all():
         return line
@@ -111,7 +112,7 @@ def _longer(line: Any) -> Any:
 
 
 def _trim(parts: list[Any]) -> list[Any]:
-    """Without short pieces that lead nowhere, and joined again where these were."""
+    """Remove short pieces that lead nowhere, and join the lines again at these points."""
     count = _ends(parts)
     remaining = [
         p for p in parts if p.length >= DANGLE or min(count[_as_point(c)] for c in (p.coords[0], p.coords[-1])) > 1
@@ -122,7 +123,7 @@ def _trim(parts: list[Any]) -> list[Any]:
 
 
 def _ends(parts: Sequence[Any]) -> dict[Point, int]:
-    """How many lines end at each place."""
+    """Count the lines that end at each point."""
     count: dict[Point, int] = {}
     for part in parts:
         for c in (part.coords[0], part.coords[-1]):
@@ -131,7 +132,7 @@ def _ends(parts: Sequence[Any]) -> dict[Point, int]:
 
 
 def _shorter(part: Any, count: dict[Point, int]) -> Any:
-    """Without what ``_longer`` added at ends that met nothing."""
+    """Remove the extensions of ``_longer`` at ends that met nothing."""
     free = [EXTEND if count[_as_point(c)] == 1 else 0.0 for c in (part.coords[0], part.coords[-1])]
     return substring(part, free[0], part.length - free[1]) if any(free) else part
 
@@ -145,9 +146,9 @@ def _as_point(c: Iterable[float]) -> Point:
 
 
 def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[tuple[str, Any]]]:
-    """Lanes and the ways through junctions. Of each link its lanes: (name of its first node, line).
+    """Add lanes and the paths through junctions; return for each link its lanes: (name of its first node, line).
 
-    keep: metres that ways through junctions stay away from kerbs.
+    keep: distance in metres of paths through junctions from kerbs.
     """
     inner = [
         shapely.buffer(link.line, max(0.05, streets.carriage(link) / 2 - keep), cap_style="square", join_style="mitre")
@@ -189,9 +190,9 @@ def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[
 
 
 def _turn(last: tuple[Point, Point], first: tuple[Point, Point], middle: Point, roadway: Any) -> list[Point]:
-    """Where a way through a junction bends: nowhere, where both lanes' directions meet, or in the junction's middle.
+    """Return the bend of a path through a junction: none if both lanes' directions meet, else the junction's centre.
 
-    last, first: where a lane ends and the next one begins, with their directions.
+    last, first: the end of a lane and the start of the next one, with their directions.
     """
     (ax, ay), (ux, uy) = last
     (bx, by), (vx, vy) = first
@@ -207,7 +208,7 @@ def _turn(last: tuple[Point, Point], first: tuple[Point, Point], middle: Point, 
 
 
 def _lane(streets: Streets, line: Any, start: int, end: int, off: float) -> Any:
-    """To the right of a link's middle, from one junction's edge to the next one's."""
+    """Return the line to the right of a link's centreline, from one junction's edge to the next one's."""
     long = line.length
     cuts = [min(_before(streets, junction) + 2.0, 0.35 * long) for junction in (start, end)]
     middle = substring(line, cuts[0], long - cuts[1])
@@ -224,7 +225,7 @@ def _lane(streets: Streets, line: Any, start: int, end: int, off: float) -> Any:
 
 
 def _before(streets: Streets, junction: int) -> float:
-    """Metres before a junction's middle at which its streets' crossings lie."""
+    """Return the distance in metres before a junction's centre of its streets' crossings."""
     widths = [streets.carriage(streets.links[k]) for k in streets.links_at(junction)]
     return max(widths) / 2 + streets.walk + 0.5 if len(widths) > 1 else 1.0
 
@@ -235,7 +236,7 @@ def _before(streets: Streets, junction: int) -> float:
 def sidewalks(
     site: Site, streets: Streets, blocks: Sequence[Any], edge: Any, speed: float, notes: DerivationNotes
 ) -> None:
-    """Ways around blocks and inside the town's edge (a polygon, or None), and crossings between them."""
+    """Add paths around blocks and inside the town's edge (a polygon, or None), and crossings between them."""
     areas = [shapely.buffer(block, streets.walk / 2, join_style="mitre", mitre_limit=2.0) for block in blocks]
     rings = [a.exterior for a in areas if a.geom_type == "Polygon"]
     if edge is not None:
@@ -266,7 +267,7 @@ def sidewalks(
 
 
 def _crossings(streets: Streets) -> list[tuple[int, Point, int, Point]]:
-    """(sidewalk, place, sidewalk, place) of each crossing."""
+    """Return (sidewalk, position, sidewalk, position) of each crossing."""
     if not streets.loops:
         return []
     tree = shapely.STRtree([loop.ring for loop in streets.loops])
@@ -283,7 +284,7 @@ def _crossings(streets: Streets) -> list[tuple[int, Point, int, Point]]:
 
 
 def _add_crossing(streets: Streets, link: Link, place: float, tree: Any) -> tuple[int, Point, int, Point] | None:
-    """A crossing at so many metres along a link; None where one side has no sidewalk there."""
+    """Return a crossing at this distance in metres along a link; None if one side has no sidewalk there."""
     ahead: Any = shapely.line_interpolate_point(link.line, place + 0.25)
     behind: Any = shapely.line_interpolate_point(link.line, place - 0.25)
     middle = shapely.line_interpolate_point(link.line, place)
@@ -310,7 +311,7 @@ def _add_crossing(streets: Streets, link: Link, place: float, tree: Any) -> tupl
 
 
 def _select_crossings(count: int, pairs: Sequence[tuple[int, int]]) -> set[int]:
-    """The largest set of sidewalks that crossings join."""
+    """Return the largest set of sidewalks that crossings connect."""
     root = list(range(count))
 
     def top(k: int) -> int:
@@ -329,7 +330,7 @@ def _select_crossings(count: int, pairs: Sequence[tuple[int, int]]) -> set[int]:
 
 
 def _corners(loop: Loop, number: int) -> None:
-    """Nodes where a sidewalk turns."""
+    """Add nodes at the corners of a sidewalk."""
     at = shapely.get_coordinates(loop.ring)[:-1]
     for k, corner in enumerate(at):
         a, b = corner - at[k - 1], at[(k + 1) % len(at)] - corner
@@ -339,7 +340,7 @@ def _corners(loop: Loop, number: int) -> None:
 
 
 def _stop(loop: Loop, at: Point, name: str) -> str:
-    """A node on a sidewalk, or one that is there within half a metre."""
+    """Add a node on a sidewalk, or return an existing one within half a metre."""
     for _, stop_name, place in loop.stops:
         if (place[0] - at[0]) ** 2 + (place[1] - at[1]) ** 2 < 0.25:
             return stop_name
@@ -348,7 +349,7 @@ def _stop(loop: Loop, at: Point, name: str) -> str:
 
 
 def _add_sidewalk(site: Site, loop: Loop, speed: float) -> None:
-    """A sidewalk's nodes and the ways between them."""
+    """Add a sidewalk's nodes and the edges between them."""
     stops = sorted(loop.stops)
     for _, name, at in stops:
         site.node(name, at)
@@ -369,12 +370,12 @@ def _add_sidewalk(site: Site, loop: Loop, speed: float) -> None:
 
 
 def stop(site: Site, streets: Streets, roads: Sequence[Sequence[tuple[str, Any]]], notes: DerivationNotes) -> None:
-    """A way between a sidewalk and the lane that begins next to it: where robots are set down."""
+    """Join a sidewalk and the lane that begins next to it: a drop-off stop for robots."""
     walks = [(name, at) for loop in streets.loops for _, name, at in loop.stops]
     lanes_ = [(name, lane) for pair in roads for name, lane in pair]
     if not walks or not lanes_:
         if walks or lanes_:
-            notes.drop("sidewalks", len(streets.loops), "there is no way from a lane to them")
+            notes.drop("sidewalks", len(streets.loops), "there is no path from a lane to them")
         return
     places = shapely.STRtree([shapely.Point(at) for _, at in walks])
     best: tuple[float, str, str] | None = None

@@ -18,16 +18,16 @@ CROWN = "models/crown/meshes/crown.stl"
 CROWNS = ("crown", "crown_light", "crown", "crown_dark")
 
 MAX_TREES = 40_000
-"""A trunk and a crown have 144 triangles; ten millions are what a derivation looks at."""
+"""Maximum number of trees: a trunk and a crown have 144 triangles, and a derivation reads ten million."""
 
 MAX_PLANTS = 50_000
 MAX_PER_ROW = 9_000
-"""Solids of one object, of which ``app.model.solids`` takes 10 000."""
+"""Maximum number of solids of one object; ``app.model.solids`` reads 10 000."""
 
 
 @cache
 def crown_mesh() -> bytes:
-    """A ball of radius 1 with 80 sides, as binary STL: a crown is one of these, stretched."""
+    """Ball of radius 1 with 80 sides, as binary STL: each crown is a scaled one."""
     g = (1 + math.sqrt(5)) / 2
     corners = np.array(
         [(a * s, b * t, 0.0) for a, b in ((1.0, g),) for s in (-1, 1) for t in (-1, 1)]
@@ -58,7 +58,7 @@ def crown_mesh() -> bytes:
 def tree(
     site: Site, i: str, at: tuple[float, float], *, trunk: float, height: float, crown: float, below: float, tint: int
 ) -> None:
-    """A tree: a trunk of a radius, and a crown of a radius from ``below`` to ``height`` metres above the ground."""
+    """Tree: a trunk of a radius, and a crown of a radius from ``below`` to ``height`` metres above the ground."""
     site.files[CROWN] = crown_mesh()
     middle, half = mm((below + height) / 2), mm((height - below) / 2)
     stem = mm(below + half / 2)
@@ -86,12 +86,12 @@ def tree(
 
 
 def jitter(stream: np.random.Generator, count: int, max_offset: float) -> Any:
-    """Offsets float64 [n, 2] along and across, at most so many metres, evenly spread."""
+    """Draw offsets float64 [n, 2] along and across, up to a maximum in metres, evenly distributed."""
     return np.round((2.0 * stream.random((count, 2)) - 1.0) * max_offset, 3)
 
 
 def places(out: Field, stream: np.random.Generator, kind: str, step: float, max_offset: float) -> list[list[Any]]:
-    """The places (u, v) of what stands in the rows of a kind, row by row; none beyond a row's ends."""
+    """Return the positions (u, v) of plants in the rows of a kind, row by row; none beyond a row's ends."""
     rows = []
     for row in out.rows:
         if row.kind == kind:

@@ -1,9 +1,9 @@
-"""Wave-function collapse: grids whose every small window stands in a sample.
+"""Wave-function collapse: grids in which every small window occurs in a sample.
 
-The overlapping model (M. Gumin, WaveFunctionCollapse, 2016) takes every window of N × N tiles of the sample as a
-pattern; two patterns may stand side by side where they agree on what they share. The simple tiled model takes blocks of
-cells as tiles, which may stand side by side where they do so in the sample. A tile is one cell or a block of cells; the
-sample may be turned and mirrored. ``app.generate._kernels_wfc`` does the work on any lattice of windows.
+In the overlapping model (M. Gumin, WaveFunctionCollapse, 2016) every window of N × N tiles of the sample is a pattern;
+two patterns may be adjacent if they agree on their overlap. In the simple tiled model blocks of cells are tiles, which
+may be adjacent if they are in the sample. A tile is one cell or a block of cells; the sample may be rotated and
+mirrored. ``app.generate._kernels_wfc`` solves any lattice of windows.
 
 Arrays are [row, column] as in ``OccupancyGrid``: row 0 is the lowest.
 """
@@ -26,39 +26,45 @@ U64 = NDArray[np.uint64]
 Bool = NDArray[np.bool_]
 
 DONE, IMPOSSIBLE, TIRED = 0, 1, 2
-"""As ``_kernels_wfc`` has them, which is imported when it is needed."""
+"""Results as in ``_kernels_wfc``, which is imported on demand."""
 
 Symmetry = Literal["none", "mirror", "rotate", "all"]
 
 MAX_PATTERNS = 4096
 MAX_TILES = 4096
 MAX_WEIGHT = 2**16
-"""What all patterns weigh together, about: entropies are read from a table of this length."""
+"""Approximate sum of all patterns' weights: entropies are read from a table of this length."""
 
 MAX_WORK = 3_000_000_000
-"""Words of 64 patterns that are looked at before an attempt is given up: some minutes."""
+"""Words of 64 patterns that are processed before an attempt is given up: some minutes."""
 
 MAX_PLACES = 2**22
-"""Tiles of a result."""
+"""Maximum number of tiles of a result."""
 
 BALANCE = 300
-"""Places that smooth what has been placed so far, when patterns are weighed by it."""
+"""Number of places that smooth the counts of placed patterns, for balanced weights."""
 
 ATTEMPTS = 4
 MAX_ROUNDS = 12
-"""Of joining free space."""
+"""Number of attempts to join free space."""
 
 SEARCH_RADIUS_TILES = 32
-"""Tiles around a piece apart in which a way to the rest is looked for first."""
+"""Tiles around an isolated piece in which a path to the rest is searched first."""
 
 DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0))
-"""(row, column): direction d and d ^ 1 are opposite."""
+"""Steps (row, column): direction d and d ^ 1 are opposite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """What a sample teaches. tiles: uint8 [T, t, t] cells. patterns: int64 [P, N, N] tiles. weights: int64 [P], how
-    often each stands in the sample, scaled. allowed: uint64 [4, P, words], which patterns may stand beside each."""
+    """Model learned from a sample.
+
+    Attributes:
+        tiles: uint8 [T, t, t] cells.
+        patterns: int64 [P, N, N] tiles.
+        weights: int64 [P], scaled count of each in the sample.
+        allowed: uint64 [4, P, words], patterns that may be adjacent to each.
+    """
 
     tiles: U8
     patterns: I64
@@ -67,27 +73,27 @@ class Model:
 
     @property
     def tile(self) -> int:
-        """Cells along a tile."""
+        """Number of cells along a tile."""
         return int(self.tiles.shape[1])
 
     @property
     def size(self) -> int:
-        """Tiles along a pattern."""
+        """Number of tiles along a pattern."""
         return int(self.patterns.shape[1])
 
     @property
     def classes(self) -> I64:
-        """Patterns that count as one for the balance: with the same tile at the upper right. int64 [P], below P."""
+        """Groups of patterns for the balance: those with the same tile at the upper right. int64 [P], below P."""
         return np.unique(self.patterns[:, -1, -1], return_inverse=True)[1].reshape(-1).astype(np.int64)
 
     @property
     def words(self) -> int:
-        """64-bit words of a domain."""
+        """Number of 64-bit words of a domain."""
         return (len(self.patterns) + 63) // 64
 
 
 def symmetries(cells: NDArray[Any], symmetry: Symmetry) -> list[NDArray[Any]]:
-    """A sample as it is, mirrored left to right, turned by quarters, or all eight."""
+    """Return a sample as it is, mirrored left to right, rotated by quarters, or all eight variants."""
     if symmetry == "none":
         return [cells]
     if symmetry == "mirror":
@@ -105,22 +111,30 @@ def learn(
     wrap: bool = False,
     valid: Bool | None = None,
 ) -> Model:
-    """A model of a sample. tile: cells along a tile, by which the sample's sides must divide. pattern: tiles along a
-    pattern; 1 is the simple tiled model. wrap: the sample goes on at its other side. valid: windows with cells that are
-    not so teach nothing. CannotGenerate where there are too many patterns, or none.
+    """Learn a model from a sample.
+
+    Args:
+        tile: cells along a tile, a divisor of the sample's sides.
+        pattern: tiles along a pattern; 1 is the simple tiled model.
+        wrap: whether the sample continues at its other side.
+        valid: cells to learn from; windows with other cells are skipped.
+
+    Raises CannotGenerate if there are too many patterns, or none.
     """
     height, width = cells.shape
     if height % tile or width % tile or min(height, width) < tile * max(pattern, 2):
         raise CannotGenerate(
-            f"a sample of {width} × {height} cells does not hold {max(pattern, 2)} × {max(pattern, 2)} tiles of {tile} "
-            "cells, or is no whole number of them: give a larger sample, or a smaller tile or pattern"
+            f"a sample of {width} × {height} cells does not contain {max(pattern, 2)} × {max(pattern, 2)} tiles of "
+            f"{tile} cells, or a whole number of them: use a larger sample, or a smaller tile or pattern"
         )
     sure = np.ones(cells.shape, bool) if valid is None else valid
     blocks = [_blocks(one, tile) for one in symmetries(cells, symmetry)]
     teach = [_blocks(one, tile).min(axis=(2, 3)) for one in symmetries(sure, symmetry)]
     tiles, index = _distinct(np.concatenate([b.reshape(-1, tile * tile) for b in blocks]))
     if len(tiles) > MAX_TILES:
-        raise CannotGenerate(f"the sample has {len(tiles)} different tiles, the limit is {MAX_TILES}: ask for smaller")
+        raise CannotGenerate(
+            f"the sample has {len(tiles)} different tiles, the maximum is {MAX_TILES}: use smaller ones"
+        )
     maps, at = [], 0
     for b in blocks:
         rows, columns = b.shape[:2]
@@ -132,13 +146,13 @@ def learn(
         windows.append(_windows(_wrap(one, pattern, wrap), pattern)[taught].reshape(-1, pattern * pattern))
     if not sum(len(f) for f in windows):
         raise CannotGenerate(
-            f"no window of {pattern} × {pattern} tiles of the sample is known all over: give a smaller pattern"
+            f"no window of {pattern} × {pattern} tiles of the sample is completely known: use a smaller pattern"
         )
     patterns, pattern_index = _distinct(np.concatenate(windows))
     if len(patterns) > MAX_PATTERNS:
         raise CannotGenerate(
-            f"the sample has {len(patterns)} different patterns, the limit is {MAX_PATTERNS}: give a smaller pattern, "
-            "fewer symmetries, or a plainer sample"
+            f"the sample has {len(patterns)} different patterns, the maximum is {MAX_PATTERNS}: use a smaller pattern, "
+            "fewer symmetries, or a simpler sample"
         )
     counts = np.bincount(pattern_index, minlength=len(patterns))
     stack = patterns.reshape(-1, pattern, pattern).astype(np.int64)
@@ -153,13 +167,13 @@ def learn(
 
 
 def scale_weights(counts: I64) -> I64:
-    """Weights of at least 1 that are about MOST_WEIGHT together."""
+    """Scale weights to at least 1, with a sum of about MAX_WEIGHT."""
     total = max(int(counts.sum()), 1)
     return np.maximum(counts * (MAX_WEIGHT - len(counts)) // total, 1).astype(np.int64)
 
 
 def agreeing(patterns: I64) -> U64:
-    """allowed[d, p]: the patterns that agree with p where they overlap it, one tile further in direction d."""
+    """Return allowed[d, p]: the patterns that agree with p in their overlap, one tile further in direction d."""
     n = patterns.shape[1]
     out = []
     for dy, dx in DIRECTIONS:
@@ -172,7 +186,7 @@ def agreeing(patterns: I64) -> U64:
 
 
 def pack_bits(mask: Bool) -> U64:
-    """bool [n, P] as uint64 [n, words], bit p of a row for pattern p."""
+    """Pack bool [n, P] as uint64 [n, words], bit p of a row for pattern p."""
     words = (mask.shape[1] + 63) // 64
     bits = np.zeros((len(mask), words * 8), np.uint8)
     some = np.packbits(mask, axis=1, bitorder="little")
@@ -181,7 +195,7 @@ def pack_bits(mask: Bool) -> U64:
 
 
 def _observed_pairs(count: int, pairs: list[list[I64]]) -> U64:
-    """allowed of tiles: what stands right of and above each in the sample, and the other way round."""
+    """Return ``allowed`` of tiles: those right of and above each in the sample, and the reverse."""
     right, above = np.zeros((count, count), bool), np.zeros((count, count), bool)
     for left_, right_, low, high in pairs:
         right[left_, right_] = True
@@ -190,7 +204,7 @@ def _observed_pairs(count: int, pairs: list[list[I64]]) -> U64:
 
 
 def _pairs(tiles: NDArray[Any], teach: Bool, wrap: bool) -> list[I64]:
-    """(left, right, low, high) of all neighbours that are both known."""
+    """Yield (left, right, low, high) of all neighbours that are both known."""
     out = []
     for axis in (1, 0):
         if wrap:
@@ -207,7 +221,7 @@ def _pairs(tiles: NDArray[Any], teach: Bool, wrap: bool) -> list[I64]:
 
 
 def _blocks(cells: NDArray[Any], tile: int) -> NDArray[Any]:
-    """[rows, columns, tile, tile]."""
+    """Return the tiles as [rows, columns, tile, tile]."""
     height, width = cells.shape
     return np.ascontiguousarray(cells.reshape(height // tile, tile, width // tile, tile).transpose(0, 2, 1, 3))
 
@@ -221,7 +235,7 @@ def _windows(tiles: NDArray[Any], pattern: int) -> Any:
 
 
 def _distinct(rows: NDArray[Any]) -> tuple[NDArray[Any], I64]:
-    """The distinct rows in ascending order, and which each row is."""
+    """Return the distinct rows in ascending order, and the index of each row in them."""
     width = 1 if rows.dtype.itemsize == 1 else 2  # tiles and patterns are below 2^16
     bytes_ = np.ascontiguousarray(rows, f">u{width}").view(f"V{rows.shape[1] * width}").reshape(-1)
     _, first, index = np.unique(bytes_, return_index=True, return_inverse=True)
@@ -230,8 +244,15 @@ def _distinct(rows: NDArray[Any]) -> tuple[NDArray[Any], I64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lattice:
-    """Windows of tiles. rows, columns: int64 [n], the lower left tile of each. neighbours: int32 [n, 4]. shape: (rows,
-    columns) of the tiles. Windows of a periodic lattice go on at the other side."""
+    """Windows of tiles.
+
+    Attributes:
+        rows, columns: int64 [n], the lower left tile of each.
+        neighbours: int32 [n, 4].
+        shape: (rows, columns) of the tiles.
+
+    Windows of a periodic lattice continue at the other side.
+    """
 
     rows: I64
     columns: I64
@@ -243,7 +264,7 @@ class Lattice:
     def from_shape(
         cls, shape: tuple[int, int], pattern: int, *, periodic: bool = False, target: Bool | None = None
     ) -> Lattice:
-        """All windows of so many tiles; target: bool [rows, columns] of tiles, only windows that cover one of these."""
+        """Return all windows of a lattice; target: bool [rows, columns] of tiles, only windows that cover one."""
         height, width = shape
         if not periodic:
             height, width = height - pattern + 1, width - pattern + 1
@@ -267,8 +288,10 @@ class Lattice:
         return cls(rows.astype(np.int64), columns.astype(np.int64), neighbours, shape, periodic)
 
     def fitting(self, patterns: I64, fixed: NDArray[Any], wall: int = -1) -> U64:
-        """uint64 [n, words]: the patterns that have the fixed tiles of each window (int64 [rows, columns], -1: any).
-        wall: a tile that stands only where it is fixed."""
+        """Return uint64 [n, words]: the patterns with the fixed tiles of each window (int64 [rows, columns], -1: any).
+
+        wall: a tile that occurs only at fixed positions.
+        """
         n = patterns.shape[1]
         words = (len(patterns) + 63) // 64
         out = np.broadcast_to(pack_bits(np.ones((1, len(patterns)), bool)), (len(self.rows), words)).copy()
@@ -290,7 +313,7 @@ class Lattice:
 
 @dataclass(slots=True, eq=False)
 class Wave:
-    """A lattice that is being filled, so that a part of it can be made again under further conditions."""
+    """Lattice that is being solved; parts of it can be solved again under further conditions."""
 
     model: Model
     lattice: Lattice
@@ -322,7 +345,7 @@ class Wave:
         counted: Bool | None = None,
         wider: U64 | None = None,
     ) -> Wave:
-        """Everything still possible. draw: gives the seed of what is drawn later; the others: see ``_kernels_wfc``."""
+        """Set up a lattice with all patterns possible. draw: seeds later draws; others: see ``_kernels_wfc``."""
         n = len(lattice.rows)
         weights = model.weights
         total = int(weights.sum())
@@ -352,7 +375,7 @@ class Wave:
         )
 
     def run(self, start: I64 | None = None) -> int:
-        """Collapse; start: places that were unmade, else all. How it ended, see ``_kernels_wfc``."""
+        """Collapse; start: places that were reset, else all. Returns the result, see ``_kernels_wfc``."""
         from app.generate import _kernels_wfc as kernels
 
         fresh = start is None
@@ -379,7 +402,7 @@ class Wave:
         )
 
     def tiles(self) -> I64:
-        """int64 [rows, columns]: the tiles that stand there; -1 where no window covers one. Only when it is done."""
+        """Return int64 [rows, columns]: the placed tiles; -1 if no window covers one. Only after DONE."""
         word = np.argmax(self.domain != 0, axis=1)
         bits = self.domain[np.arange(len(self.domain)), word]
         chosen = word * 64 + np.rint(np.log2(bits.astype(np.float64))).astype(np.int64)
@@ -403,16 +426,20 @@ def collapse_model(
     repairs: int = 20_000,
     wall: int = -1,
 ) -> I64:
-    """Tiles int64 [rows, columns] of which every window is a pattern of the model.
+    """Return tiles int64 [rows, columns] of which every window is a pattern of the model.
 
-    fixed: int64 [rows, columns], the tiles that are given, -1 elsewhere; wall: one that stands nowhere else. draw: a
-    stream of chance by name. scan: places are decided row by row, which keeps the sample's statistics; else where the
-    entropy is least. joined: all free cells are to be one piece, by their sides. CannotGenerate where that cannot be
-    had.
+    Args:
+        fixed: int64 [rows, columns], the given tiles, -1 elsewhere.
+        wall: tile that occurs only at fixed positions.
+        draw: random stream by name.
+        scan: decide places row by row, which preserves the sample's statistics, instead of by lowest entropy.
+        joined: make all free cells one piece, by their sides.
+
+    Raises CannotGenerate if there is no solution.
     """
     if shape[0] * shape[1] > MAX_PLACES:
         raise CannotGenerate(
-            f"{shape[1]} × {shape[0]} tiles are more than {MAX_PLACES}: make it smaller, or give larger tiles"
+            f"{shape[1]} × {shape[0]} tiles are more than {MAX_PLACES}: make the site smaller, or use larger tiles"
         )
     lattice = Lattice.from_shape(shape, model.size, periodic=periodic)
     initial = lattice.fitting(model.patterns, fixed, wall)
@@ -433,8 +460,8 @@ def collapse_model(
         if ended == IMPOSSIBLE and attempt == 0 and wave.report[0] <= 1:
             at = int(wave.report[1])
             raise CannotGenerate(
-                f"what is given contradicts the sample at row {lattice.rows[at]}, column {lattice.columns[at]}: no "
-                "pattern fits there. Give a sample that shows such a place, another border or symmetry, or a smaller "
+                f"the fixed cells contradict the sample at row {lattice.rows[at]}, column {lattice.columns[at]}, where "
+                "no pattern fits: use a sample that contains such a place, another border or symmetry, or a smaller "
                 "pattern"
             )
         if ended != DONE:
@@ -444,14 +471,16 @@ def collapse_model(
             return wave.tiles()
         why = "the free space could not be joined"
     raise CannotGenerate(
-        f"{why} in {ATTEMPTS} attempts: give another seed, a smaller pattern, a plainer sample or another border"
+        f"{why} in {ATTEMPTS} attempts: use another seed, a smaller pattern, a simpler sample or another border"
         + (", or connected=false" if joined else "")
     )
 
 
 def _join(wave: Wave) -> bool:
-    """Make one piece of the free cells: a piece apart is closed, or a way to the rest is opened, and what is around
-    that is made again. Whether that was possible."""
+    """Join the free cells: close each isolated piece, or open a path to the rest, and solve its surroundings again.
+
+    Returns whether that was possible.
+    """
     import cv2
 
     tile = wave.model.tile
@@ -475,7 +504,7 @@ def _join(wave: Wave) -> bool:
 
 
 def _join_borders(label: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Labels of which those that touch across the borders of a periodic lattice are one."""
+    """Merge labels that touch across the borders of a periodic lattice."""
     out = label.copy()
     for a, b in ((0, -1), (-1, 0)):
         for one, other in ((out[a], out[b]), (out[:, a], out[:, b])):
@@ -486,8 +515,10 @@ def _join_borders(label: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
-    """Close a piece apart, or open the shortest way from it to the main one (bool [rows, columns] of tiles that hold
-    any of it). Where that contradicts, nothing changes."""
+    """Close an isolated piece, or open the shortest path from it to the main one; no change on contradiction.
+
+    Pieces are bool [rows, columns] of tiles that contain any cell of them.
+    """
     from scipy import ndimage
 
     lattice, model = wave.lattice, wave.model
@@ -547,7 +578,7 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
 
 
 def render(model: Model, tiles: I64) -> U8:
-    """Tiles (all of them known) as cells."""
+    """Convert tiles (all of them known) to cells."""
     blocks = model.tiles[tiles]
     rows, columns = tiles.shape
     return np.ascontiguousarray(blocks.transpose(0, 2, 1, 3).reshape(rows * model.tile, columns * model.tile))

@@ -1,8 +1,8 @@
 """Cellular automata: caves, forests and cluttered halls grown from random cells by a rule in B/S notation.
 
-A rule ``B5678/S45678`` says with how many of its eight neighbours a dead cell comes alive (B) and a living one stays so
-(S). Alive is what stands there: rock, trees, clutter. Afterwards the places that a robot of the given radius fits into
-are joined by passages, shortest first, and what stays apart is filled, so that free space is one piece.
+A rule ``B5678/S45678`` states with how many of its eight neighbours a dead cell is born (B) and a living one survives
+(S). Living cells are rock, trees or clutter. Then places that a robot of the given radius fits into are joined by
+passages, shortest first, and all others are filled, so that free space is one piece.
 """
 
 from __future__ import annotations
@@ -37,87 +37,95 @@ CLUTTER = CellStyle("obstacle", 1.2, "goods")
 
 @dataclass(frozen=True, slots=True)
 class CaveOptions(SiteOptions):
-    """How a cave grows."""
+    """Parameters of a cave."""
 
-    width: float = parameter(30.0, "along x, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
-    depth: float = parameter(30.0, "along y, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
+    width: float = parameter(30.0, "size along x, if there is no fence", minimum=1.0, maximum=5000.0, unit="m")
+    depth: float = parameter(30.0, "size along y, if there is no fence", minimum=1.0, maximum=5000.0, unit="m")
     cell: float = parameter(
-        0.25, "the automaton's cells; whole cells of the grid", minimum=0.01, maximum=50.0, unit="m"
+        0.25, "size of the automaton's cells; a multiple of the grid's", minimum=0.01, maximum=50.0, unit="m"
     )
-    rule: str = parameter("B5678/S45678", "with how many neighbours a cell comes alive, and stays so")
-    iterations: int = parameter(6, "how often the rule is applied", minimum=0, maximum=1000)
-    density: float = parameter(0.49, "share of cells that are alive in the beginning", minimum=0.0, maximum=1.0)
+    rule: str = parameter("B5678/S45678", "numbers of neighbours with which a cell is born (B) and survives (S)")
+    iterations: int = parameter(6, "number of times that the rule is applied", minimum=0, maximum=1000)
+    density: float = parameter(0.49, "share of living cells at the start", minimum=0.0, maximum=1.0)
     passage: float | None = parameter(
-        None, "width of the passages that join places [three times robot_radius]", minimum=0.0, maximum=100.0, unit="m"
+        None,
+        "width of passages between places; default: three times robot_radius",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m",
     )
     smallest: float = parameter(
-        2.0, "places of less than this that a robot fits into are not joined", minimum=0.0, maximum=1e6, unit="m²"
+        2.0, "area below which places are filled instead of joined", minimum=0.0, maximum=1e6, unit="m²"
     )
 
 
 @dataclass(frozen=True, slots=True)
 class HallOptions(CaveOptions):
-    """How clutter gathers in a hall."""
+    """Parameters of a cluttered hall."""
 
-    width: float = parameter(20.0, "along x, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
-    depth: float = parameter(15.0, "along y, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
-    cell: float = parameter(0.4, "the automaton's cells; whole cells of the grid", minimum=0.01, maximum=50.0, unit="m")
-    rule: str = parameter("B5678/S3456", "with how many neighbours a cell comes alive, and stays so")
-    iterations: int = parameter(2, "how often the rule is applied", minimum=0, maximum=1000)
-    density: float = parameter(0.34, "share of cells that are alive in the beginning", minimum=0.0, maximum=1.0)
+    width: float = parameter(20.0, "size along x, if there is no fence", minimum=1.0, maximum=5000.0, unit="m")
+    depth: float = parameter(15.0, "size along y, if there is no fence", minimum=1.0, maximum=5000.0, unit="m")
+    cell: float = parameter(
+        0.4, "size of the automaton's cells; a multiple of the grid's", minimum=0.01, maximum=50.0, unit="m"
+    )
+    rule: str = parameter("B5678/S3456", "numbers of neighbours with which a cell is born (B) and survives (S)")
+    iterations: int = parameter(2, "number of times that the rule is applied", minimum=0, maximum=1000)
+    density: float = parameter(0.34, "share of living cells at the start", minimum=0.0, maximum=1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class ForestOptions(SiteOptions):
-    """How woods and clearings come to be."""
+    """Parameters of a forest."""
 
-    width: float = parameter(60.0, "along x, where no fence says it", minimum=5.0, maximum=5000.0, unit="m")
-    depth: float = parameter(60.0, "along y, where no fence says it", minimum=5.0, maximum=5000.0, unit="m")
-    spacing: float = parameter(2.5, "the automaton's cells, each of one tree", minimum=0.5, maximum=50.0, unit="m")
-    rule: str = parameter("B5678/S345678", "with how many neighbours a cell comes alive, and stays so")
-    iterations: int = parameter(3, "how often the rule is applied", minimum=0, maximum=1000)
-    density: float = parameter(0.4, "share of cells that are alive in the beginning", minimum=0.0, maximum=1.0)
+    width: float = parameter(60.0, "size along x, if there is no fence", minimum=5.0, maximum=5000.0, unit="m")
+    depth: float = parameter(60.0, "size along y, if there is no fence", minimum=5.0, maximum=5000.0, unit="m")
+    spacing: float = parameter(
+        2.5, "size of the automaton's cells, each with one tree", minimum=0.5, maximum=50.0, unit="m"
+    )
+    rule: str = parameter("B5678/S345678", "numbers of neighbours with which a cell is born (B) and survives (S)")
+    iterations: int = parameter(3, "number of times that the rule is applied", minimum=0, maximum=1000)
+    density: float = parameter(0.4, "share of living cells at the start", minimum=0.0, maximum=1.0)
     jitter: float = parameter(
-        0.3, "how far trees stand from their cell's middle, as a share of the spacing", minimum=0.0, maximum=0.5
+        0.3, "maximum distance of trees from their cell's centre, as a share of the spacing", minimum=0.0, maximum=0.5
     )
     trunk: tuple[float, float] = parameter(
-        (0.1, 0.25), "smallest,largest radius of trunks", minimum=0.02, maximum=2.0, unit="m"
+        (0.1, 0.25), "smallest,largest radius of the trunks", minimum=0.02, maximum=2.0, unit="m"
     )
     tree_height: tuple[float, float] = parameter(
-        (6.0, 14.0), "lowest,highest tree", minimum=1.0, maximum=100.0, unit="m"
+        (6.0, 14.0), "smallest,largest height of the trees", minimum=1.0, maximum=100.0, unit="m"
     )
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"})
 def cave(given: Layers, options: CaveOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A cave: halls and passages in rock, grown by a cellular automaton."""
+    """Cave: halls and passages in rock, grown by a cellular automaton."""
     return _grow_site(given, options, source, notes, STYLES["rock"], STYLES["rock"], ground="gravel")
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"})
 def cluttered_hall(given: Layers, options: HallOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A hall full of clutter that a cellular automaton heaped up."""
+    """Hall full of clutter, heaped up by a cellular automaton."""
     return _grow_site(given, options, source, notes, CLUTTER, STYLES["wall"], ground="floor")
 
 
 @generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"})
 def forest(given: Layers, options: ForestOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A forest: trees with trunks and crowns, and clearings where a cellular automaton leaves some."""
+    """Forest: trees with trunks and crowns, and clearings, from a cellular automaton."""
     for name in ("trunk", "tree_height"):
         low, high = getattr(options, name)
         if low > high:
-            raise invalid_option_error(name, "the smaller one comes first")
+            raise invalid_option_error(name, "the smaller value must come first")
     reach = options.spacing * (0.5 - options.jitter)
     if reach < options.trunk[1]:
         raise invalid_option_error(
-            "jitter", f"trunks of {options.trunk[1]:g} m would touch: give less jitter or a larger spacing"
+            "jitter", f"trunks of {options.trunk[1]:g} m would touch: use less jitter or a larger spacing"
         )
     site = Site(given, options, notes)
     box = site.set_fence(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
     columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
     if rows * columns > MAX_OBJECTS:
         raise invalid_option_error(
-            "spacing", f"{columns} × {rows} cells are more than {MAX_OBJECTS}: give a larger spacing"
+            "spacing", f"{columns} × {rows} cells are more than {MAX_OBJECTS}: use a larger spacing"
         )
     born, stays = _rule(options.rule)
     alive = source.stream("cells").random((rows, columns)) < options.density
@@ -136,7 +144,7 @@ def _grow_site(
     *,
     ground: str,
 ) -> Layers:
-    """A closed place of occupied cells whose free space is one piece."""
+    """Generate a closed site of occupied cells with one piece of free space."""
     resolution = options.resolution or _fine(options)
     step = round(options.cell / resolution)
     if step < 1 or abs(step * resolution - options.cell) > 1e-6:
@@ -149,12 +157,12 @@ def _grow_site(
     coarse = GridFrame(place.x, place.y, options.cell, place.columns // step, place.rows // step)
     if min(coarse.rows, coarse.columns) < 5:
         raise invalid_option_error(
-            "cell", f"{coarse.columns} × {coarse.rows} cells are too few: at least 5 × 5 are needed"
+            "cell", f"{coarse.columns} × {coarse.rows} cells are too few: there must be at least 5 × 5"
         )
     if coarse.rows * coarse.columns * max(options.iterations, 1) > MAX_STEPS:
         raise invalid_option_error(
             "iterations",
-            f"{coarse.rows * coarse.columns} cells times {options.iterations} are more than {MAX_STEPS}: give fewer, "
+            f"{coarse.rows * coarse.columns} cells times {options.iterations} are more than {MAX_STEPS}: use fewer, "
             "or larger cells",
         )
     occupied = source.stream("cells").random((coarse.rows, coarse.columns)) < options.density
@@ -173,10 +181,10 @@ def _grow_site(
         options.smallest / options.cell**2,
     )
     if joined.all():
-        raise CannotGenerate("nothing is left free: give a lower density, another rule, or a smaller robot_radius")
-    notes.drop("free cells", closed, "in places apart: they are filled")
+        raise CannotGenerate("no free space is left: use a lower density, another rule, or a smaller robot_radius")
+    notes.drop("free cells", closed, "in isolated places, which are filled")
     if passages:
-        notes.fill("passages", passages, "joined places of free space that the rule left apart")
+        notes.fill("passages", passages, "joined isolated places of free space")
     if border is look:
         _cells.add_objects(site, coarse, joined, look)
     else:
@@ -186,29 +194,29 @@ def _grow_site(
 
 
 MAX_STEPS = 2**32
-"""Cells times iterations."""
+"""Maximum product of cells and iterations."""
 
 
 def _fine(options: CaveOptions) -> float:
-    """The usual resolution where the automaton's cells are whole ones of it, else these cells."""
+    """Return the default resolution if the automaton's cells are multiples of it, else their size."""
     step = options.cell / RESOLUTION
     is_multiple = abs(step - round(step)) < 1e-6 and step >= 1
     return RESOLUTION if is_multiple and options.width * options.depth / RESOLUTION**2 <= 2**22 else options.cell
 
 
 def _rule(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """(neighbours with which a cell comes alive, with which it stays so)."""
+    """Parse a rule: (numbers of neighbours with which a cell is born, with which it survives)."""
     match = RULE.fullmatch(text.strip().upper())
     if match is None:
         raise invalid_option_error(
-            "rule", f"must be B and S with numbers of neighbours from 0 to 8, as B5678/S45678, got {text[:40]!r}"
+            "rule", f"must be B and S with numbers of neighbours from 0 to 8, such as B5678/S45678, got {text[:40]!r}"
         )
     born, stays = (tuple(sorted({int(c) for c in digits})) for digits in match.groups())
     return born, stays
 
 
 def _within(fence: Any, place: GridFrame) -> Bool:
-    """Which cells lie inside of a fence as a whole, but those at its border."""
+    """Return the cells that are completely inside a fence, except those at its border."""
     inner = shapely.buffer(fence, -place.resolution, join_style="mitre")
     x = place.x + (np.arange(place.columns) + 0.5) * place.resolution
     y = place.y + (np.arange(place.rows) + 0.5) * place.resolution
@@ -257,4 +265,4 @@ def _trees(site: Site, alive: Bool, box: tuple[float, ...], options: ForestOptio
             height=height,
         )
     if not count:
-        raise CannotGenerate("no tree is left: give a higher density, another rule or fewer iterations")
+        raise CannotGenerate("no tree is left: use a higher density, another rule or fewer iterations")

@@ -1,8 +1,8 @@
-"""The unknown part of a grid from its known part, as far as that is sure.
+"""Fill in unknown cells of a grid from its known part, as far as they are certain.
 
-Walls that go on straight on the other side of an unknown place are continued. A cell becomes free where wave-function
-collapse with the known cells fixed (``_wfc``) says so, and cells that are surrounded like it are free often enough
-(``_evidence``). All others stay unknown: what is not known is never free. With ``confidence=0`` all are made up.
+Walls that continue straight on the other side of an unknown area are completed. A cell becomes free if wave-function
+collapse with the known cells fixed (``_wfc``) gives that, and cells with the same surroundings are free often enough
+(``_evidence``). All others stay unknown. With ``confidence=0`` all cells are filled in.
 """
 
 from __future__ import annotations
@@ -26,21 +26,23 @@ U8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
 MAX_FILLED_CELLS = 2**20
-"""Cells that are filled in at once."""
+"""Maximum number of cells that are filled in at once."""
 
 REPAIRS = 100_000
 
 HOLE = 2.0
-"""Metres of the holes that tell how sure a cell is, where the reach is not limited."""
+"""Side of the holes that measure the confidence if the reach is unlimited, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How far it goes, and how it learns."""
+    """Parameters of complete_grid."""
 
-    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
+    grid: str | None = parameter(
+        None, "name of the grid; default: map, else the only one of a level that is no filter mask"
+    )
     reach: float = parameter(
-        1.0, "unknown cells nearer than this to a known one are filled in; 0: all of them", minimum=0.0, maximum=1e6
+        1.0, "maximum distance of filled-in cells from a known one; 0: unlimited", minimum=0.0, maximum=1e6
     )
     confidence: float = parameter(
         0.98,
@@ -49,22 +51,22 @@ class Options:
         minimum=0.0,
         maximum=0.9999,
     )
-    pattern: int = parameter(3, "cells along a window", minimum=2, maximum=3)
+    pattern: int = parameter(3, "number of cells along a window", minimum=2, maximum=3)
     symmetry: Literal["none", "mirror", "rotate", "all"] = parameter(
-        "all", "whether what is known is also taken mirrored, turned by quarters, or both"
+        "all", "whether the known part is also used mirrored, rotated by quarters, or both"
     )
     order: Literal["rows", "entropy"] = parameter(
-        "entropy", "what is decided next: where the entropy is least, from what is known inwards, or row by row"
+        "entropy", "order of decisions: lowest entropy first, from the known part inwards, or row by row"
     )
 
 
 @generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=3)
 def complete_grid(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A grid's unknown cells as far as they are sure: walls that go on straight, free cells between free ones.
+    """Fill in unknown cells of a grid that are certain: walls that continue straight, free cells between free ones.
 
-    Known cells stay as they are. Every window that was made up stands somewhere in the known part where that can be;
-    how many do not is told, and how many cells stay unknown. Raises CannotGenerate where nothing is unknown, no window
-    is known, nothing is sure, or too much is to be filled in.
+    Known cells do not change. Every filled-in window occurs in the known part if possible; warnings state how many do
+    not, and how many cells stay unknown. Raises CannotGenerate if no cell is unknown, no window is known, no cell is
+    certain, or too many would be filled in.
     """
     parts: dict[PartKey, Part] = {}
     why = ""
@@ -74,7 +76,7 @@ def complete_grid(given: Layers, options: Options, source: RandomSource, notes: 
             continue
         parts[key] = _complete_grid(grid, options, source, notes, key)
     if not parts:
-        raise CannotGenerate(f"{why}: there is nothing to fill in")
+        raise CannotGenerate(f"{why}: nothing to fill in")
     return Layers(parts, given.datum, given.levels)
 
 
@@ -83,27 +85,29 @@ def _complete_grid(
 ) -> OccupancyGrid:
     name = grid_label(key)
     if grid.cells.size > MAX_CELLS:
-        raise CannotGenerate(f"{name} has {grid.cells.size} cells, the limit is {MAX_CELLS}")
+        raise CannotGenerate(f"{name} has {grid.cells.size} cells, the maximum is {MAX_CELLS}")
     known_cells = grid.cells != UNKNOWN
     grey = unknown_grey(grid)
     if grey is not None:
         known_cells &= ~grey
-        notes.warn(grey_warning(grid, grey, name, "nothing is learned from them, and they stay as they are"))
+        notes.warn(grey_warning(grid, grey, name, "they are not learned from and do not change"))
     target = _cells_to_fill(known_cells, options.reach / grid.resolution)
     if grey is not None:
         target &= ~grey
     count = int(np.count_nonzero(target))
     if count > MAX_FILLED_CELLS:
         raise invalid_option_error(
-            "reach", f"{name}: {count} cells would be filled in, the limit is {MAX_FILLED_CELLS}: give a smaller reach"
+            "reach", f"{name}: {count} cells would be filled in, the maximum is {MAX_FILLED_CELLS}: use a smaller reach"
         )
     if not count:
-        raise invalid_option_error("reach", f"{name}: no unknown cell is that near to a known one: give a larger reach")
+        raise invalid_option_error("reach", f"{name}: no unknown cell is that close to a known one: use a larger reach")
     occupied = known_cells & (grid.cells >= grid.occupied_thresh * OCCUPIED)
     n = options.pattern
     counts = _counts(occupied, known_cells, n, options.symmetry)
     if not counts.any():
-        raise CannotGenerate(f"{name}: no window of {n} × {n} cells is known all over, so nothing can be learned")
+        raise CannotGenerate(
+            f"{name}: no window of {n} × {n} cells is completely known to learn from: set a smaller pattern"
+        )
     cells = grid.cells.copy()
     before = _evidence.Grid(occupied, known_cells, grid.resolution)
     wall = _evidence.walls(before, target)
@@ -139,9 +143,9 @@ def _fill(
     notes: DerivationNotes,
     key: PartKey,
 ) -> None:
-    """Make up the wanted cells, in place. What is not free stays unknown unless all is to be made up."""
+    """Fill in the wanted cells, in place. Cells that are not free stay unknown unless all are to be filled in."""
     n = options.pattern
-    # Only what is near the wanted cells is looked at.
+    # process only the surroundings of the wanted cells
     rows, columns = np.flatnonzero(target.any(axis=1)), np.flatnonzero(target.any(axis=0))
     y0, y1 = max(int(rows[0]) - n, 0), int(rows[-1]) + n + 1
     x0, x1 = max(int(columns[0]) - n, 0), int(columns[-1]) + n + 1
@@ -161,7 +165,7 @@ def _fill_window(
     notes: DerivationNotes,
     key: PartKey,
 ) -> NDArray[np.int64]:
-    """0 and 1 for each cell of a window of the grid, -1 where nothing was made."""
+    """Solve a window of the grid: 0 or 1 for each cell, -1 without a result."""
     n = options.pattern
     codes = np.arange(2 ** (n * n))
     patterns = (codes[:, None] >> np.arange(n * n) & 1).reshape(-1, n, n).astype(np.int64)
@@ -194,18 +198,18 @@ def _fill_window(
             strange = int(np.count_nonzero(~(wave.domain & seen).any(axis=1)))
             if strange:
                 notes.warn(
-                    f"{strange} of {len(lattice.rows)} windows that were filled in stand nowhere in the known part: no "
-                    "others fit between the known cells",
+                    f"{strange} of {len(lattice.rows)} filled-in windows do not occur in the known part; no others fit "
+                    "between the known cells",
                     where=grid_label(key),
                 )
             return wave.tiles()
     raise CannotGenerate(
-        f"{grid_label(key)}: {repairs} contradictions could not be repaired: give a smaller pattern or reach"
+        f"{grid_label(key)}: {repairs} contradictions could not be repaired: use a smaller pattern or reach"
     )
 
 
 def _cells_to_fill(known_cells: Bool, reach: float) -> Bool:
-    """The unknown cells within so many cells of a known one (middle to middle); all where reach is 0."""
+    """Return the unknown cells within this many cells of a known one (between centres); all if reach is 0."""
     import cv2
 
     if not reach or not known_cells.any():
@@ -215,7 +219,7 @@ def _cells_to_fill(known_cells: Bool, reach: float) -> Bool:
 
 
 def _counts(occupied: Bool, known_cells: Bool, n: int, symmetry: _wfc.Symmetry) -> NDArray[np.int64]:
-    """How often each window stands where all is known, by its cells as bits, row by row from below: int64 [2^(n·n)]."""
+    """Count each completely known window, by its cells as bits, row by row from below: int64 [2^(n·n)]."""
     height, width = (v - n + 1 for v in known_cells.shape)
     counts = np.zeros(2 ** (n * n), np.int64)
     if height < 1 or width < 1:

@@ -21,26 +21,29 @@ class CropRows(FieldOptions):
     """Parameters of a field of crops."""
 
     beds: int | None = parameter(
-        None, "beds; default: as many as the fence holds, 10 without one", minimum=2, maximum=_field.MAX_ROWS
+        None,
+        "number of beds; default: as many as fit into the fence, 10 without one",
+        minimum=2,
+        maximum=_field.MAX_ROWS,
     )
-    rows_per_bed: int = parameter(3, "rows of plants in a bed", minimum=1, maximum=20)
-    row_spacing: float = parameter(0.4, "from row to row in a bed", minimum=0.1, maximum=2.0, unit="m")
+    rows_per_bed: int = parameter(3, "number of plant rows in a bed", minimum=1, maximum=20)
+    row_spacing: float = parameter(0.4, "distance between rows in a bed", minimum=0.1, maximum=2.0, unit="m")
     aisle: float = parameter(
         1.1,
-        "from the last row of a bed to the first of the next, where robots drive",
+        "distance from the last row of a bed to the first of the next, where robots drive",
         minimum=0.3,
         maximum=10,
         unit="m",
     )
-    plant_spacing: float = parameter(0.5, "from plant to plant in a row", minimum=0.05, maximum=5.0, unit="m")
-    jitter: float = parameter(0.03, "how far a plant may stand from its place", minimum=0.0, maximum=1.0, unit="m")
-    plant_height: float = parameter(0.4, "of the plants", minimum=0.05, maximum=3.0, unit="m")
-    plant_diameter: float = parameter(0.24, "of the plants", minimum=0.02, maximum=1.0, unit="m")
+    plant_spacing: float = parameter(0.5, "distance between plants in a row", minimum=0.05, maximum=5.0, unit="m")
+    jitter: float = parameter(0.03, "maximum random offset of a plant", minimum=0.0, maximum=1.0, unit="m")
+    plant_height: float = parameter(0.4, "height of the plants", minimum=0.05, maximum=3.0, unit="m")
+    plant_diameter: float = parameter(0.24, "diameter of the plants", minimum=0.02, maximum=1.0, unit="m")
 
 
 @generates({"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=CropRows, also={"location"})
 def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A field of crops: beds of several rows of plants, wheel tracks between them, headlands, and a yard."""
+    """Field of crops: beds of several rows of plants, wheel tracks between them, headlands, and a yard."""
     site = Site(given, options, notes, coloured=True)
     width = (options.rows_per_bed - 1) * options.row_spacing
     out = _field.open_field(
@@ -54,7 +57,9 @@ def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: Der
     )
     plants = sum(int(row.length / options.plant_spacing) + 1 for row in out.rows) * options.rows_per_bed
     if plants > _trees.MAX_PLANTS:
-        raise invalid_option_error("plant_spacing", f"there would be {plants} plants; the limit is {_trees.MAX_PLANTS}")
+        raise invalid_option_error(
+            "plant_spacing", f"there would be {plants} plants, the maximum is {_trees.MAX_PLANTS}"
+        )
     if max(row.length for row in out.rows) / options.plant_spacing > _trees.MAX_PER_ROW:
         raise invalid_option_error("plant_spacing", f"a row would have more than {_trees.MAX_PER_ROW} plants")
     _field.ground(out, field_colour="soil")
@@ -69,7 +74,7 @@ def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: Der
 
 
 def _row(site: Site, i: str, out: _field.Field, row: Row, options: CropRows, stream: np.random.Generator) -> None:
-    """A row of plants as one object, each plant a block."""
+    """Add a row of plants as one object, each plant a block."""
     along = np.array(_field.between(row, options.plant_spacing))
     offset = _trees.jitter(stream, len(along), options.jitter)
     size = 0.75 + 0.25 * stream.random((len(along), 2))

@@ -17,14 +17,17 @@ class Orchard(FieldOptions):
     """Parameters of an orchard."""
 
     rows: int | None = parameter(
-        None, "rows of trees; default: as many as the fence holds, 8 without one", minimum=2, maximum=_field.MAX_ROWS
+        None,
+        "number of tree rows; default: as many as fit into the fence, 8 without one",
+        minimum=2,
+        maximum=_field.MAX_ROWS,
     )
-    row_spacing: float = parameter(3.6, "from row to row", minimum=1.0, maximum=30.0, unit="m")
-    tree_spacing: float = parameter(1.8, "from tree to tree in a row", minimum=0.5, maximum=30.0, unit="m")
-    jitter: float = parameter(0.1, "how far a tree may stand from its place", minimum=0.0, maximum=5.0, unit="m")
-    tree_height: float = parameter(3.2, "of the trees", minimum=1.0, maximum=30.0, unit="m")
-    crown_diameter: float = parameter(1.6, "of the trees' crowns", minimum=0.3, maximum=20.0, unit="m")
-    trunk_diameter: float = parameter(0.16, "of the trees' trunks", minimum=0.04, maximum=2.0, unit="m")
+    row_spacing: float = parameter(3.6, "distance between rows", minimum=1.0, maximum=30.0, unit="m")
+    tree_spacing: float = parameter(1.8, "distance between trees in a row", minimum=0.5, maximum=30.0, unit="m")
+    jitter: float = parameter(0.1, "maximum random offset of a tree", minimum=0.0, maximum=5.0, unit="m")
+    tree_height: float = parameter(3.2, "height of the trees", minimum=1.0, maximum=30.0, unit="m")
+    crown_diameter: float = parameter(1.6, "diameter of the trees' crowns", minimum=0.3, maximum=20.0, unit="m")
+    trunk_diameter: float = parameter(0.16, "diameter of the trees' trunks", minimum=0.04, maximum=2.0, unit="m")
 
 
 @generates(
@@ -33,9 +36,9 @@ class Orchard(FieldOptions):
     also={"location"},
 )
 def orchard(given: Layers, options: Orchard, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """An orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
+    """Orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
     if options.crown_diameter < options.trunk_diameter:
-        raise invalid_option_error("crown_diameter", "a crown is no thinner than its trunk")
+        raise invalid_option_error("crown_diameter", "must be at least trunk_diameter")
     site = Site(given, options, notes, coloured=True)
     lines = _field.number_rows(options.rows or _field.MAX_ROWS)
     out = _field.open_field(
@@ -48,7 +51,7 @@ def orchard(given: Layers, options: Orchard, source: RandomSource, notes: Deriva
     )
     trees = sum(int(row.length / options.tree_spacing) + 1 for row in out.rows)
     if trees > _trees.MAX_TREES:
-        raise invalid_option_error("tree_spacing", f"there would be {trees} trees; the limit is {_trees.MAX_TREES}")
+        raise invalid_option_error("tree_spacing", f"there would be {trees} trees, the maximum is {_trees.MAX_TREES}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
         site.mark(f"row{row.number}", "tree_row", out.line(row), name=f"Row {row.number}")

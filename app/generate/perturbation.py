@@ -1,14 +1,13 @@
-"""Perturbation: an environment as it may be tomorrow, for studies of how much a fleet stands.
+"""Perturbation: a changed copy of an environment, to study how much change a fleet tolerates.
 
-Level by level: objects that are no part of the building are shifted and turned, whole rows of them as rows, some are
-gone, and new obstacles stand where it was free. The grids follow: what changes of a slice of the objects changes in
-them. A level that has a grid and no objects with a body has its pieces of occupied cells moved instead. Then sensors'
-noise is laid on the grids, more of it far from where the robots drive: false obstacles, edges that are worn away or
-grown, patches that were not seen. The network loses, or has marked as blocked, what the obstacles now stand in the way
-of.
+Level by level, objects that are not part of the building are shifted and turned, rows of them as a whole, some are
+removed, and new obstacles are added on free ground. The grids follow: what changes in a slice of the objects changes in
+them. On a level with a grid and no objects with a body, pieces of occupied cells are moved instead. Then sensor noise
+is added to the grids, more of it far from the robots' paths: false obstacles, worn or grown edges, unseen patches.
+Network edges that obstacles now block are removed or marked as blocked.
 
-Robots have driven along the network and seen it from near: there is no noise within their radius of its edges. What
-stands there stands in the way because an obstacle does.
+Robots have driven along the network and seen it from close by: there is no noise within their radius of its edges. An
+obstacle on an edge is a real one.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 NAME = "perturbation"
-"""The family of new obstacles."""
+"""Family of new obstacles."""
 
 FIXED_KINDS = frozenset(
     {
@@ -60,59 +59,59 @@ FIXED_KINDS = frozenset(
         *("ditch", "stream", "pillar", "column", "stairs", "field", "terrain", "ground_plane", "light"),
     }
 )
-"""Kinds of objects that are built, or are ground: they do not move."""
+"""Kinds of objects that are built, or are ground: they never move."""
 
 
 SHAPELESS = 0.25
-"""Metres around a model of which nobody has supplied the shape."""
+"""Radius in metres around a model without a known shape."""
 
 HALF = 0.71
-"""Of a cell's side: how far its corners are from its middle. Who measures from cell to cell errs by as much."""
+"""Half the diagonal of a cell, as a share of its side: the maximum error of distances between cells."""
 
 MAX_ATTEMPTS = 40
-"""Places that are tried for each new obstacle."""
+"""Number of positions that are tried for each new obstacle."""
 
 MAX_PIECES = 20_000
-"""Pieces of occupied cells that are moved; with more the grid is rather noise."""
+"""Maximum number of pieces of occupied cells that are moved; more are rather noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Perturbation:
-    """How much is disturbed. The defaults are mild."""
+    """Parameters of the perturbation. The defaults are mild."""
 
     severity: float = parameter(
-        1.0, "factor on all that follows but sizes and distances; 0: nothing changes", minimum=0.0, maximum=10.0
+        1.0, "factor on all following parameters except sizes and distances", minimum=0.0, maximum=10.0
     )
-    level: str | None = parameter(None, "only this level; default: all")
+    level: str | None = parameter(None, "level to disturb; default: all")
     grid: str | None = parameter(
-        None, "only this grid has noise; default: all but costmap filter masks. All maps follow the objects"
+        None, "grid with noise; default: all except costmap filter masks. All grids follow the objects"
     )
-    shift: float = parameter(0.1, "how far a thing is moved at most", minimum=0.0, maximum=100.0, unit="m")
-    turn: float = parameter(5.0, "how far it is turned at most", minimum=0.0, maximum=180.0, unit="°")
+    shift: float = parameter(0.1, "maximum distance by which an object is moved", minimum=0.0, maximum=100.0, unit="m")
+    turn: float = parameter(5.0, "maximum angle by which an object is turned", minimum=0.0, maximum=180.0, unit="°")
     row_shift: float = parameter(
-        0.15, "how far a whole row of things is moved at most", minimum=0.0, maximum=100.0, unit="m"
+        0.15, "maximum distance by which a whole row of objects is moved", minimum=0.0, maximum=100.0, unit="m"
     )
-    missing: float = parameter(0.03, "share of the things that are gone", minimum=0.0, maximum=1.0)
+    missing: float = parameter(0.03, "share of objects that are removed", minimum=0.0, maximum=1.0)
     largest: float = parameter(
-        5.0, "things that are longer neither move nor go", minimum=0.05, maximum=1000.0, unit="m"
+        5.0, "maximum length of objects that are moved or removed", minimum=0.05, maximum=1000.0, unit="m"
     )
-    obstacles: int = parameter(3, "new obstacles on each level", minimum=0, maximum=10_000)
+    obstacles: int = parameter(3, "number of new obstacles on each level", minimum=0, maximum=10_000)
     obstacle_size: tuple[float, float] = parameter(
-        (0.3, 1.0), "least and most metres across a new obstacle", minimum=0.05, maximum=50.0, unit="m"
+        (0.3, 1.0), "smallest,largest diameter of new obstacles", minimum=0.05, maximum=50.0, unit="m"
     )
-    speckle: float = parameter(0.0005, "share of far free cells that are wrongly occupied", minimum=0.0, maximum=0.5)
-    erode: float = parameter(0.05, "share of obstacles' edge cells that are lost", minimum=0.0, maximum=1.0)
-    dilate: float = parameter(0.05, "share of cells beside obstacles that are occupied", minimum=0.0, maximum=1.0)
-    dropped: int = parameter(2, "patches of each grid that are unknown", minimum=0, maximum=10_000)
-    patch: float = parameter(1.5, "metres across such a patch, at most", minimum=0.05, maximum=1000.0, unit="m")
+    speckle: float = parameter(0.0005, "share of distant free cells that become occupied", minimum=0.0, maximum=0.5)
+    erode: float = parameter(0.05, "share of obstacles' edge cells that become free", minimum=0.0, maximum=1.0)
+    dilate: float = parameter(0.05, "share of cells beside obstacles that become occupied", minimum=0.0, maximum=1.0)
+    dropped: int = parameter(2, "number of patches of each grid that become unknown", minimum=0, maximum=10_000)
+    patch: float = parameter(1.5, "maximum diameter of such a patch", minimum=0.05, maximum=1000.0, unit="m")
     sensor_range: float = parameter(
-        10.0, "distance from where robots drive at which noise is full", minimum=0.1, maximum=1000.0, unit="m"
+        10.0, "distance from the robots' paths at which noise is strongest", minimum=0.1, maximum=1000.0, unit="m"
     )
     robot_radius: float = parameter(
-        0.3, "an edge that is nearer to a new obstacle cannot be taken", minimum=0.0, maximum=5.0, unit="m"
+        0.3, "radius of the robot; edges closer to a new obstacle are blocked", minimum=0.0, maximum=5.0, unit="m"
     )
     edges: Literal["remove", "block"] = parameter(
-        "remove", "what happens to edges that cannot be taken: gone, with nodes that are covered, or marked as blocked"
+        "remove", "treatment of blocked edges: removed, with covered nodes, or marked as blocked"
     )
 
 
@@ -123,33 +122,36 @@ class Perturbation:
     parameters=Perturbation,
 )
 def perturbation(given: Layers, options: Perturbation, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """The environment disturbed: things shifted, missing and new, noise on its grids, a network that still fits.
+    """Disturbed environment: objects shifted, removed and added, noise on its grids, a network that still fits.
 
     Objects stay in their family and keep their ids; new ones are of the family ``perturbation``. Grids keep their
-    frame. Voxels, zones and pictures are not changed. Raises CannotGenerate where it is too large, or there is no such
-    level.
+    frame. Voxels, zones and images do not change. Raises CannotGenerate if the environment is too large, or there is no
+    such level.
     """
     low, high = options.obstacle_size
     if low > high:
-        raise Invalid("obstacle_size: least comes first", [Problem("least comes first", where="obstacle_size")])
+        raise Invalid(
+            "obstacle_size: the smaller value must come first",
+            [Problem("the smaller value must come first", where="obstacle_size")],
+        )
     cells = sum(g.cells.size for g in given.grids().values())
     objects = sum(len(p) for p in given.vector("objects").values())
     if cells > MAX_CELLS or objects > MAX_OBJECTS:
         raise CannotGenerate(
-            f"there are {cells} cells and {objects} objects; at most {MAX_CELLS} and {MAX_OBJECTS} can be disturbed: "
-            "cut the environment, or make its grid coarser"
+            f"there are {cells} cells and {objects} objects, the maximum is {MAX_CELLS} and {MAX_OBJECTS}: split the "
+            "environment, or make its grid coarser"
         )
     levels = sorted({k.level for k in given.parts if k.layer in ("objects", "occupancy", "topology")})
     if options.level is not None:
         if options.level not in levels:
-            reason = f"there is no level {options.level!r} to disturb; there are: {', '.join(levels)}"
+            reason = f"unknown level {options.level!r}; available: {', '.join(levels)}"
             raise CannotGenerate(f"level: {reason}", [Problem(reason, where="level")])
         levels = [options.level]
     if options.severity == 0.0:
-        raise CannotGenerate("severity: 0 changes nothing", [Problem("0 changes nothing", where="severity")])
+        raise CannotGenerate("severity: must be above 0", [Problem("must be above 0", where="severity")])
     if options.grid is not None and options.grid not in {k.name for k in given.grids()}:
         grid_names = ", ".join(sorted({k.name for k in given.grids()})) or "none"
-        reason = f"there is no grid {options.grid!r} to disturb; there are: {grid_names}"
+        reason = f"unknown grid {options.grid!r}; available: {grid_names}"
         raise CannotGenerate(f"grid: {reason}", [Problem(reason, where="grid")])
     parts: dict[PartKey, Part] = {}
     for level in levels:
@@ -158,17 +160,17 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
         text = "; ".join(f"{w.where}: {w.problem}" for w in notes.warnings)
         text += "".join(f"; {one.count} {one.subject}: {one.why}" for one in notes.dropped)
         raise CannotGenerate(
-            f"nothing is disturbed by these parameters{': ' + text.removeprefix('; ') if text else ''}: ask for more, "
-            "or upload or derive objects that stand in the way, or a grid"
+            f"these parameters disturb nothing{' (' + text.removeprefix('; ') + ')' if text else ''}: increase them, "
+            "or upload or derive obstacles or a grid"
         )
     if options.edges == "remove":
         parts |= drop_unconnected(given, parts, notes)
-    notes.warn("voxels, zones and pictures are as they were: derive them anew where they are to fit")
+    notes.warn("voxels, zones and images are unchanged; derive them again if they must match")
     return Layers(parts, given.datum, given.levels)
 
 
 class _Level:
-    """One level on its way."""
+    """One level during the perturbation."""
 
     def __init__(
         self, given: Layers, options: Perturbation, source: RandomSource, notes: DerivationNotes, level: str
@@ -184,11 +186,11 @@ class _Level:
         self.lines = {k: p for k, p in given.vector("topology", level).items() if len(p)}
 
     def draw(self, name: str) -> np.random.Generator:
-        """Chance for one purpose on this level."""
+        """Return the random stream of one purpose on this level."""
         return self.source.stream(f"{self.level}/{name}")
 
     def changed_parts(self) -> dict[PartKey, Part]:
-        """The parts of the level that are changed."""
+        """Return the parts of the level that changed."""
         out: dict[PartKey, Part] = {}
         things = self._things()
         grids = self.maps if things else {k: g for k, g in self.grids.items() if k in self.noisy}
@@ -202,7 +204,7 @@ class _Level:
             changes = {k: self._pieces(k, g) for k, g in grids.items()}
             change = changes[first]
         else:
-            self.notes.warn("it has neither objects that stand in the way nor a grid", where=self.level)
+            self.notes.warn("it has neither obstacles nor a grid", where=self.level)
             return out
         network, edge_lines = self._network(change, main)
         out |= network
@@ -216,7 +218,7 @@ class _Level:
 
     # --- objects -----------------------------------------------------------------------------------------------------
     def _things(self) -> list[Movable]:
-        """Everything with a body, those that may move first told apart from those that stay."""
+        """Collect everything with a body; movable objects are separated from fixed ones first."""
         solid_reader = solids.Solids(self.given.resources())
         out: list[Movable] = []
         for key, part in self.parts.items():
@@ -225,16 +227,18 @@ class _Level:
                 try:
                     body = object_footprint(p, geometry, solid_reader)
                 except (Invalid, BadUpload) as error:
-                    self.notes.warn(f"it stays as it is: {error.detail}", where=part.ids[k])
+                    self.notes.warn(f"it is unchanged; {error.detail}", where=part.ids[k])
                     continue
                 if (body is None or body.is_empty) and p.get("kind") in ("model", "include") and not geometry.is_empty:
-                    body = shapely.centroid(geometry).buffer(SHAPELESS)  # its files are elsewhere
+                    body = shapely.centroid(geometry).buffer(SHAPELESS)  # its files are in another part
                 if body is None or body.is_empty:
                     continue
                 x0, y0, x1, y1 = body.bounds
                 pose = p.get("pose")
                 middle = ((x0 + x1) / 2, (y0 + y1) / 2) if pose is None else solids.parse_pose(p)[:2]
-                woven = isinstance(p.get("osm"), dict) and shapely.get_type_id(geometry) != 0  # its nodes would stay
+                woven = (
+                    isinstance(p.get("osm"), dict) and shapely.get_type_id(geometry) != 0
+                )  # its nodes would stay behind
                 stays = (
                     str(p.get("kind")) in FIXED_KINDS or math.hypot(x1 - x0, y1 - y0) > self.options.largest or woven
                 )
@@ -245,7 +249,7 @@ class _Level:
         return out
 
     def _objects(self, things: list[Movable], main: OccupancyGrid | None) -> tuple[CellChange, dict[PartKey, Part]]:
-        """What changes of the obstacles, and the parts of objects that do."""
+        """Return the changes of the obstacles, and the changed parts of objects."""
         loose = [t for t in things if t.moved is not None]
         rows = find_rows(np.array([t.at for t in loose]).reshape(-1, 2))
         for t, row in zip(loose, rows.tolist(), strict=True):
@@ -253,7 +257,7 @@ class _Level:
         self._shaken(loose)
         back = separate(things)
         if back:
-            self.notes.drop("shifts", back, "another thing stands there")
+            self.notes.drop("shifts", back, "their new place is occupied")
         fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
         phrases = self._summary(things)
         out: dict[PartKey, Part] = {}
@@ -278,11 +282,11 @@ class _Level:
         removed_count = sum(t.gone for t in things)
         moved = sum(t.has_changed for t in things) - removed_count
         rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
-        phrases = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
-        return phrases + ([f"{removed_count} gone"] if removed_count else [])
+        phrases = [f"{moved} objects moved" + (f" ({rows} rows)" if rows else "")] if moved else []
+        return phrases + ([f"{removed_count} removed"] if removed_count else [])
 
     def _shaken(self, loose: list[Movable]) -> None:
-        """Draw what goes, and how far what stays is moved."""
+        """Draw the removed objects, and the displacement of the others."""
         s, options = self.options.severity, self.options
         go = self.draw("missing").random(len(loose)) < min(options.missing * s, 1.0)
         by = self.draw("shift").random((len(loose), 3)) * 2 - 1
@@ -292,14 +296,14 @@ class _Level:
                 t.gone = True
                 continue
             along = rows[t.row].tolist() if t.row >= 0 else (0.0, 0.0)
-            half = math.sqrt(0.5)  # so that the most is the most in any direction
+            half = math.sqrt(0.5)  # so that the maximum applies in every direction
             x = half * s * (dx * options.shift + along[0] * options.row_shift)
             y = half * s * (dy * options.shift + along[1] * options.row_shift)
             angle = math.radians(min(options.turn * s, 180.0)) * turn
             t.moved = (round(x, 3) + 0.0, round(y, 3) + 0.0, round(angle, 6) + 0.0)
 
     def _slice_changes(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> CellChange:
-        """What a slice of the objects shows now and did not before, and the other way round."""
+        """Return what a slice of the objects shows now and not before, and the reverse."""
         slice_properties = main.properties.get("slice") if main is not None else None
         height = slice_properties.get("height") if isinstance(slice_properties, dict) else None
         size = None if main is None else main.resolution
@@ -318,7 +322,7 @@ class _Level:
         return CellChange(size, unpack_squares(freed), unpack_squares(filled), unpack_squares(before))
 
     def _slice(self, parts: Mapping[PartKey, Part], slice_parameters: Slice | None) -> OccupancyGrid | None:
-        """The level's grid of these objects; None where nothing stands there at that height."""
+        """Return the level's grid of these objects; None if there is nothing at that height."""
         level_parts = {k: p for k, p in parts.items() if k.layer in ("resources", "location") or k.level == self.level}
         try:
             sliced_layers = objects_to_occupancy(
@@ -332,9 +336,9 @@ class _Level:
     def _obstacles(
         self, things: Sequence[Movable], main: OccupancyGrid | None
     ) -> list[tuple[str, Any, dict[str, Any]]]:
-        """New objects where it is free."""
+        """Add new objects on free ground."""
         rng = self.draw("obstacles")
-        bodies = [t.now() for t in things if t.moved is not None and not t.gone]  # the grid shows all the others
+        bodies = [t.now() for t in things if t.moved is not None and not t.gone]  # the grid shows all others
         tree = shapely.STRtree(bodies)
         new: list[Any] = []
         rows: list[tuple[str, Any, dict[str, Any]]] = []
@@ -366,11 +370,11 @@ class _Level:
             properties = {"kind": "obstacle", "pose": [x, y, floor, 0.0, 0.0, yaw], "size": wide, "height": high}
             rows.append((f"new/{number}", body, {**properties, "shapes": [solid]}))
         if len(rows) < count:
-            self.notes.drop("new obstacles", count - len(rows), f"there is no room for them on {self.level}")
+            self.notes.drop("new obstacles", count - len(rows), f"there is no free space for them on {self.level}")
         return rows
 
     def _body(self, rng: np.random.Generator) -> tuple[Any, float, float, list[float]]:
-        """(its outline around 0, yaw, height, sizes) of a box, or of a cylinder, which has one size."""
+        """Draw (outline around 0, yaw, height, sizes) of a box, or of a cylinder, which has one size."""
         kind, a, b, turn, tall = rng.random(5).tolist()
         low, high = self.options.obstacle_size
         long, wide = (round(low + (high - low) * v, 3) for v in (a, b))
@@ -380,7 +384,7 @@ class _Level:
         return shapely.box(-long / 2, -wide / 2, long / 2, wide / 2), round(math.pi * turn, 6), height, [long, wide]
 
     def _room(self, main: OccupancyGrid | None) -> Callable[[np.random.Generator], tuple[float, float]] | None:
-        """A function that draws a place in the open; None where there is none."""
+        """Return a function that draws a position on open ground; None if there is none."""
         if main is None:
             return None
         spots = open_cells(main.cells, self.options.obstacle_size[1] / main.resolution)
@@ -393,12 +397,12 @@ class _Level:
         return drawn if len(spots) else None
 
     def _scaled_count(self, count: int) -> int:
-        """A count by severity."""
+        """Return a count scaled by severity."""
         return min(round(count * self.options.severity), MAX_OBJECTS)
 
     # --- a grid without objects --------------------------------------------------------------------------------------
     def _pieces(self, key: PartKey, grid: OccupancyGrid) -> CellChange:
-        """Its small pieces of occupied cells moved and gone, and new ones: as cells of the grid itself."""
+        """Move and remove small pieces of occupied cells, and add new ones, as cells of the grid itself."""
         import cv2
 
         occupied = (grid.cells == OCCUPIED).astype(np.uint8)
@@ -435,7 +439,7 @@ class _Level:
             if not t.gone and into is not None:
                 cells[into][inside] = OCCUPIED
         if blocked_count:
-            self.notes.drop("shifts", blocked_count, "another thing stands there, or it is not known what does")
+            self.notes.drop("shifts", blocked_count, "their new place is occupied or unknown")
         added = self._paint_obstacles(key, grid, cells)
         phrases = self._summary(loose) + ([f"{added} new obstacles"] if added else [])
         if phrases:
@@ -448,7 +452,7 @@ class _Level:
         return CellChange(0.0, freed, filled, np.stack([column, row], axis=1))
 
     def _paint_obstacles(self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8]) -> int:
-        """Paint new obstacles onto the open cells: how many."""
+        """Paint new obstacles onto open cells; return their number."""
         import cv2
 
         rng = self.draw(f"obstacles/{key.name}")
@@ -468,12 +472,12 @@ class _Level:
                     done += 1
                     break
         if done < count:
-            self.notes.drop("new obstacles", count - done, f"there is no room for them on {self.level}")
+            self.notes.drop("new obstacles", count - done, f"there is no free space for them on {self.level}")
         return done
 
     # --- the network -------------------------------------------------------------------------------------------------
     def _network(self, change: CellChange, main: OccupancyGrid | None) -> tuple[dict[PartKey, Part], list[Any]]:
-        """The parts of the network that change, and the lines (metres) that robots still take."""
+        """Return the changed parts of the network, and the lines (metres) that robots can still use."""
         out: dict[PartKey, Part] = {}
         edge_lines: list[Any] = []
         boxes, old = (square_boxes(places, change.size, main) for places in (change.filled, change.before))
@@ -503,8 +507,10 @@ class _Level:
         return out, edge_lines
 
     def _reach(self, was: shapely.STRtree, metres: NDArray[np.object_], coarse: float) -> Array:
-        """How near an obstacle may come to each line or point: the robot's radius, and as much as cells are coarse;
-        where one was nearer than that before, so that a smaller robot is meant, half of that distance."""
+        """Return the minimum distance of an obstacle to each line or point: the robot's radius plus a cell's tolerance.
+
+        Lines with a smaller distance before are meant for a smaller robot: half of that distance.
+        """
         radius = self.options.robot_radius
         away = _nearest(was, metres, radius)
         return np.where(away < radius - 2 * coarse, away / 2, np.nextafter(radius + coarse, np.inf))
@@ -513,21 +519,19 @@ class _Level:
         if ids:
             some = ", ".join(ids[:10]) + (" …" if len(ids) > 10 else "")
             location = f"{key.level}/{key.name}"
-            self.notes.warn(
-                f"{len(ids)} {kind} are {effect}, since an obstacle now stands there: {some}", where=location
-            )
+            self.notes.warn(f"{len(ids)} {kind} are {effect} because of new obstacles: {some}", where=location)
 
     # --- noise -------------------------------------------------------------------------------------------------------
     def _noise(
         self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8], lines: Sequence[Any]
     ) -> NDArray[np.uint8]:
-        """Cells as a sensor that errs sees them."""
+        """Add sensor noise to cells."""
         known_cells = cells != UNKNOWN
         down, across = np.flatnonzero(known_cells.any(axis=1)), np.flatnonzero(known_cells.any(axis=0))
         if not len(down):
             return cells
         y0, x0 = int(down[0]), int(across[0])
-        inner = (slice(y0, int(down[-1]) + 1), slice(x0, int(across[-1]) + 1))  # most of many a map is unknown
+        inner = (slice(y0, int(down[-1]) + 1), slice(x0, int(across[-1]) + 1))  # many maps are mostly unknown
         out = cells.copy()
         out[inner] = self._errors(key, grid, cells[inner], (x0, y0), lines)
         return out
@@ -535,7 +539,7 @@ class _Level:
     def _errors(
         self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8], first: tuple[int, int], lines: Sequence[Any]
     ) -> NDArray[np.uint8]:
-        """The same of a window of the grid. first: its first column and row."""
+        """Add sensor noise to a window of the grid. first: its first column and row."""
         import cv2
 
         options, s = self.options, self.options.severity
@@ -544,7 +548,9 @@ class _Level:
         driven = np.zeros(cells.shape, np.uint8)
         for line in lines:
             at = np.round(metres_to_grid(grid, shapely.get_coordinates(line)) - 0.5) - first
-            if np.abs(at).max(initial=0.0) < 2**24:  # cv2 takes 32-bit places; what lies far off is in no grid
+            if (
+                np.abs(at).max(initial=0.0) < 2**24
+            ):  # cv2 takes 32-bit coordinates; distant obstacles are outside every grid
                 cv2.polylines(driven, [at.astype(np.int32)], False, 1)
         if not driven.any():
             away = cv2.distanceTransform(np.pad(free, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -554,7 +560,7 @@ class _Level:
         else:
             away = cv2.distanceTransform(1 - driven, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
             near = away <= options.robot_radius / grid.resolution + 2.0
-        # In 64 steps, so that no last bit of a distance decides.
+        # in 64 steps, so that no last bit of a distance decides
         weight = np.floor(np.minimum(away * (grid.resolution / options.sensor_range), 1.0) * 64) / 64
         kernel = np.ones((3, 3), np.uint8)
         rng = self.draw(f"noise/{key.name}")
@@ -578,7 +584,7 @@ class _Level:
 
 
 def _nearest(tree: shapely.STRtree, metres: NDArray[np.object_], max_distance: float) -> Array:
-    """Metres from each geometry to the nearest of the tree's; infinite beyond ``max_distance``."""
+    """Return the distance in metres of each geometry to the nearest of the tree; infinite beyond ``max_distance``."""
     out = np.full(len(metres), np.inf)
     usable = np.flatnonzero(~shapely.is_empty(metres))
     if len(usable) and len(tree.geometries) and max_distance > 0:

@@ -1,4 +1,4 @@
-"""A stand of plants grown by L-systems, of a species that is known here or by rules of one's own."""
+"""Stand of plants grown by L-systems, of a built-in species or by custom rules."""
 
 from __future__ import annotations
 
@@ -18,45 +18,48 @@ from app.parameters import parameter
 
 COLOURS = {"apple": "crown", "vine": "leaf", "bush": "crown_light", "pine": "crown_dark"}
 HEADLAND = 3.0
-"""Metres between the plants and the fence, where robots turn."""
+"""Distance in metres between the plants and the fence, where robots turn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options(SiteOptions):
-    """Which plants, how many, and how far apart."""
+    """Parameters of a stand of plants."""
 
-    species: Literal["apple", "vine", "bush", "pine"] = parameter("apple", "a species whose rules are known")
+    species: Literal["apple", "vine", "bush", "pine"] = parameter("apple", "built-in species")
     rules: str | None = parameter(
         None,
-        "an L-system instead of a species, statements on lines of their own or between semicolons, such as: "
+        "L-system instead of a species, statements on separate lines or separated by semicolons, such as: "
         "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.2 -> F(l) [ +(30) A(l * 0.7) ] /(120) A(l * 0.8)",
     )
     iterations: int | None = parameter(
-        None, "rounds of rewriting; default: the species' own, or 6", minimum=0, maximum=_lsystem.MAX_ITERATIONS
+        None,
+        "number of rounds of rewriting; default: the species' own, or 6",
+        minimum=0,
+        maximum=_lsystem.MAX_ITERATIONS,
     )
-    angle: float = parameter(25.0, "of a turn for which the rules say none", minimum=-360.0, maximum=360.0, unit="°")
-    length: float = parameter(
-        0.1, "of a branch or leaf for which the rules say none", minimum=0.001, maximum=100.0, unit="m"
-    )
-    radius: float = parameter(0.01, "of a branch for which the rules say none", minimum=0.0005, maximum=10.0, unit="m")
+    angle: float = parameter(25.0, "angle of a turn without a value", minimum=-360.0, maximum=360.0, unit="°")
+    length: float = parameter(0.1, "length of a branch or leaf without a value", minimum=0.001, maximum=100.0, unit="m")
+    radius: float = parameter(0.01, "radius of a branch without a value", minimum=0.0005, maximum=10.0, unit="m")
     body: Literal["trunk", "crown"] | None = parameter(
-        None, "what robots collide with: the trunk alone or nearly the whole plant; default: as the species is"
+        None, "collision shape: only the trunk or almost the whole plant; default: that of the species"
     )
-    rows: int = parameter(4, "rows of plants", minimum=1, maximum=200)
-    columns: int = parameter(8, "plants in a row", minimum=1, maximum=200)
+    rows: int = parameter(4, "number of rows", minimum=1, maximum=200)
+    columns: int = parameter(8, "number of plants in a row", minimum=1, maximum=200)
     row_spacing: float | None = parameter(
-        None, "between rows; default: as much as the plants and a robot need", minimum=0.1, maximum=100.0, unit="m"
+        None,
+        "distance between rows; default: as needed by the plants and a robot",
+        minimum=0.1,
+        maximum=100.0,
+        unit="m",
     )
     spacing: float | None = parameter(
-        None, "between the plants of a row; default: 1.1 times their width", minimum=0.05, maximum=100.0, unit="m"
+        None, "distance between plants of a row; default: 1.1 times their width", minimum=0.05, maximum=100.0, unit="m"
     )
-    jitter: float = parameter(0.1, "how far a plant may stand from its place", minimum=0.0, maximum=5.0, unit="m")
+    jitter: float = parameter(0.1, "maximum random offset of a plant", minimum=0.0, maximum=5.0, unit="m")
     variants: int = parameter(
-        4, "different plants, which stand scaled and turned", minimum=1, maximum=_plants.MAX_VARIANTS
+        4, "number of different plants, which are placed scaled and rotated", minimum=1, maximum=_plants.MAX_VARIANTS
     )
-    variation: float = parameter(
-        0.15, "by how much of its size a plant may be larger or smaller", minimum=0.0, maximum=0.5
-    )
+    variation: float = parameter(0.15, "maximum relative deviation of a plant's size", minimum=0.0, maximum=0.5)
 
 
 @generates(
@@ -65,17 +68,17 @@ class Options(SiteOptions):
     parameters=Options,
 )
 def plants(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A stand of plants from L-systems: apple trees, vines, bushes, pines, or by rules of your own."""
+    """Stand of plants from L-systems: apple trees, vines, bushes, pines, or by custom rules."""
     grown = _grow_plants(options, source)
     largest = 1.0 + options.variation
     body = max(p.body[0] for p in grown) * largest
     width = 2 * max(p.spread for p in grown)
-    # One cell on each side of what a robot needs, since grids round obstacles up.
+    # one cell on each side of a robot, because grids round obstacles up
     need = 2 * (body + options.jitter + options.robot_radius) + 4 * (options.resolution or 0.1) + 0.1
     row_spacing = max(need, 1.1 * width) if options.row_spacing is None else options.row_spacing
     if row_spacing < need:
         raise invalid_option_error(
-            "row_spacing", f"must be at least {need:.2f} m, so that a robot passes between the plants"
+            "row_spacing", f"must be at least {need:.2f} m, for a robot to pass between the plants"
         )
     spacing = max(0.2, 1.1 * width) if options.spacing is None else options.spacing
     head = max(HEADLAND, need)
@@ -95,7 +98,7 @@ def plants(given: Layers, options: Options, source: RandomSource, notes: Derivat
             du, dv, turn, size, choice = chance.random(5).tolist()
             plant = grown[int(choice * len(grown))]
             scale = round(1.0 + options.variation * (2.0 * size - 1.0), 3)
-            shift = options.jitter * 0.7  # so that no corner of the square lies farther off
+            shift = options.jitter * 0.7  # so that no corner of the square is farther away
             x, y = place.to_local(head + column * spacing + shift * (2 * du - 1), v + shift * (2 * dv - 1))
             radius, height = (round(part * scale, 3) for part in plant.body)
             site.add_object(
@@ -122,14 +125,14 @@ def plants(given: Layers, options: Options, source: RandomSource, notes: Derivat
 
 
 def _grow_plants(options: Options, source: RandomSource) -> list[_plants.Plant]:
-    """The plants that stand here. Invalid and CannotGenerate say what is wrong with rules."""
+    """Grow the plants of this stand. Raises Invalid and CannotGenerate for invalid rules."""
     name: str = options.species if options.rules is None else "own"
     if options.rules is None:
         template = _plants.SPECIES[options.species]
     elif options.rules.strip():
         template = _plants.Species("plant", options.rules, 6)
     else:
-        raise Invalid("rules: there are none", [Problem("there are none", where="rules")])
+        raise Invalid("rules: missing", [Problem("missing", where="rules")])
     species = replace(
         template,
         iterations=template.iterations if options.iterations is None else options.iterations,

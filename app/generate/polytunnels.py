@@ -18,7 +18,7 @@ from app.model.layers import Layers
 from app.parameters import parameter
 
 CHORDS = 6
-"""Straight pieces of an arch."""
+"""Number of straight pieces of an arch."""
 
 MAX_TUNNELS = 60
 
@@ -28,18 +28,20 @@ class Polytunnels(FieldOptions):
     """Parameters of a field of polytunnels."""
 
     tunnels: int | None = parameter(
-        None, "tunnels; default: as many as the fence holds, 2 without one", minimum=1, maximum=MAX_TUNNELS
+        None, "number of tunnels; default: as many as fit into the fence, 2 without one", minimum=1, maximum=MAX_TUNNELS
     )
-    rows_per_tunnel: int = parameter(5, "rows of tables in a tunnel", minimum=1, maximum=20)
+    rows_per_tunnel: int = parameter(5, "number of table rows in a tunnel", minimum=1, maximum=20)
     row_spacing: float = parameter(
-        1.35, "from row to row; a tunnel's legs stand as far from its outer rows", minimum=0.8, maximum=6.0, unit="m"
+        1.35, "distance between rows, and between outer rows and a tunnel's legs", minimum=0.8, maximum=6.0, unit="m"
     )
-    table_width: float = parameter(0.3, "of the tables that the plants grow on", minimum=0.1, maximum=2.0, unit="m")
-    table_height: float = parameter(1.1, "of the tables' lower side", minimum=0.2, maximum=2.0, unit="m")
-    leg_spacing: float = parameter(2.5, "from leg to leg of a table", minimum=0.5, maximum=10.0, unit="m")
-    hoop_spacing: float = parameter(2.0, "from hoop to hoop of a tunnel", minimum=0.5, maximum=10.0, unit="m")
-    tunnel_height: float = parameter(3.6, "of the hoops", minimum=2.0, maximum=8.0, unit="m")
-    side_height: float = parameter(1.8, "of the hoops' straight legs", minimum=0.5, maximum=4.0, unit="m")
+    table_width: float = parameter(
+        0.3, "width of the tables that the plants grow on", minimum=0.1, maximum=2.0, unit="m"
+    )
+    table_height: float = parameter(1.1, "height of the tables' lower side", minimum=0.2, maximum=2.0, unit="m")
+    leg_spacing: float = parameter(2.5, "distance between the legs of a table", minimum=0.5, maximum=10.0, unit="m")
+    hoop_spacing: float = parameter(2.0, "distance between the hoops of a tunnel", minimum=0.5, maximum=10.0, unit="m")
+    tunnel_height: float = parameter(3.6, "height of the hoops", minimum=2.0, maximum=8.0, unit="m")
+    side_height: float = parameter(1.8, "height of the hoops' straight legs", minimum=0.5, maximum=4.0, unit="m")
 
 
 @generates(
@@ -63,14 +65,16 @@ def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes
     out.trim_after("legs")
     legs = [row for row in out.rows if row.kind == "legs"]
     if len(legs) < 2:
-        raise invalid_option_error("rows_per_tunnel", "the fence holds no whole tunnel: make it smaller")
+        raise invalid_option_error(
+            "rows_per_tunnel", "the fence has no room for a complete tunnel: make the tunnel smaller"
+        )
     if options.tunnels and len(legs) - 1 < options.tunnels:
-        notes.drop("tunnels", options.tunnels - len(legs) + 1, "the fence holds no more")
+        notes.drop("tunnels", options.tunnels - len(legs) + 1, "the fence has no room for them")
     parts = sum(row.length / options.hoop_spacing * (CHORDS + 1) for row in legs)
     parts += sum(row.length / options.leg_spacing * 2 for row in out.rows if row.kind == "row")
     if parts > _trees.MAX_PLANTS:
         raise invalid_option_error(
-            "hoop_spacing", f"there would be {int(parts)} hoops and legs; the limit is {_trees.MAX_PLANTS}"
+            "hoop_spacing", f"there would be {int(parts)} hoops and legs, the maximum is {_trees.MAX_PLANTS}"
         )
     if max(row.length for row in legs) / options.hoop_spacing * CHORDS > _trees.MAX_PER_ROW:
         raise invalid_option_error(
@@ -91,8 +95,11 @@ def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes
 
 
 def _lines(tunnels: int, rows: int) -> list[Line]:
-    """Legs, rows, legs, rows …, legs. The aisle between row 5 and the legs behind it is r5.3, that between the legs and
-    row 6 is r5.7, and others lie half-way, as in Riseholme."""
+    """Yield the lines of the field: legs, rows, legs, rows …, legs.
+
+    The aisle between row 5 and the legs behind it is r5.3, the one between the legs and row 6 is r5.7, and others are
+    half-way, as in Riseholme.
+    """
     out = []
     for tunnel in range(tunnels):
         first = tunnel * rows
@@ -102,18 +109,18 @@ def _lines(tunnels: int, rows: int) -> list[Line]:
 
 
 def _cover(out: Field, low: Row, high: Row) -> Any:
-    """The ground that a tunnel covers."""
+    """Return the ground that a tunnel covers."""
     return out.area(max(low.low, high.low), low.v, min(low.high, high.high), high.v)
 
 
 def _places(low: Row, high: Row, step: float) -> list[float]:
-    """Where hoops stand that both lines of legs have."""
+    """Return the positions of hoops that both lines of legs have."""
     both = Row(0, low.v, max(low.low, high.low), min(low.high, high.high), "legs")
     return _field.between(both, step) if both.length > 0 else []
 
 
 def _legs(site: Site, out: Field, row: Row, options: Polytunnels) -> None:
-    """The straight posts of a line of hoops, which two tunnels share."""
+    """Add the straight posts of a line of hoops, which two tunnels share."""
     h = mm(options.side_height)
     shapes = [
         {"type": "cylinder", "radius": 0.03, "length": h, "pose": [mm(u - row.low), 0.0, mm(h / 2), 0.0, 0.0, 0.0]}
@@ -135,7 +142,7 @@ def _legs(site: Site, out: Field, row: Row, options: Polytunnels) -> None:
 
 
 def _hoops(site: Site, out: Field, number: int, low: Row, high: Row, options: Polytunnels) -> None:
-    """The arches of a tunnel, from leg to leg."""
+    """Add the arches of a tunnel, from leg to leg."""
     half, rise = (high.v - low.v) / 2, options.tunnel_height - options.side_height
     turns = [math.pi * k / CHORDS for k in range(CHORDS + 1)]
     across = [(-half * math.cos(a), options.side_height + rise * math.sin(a)) for a in turns]
@@ -167,7 +174,7 @@ def _hoops(site: Site, out: Field, number: int, low: Row, high: Row, options: Po
 
 
 def _table(site: Site, out: Field, row: Row, options: Polytunnels, stream: np.random.Generator) -> None:
-    """A row of tables on legs, with plants, and the zone that it closes."""
+    """Add a row of tables on legs, with plants, and its keep-out zone."""
     width, low, thick = options.table_width, options.table_height, 0.15
     middle = [mm(row.length / 2), 0.0, mm(low + thick / 2), 0.0, 0.0, 0.0]
     shapes: list[dict[str, Any]] = [{"type": "box", "size": [mm(row.length), mm(width), thick], "pose": middle}]

@@ -1,7 +1,7 @@
-"""Natural ground: hills of gradient noise as a height map, trees where vegetation is dense, and what the slopes cost.
+"""Natural terrain: hills of gradient noise as a height map, trees in dense vegetation, and the cost of slopes.
 
-The floor of the level is where the highest hill ends: all ground lies below it, so that the grid, a slice above the
-floor, shows what stands on the ground and not the ground. How hard the ground is to drive on is a grid of its own.
+The floor of the level is at the top of the highest hill: all ground is below it, so that the grid, a slice above the
+floor, shows obstacles on the ground and not the ground. Slopes are a grid of their own.
 """
 
 from __future__ import annotations
@@ -35,37 +35,39 @@ U8 = NDArray[np.uint8]
 FILE = "heightmaps/terrain.png"
 
 POST_INSET_METRES = 0.3
-"""Metres of corner posts from the fence."""
+"""Distance of corner posts from the fence in metres."""
 
 MIN_SPEED_PERCENT = 10
-"""Percent of the robot's speed on the steepest ground that it can take."""
+"""Percentage of the robot's speed on the steepest ground that it can climb."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options(SiteOptions):
-    """Ground, trees, and what a robot can climb."""
+    """Parameters of terrain."""
 
-    width: float = parameter(40.0, "along x, where no fence says it", minimum=2.0, maximum=5000.0, unit="m")
-    depth: float = parameter(40.0, "along y, where no fence says it", minimum=2.0, maximum=5000.0, unit="m")
-    noise: Literal["simplex", "perlin"] = parameter("simplex", "which gradient noise")
-    feature: float = parameter(15.0, "from one hill to the next, about", minimum=0.1, maximum=10_000.0, unit="m")
-    octaves: int = parameter(4, "noise added up, each twice as fine as the one before", minimum=1, maximum=16)
-    persistence: float = parameter(0.4, "how strong each octave is to the one before", minimum=0.0, maximum=1.0)
-    lacunarity: float = parameter(2.0, "how fine each octave is to the one before", minimum=1.0, maximum=8.0)
-    relief: float = parameter(1.2, "from the lowest place to the highest", minimum=0.01, maximum=1000.0, unit="m")
+    width: float = parameter(40.0, "size along x, if there is no fence", minimum=2.0, maximum=5000.0, unit="m")
+    depth: float = parameter(40.0, "size along y, if there is no fence", minimum=2.0, maximum=5000.0, unit="m")
+    noise: Literal["simplex", "perlin"] = parameter("simplex", "type of gradient noise")
+    feature: float = parameter(15.0, "approximate distance between hills", minimum=0.1, maximum=10_000.0, unit="m")
+    octaves: int = parameter(4, "number of octaves of noise", minimum=1, maximum=16)
+    persistence: float = parameter(0.4, "amplitude of each octave relative to the one before", minimum=0.0, maximum=1.0)
+    lacunarity: float = parameter(2.0, "frequency of each octave relative to the one before", minimum=1.0, maximum=8.0)
+    relief: float = parameter(
+        1.2, "height difference between the lowest and the highest point", minimum=0.01, maximum=1000.0, unit="m"
+    )
     epoch: float = parameter(
-        0.0, "near numbers are like ground and woods, as if some time had passed", minimum=-1e6, maximum=1e6
+        0.0, "coordinate in time; close values give similar ground and woods", minimum=-1e6, maximum=1e6
     )
     detail: Literal["65", "129", "257", "513", "1025"] = parameter(
-        "257", "heights along a side of the height map; Gazebo wants a power of two and one"
+        "257", "number of heights along a side of the height map; Gazebo needs a power of two plus one"
     )
-    vegetation: float = parameter(0.25, "share of the ground that bears trees", minimum=0.0, maximum=1.0)
-    spacing: float = parameter(3.0, "from tree to tree in the woods", minimum=0.5, maximum=100.0, unit="m")
-    grove: float = parameter(12.0, "from one wood to the next, about", minimum=0.1, maximum=10_000.0, unit="m")
-    climb: float = parameter(15.0, "the steepest ground that a robot takes", minimum=0.1, maximum=89.0, unit="°")
+    vegetation: float = parameter(0.25, "share of the ground with trees", minimum=0.0, maximum=1.0)
+    spacing: float = parameter(3.0, "distance between trees in the woods", minimum=0.5, maximum=100.0, unit="m")
+    grove: float = parameter(12.0, "approximate distance between woods", minimum=0.1, maximum=10_000.0, unit="m")
+    climb: float = parameter(15.0, "maximum slope that a robot can climb", minimum=0.1, maximum=89.0, unit="°")
     rough: Literal["costs", "speed", "none"] = parameter(
         "costs",
-        "the grid that tells of slopes, one of Nav2's filter masks: costs (0 flat, 100 too steep), or speed in percent",
+        "grid of slopes, a Nav2 filter mask: costs (0 flat, 100 too steep), or speed in percent",
     )
 
 
@@ -73,13 +75,13 @@ class Options(SiteOptions):
     {"location", "objects", "occupancy", "topology", "imagery", "resources"}, parameters=Options, also={"location"}
 )
 def terrain(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """Hilly ground with woods: a height map for Gazebo, trees, and a grid of what the slopes cost."""
+    """Hilly ground with woods: a height map for Gazebo, trees, and a grid of slope costs."""
     site = Site(given, options, notes)
     box = site.set_fence(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
     columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
     if options.vegetation and rows * columns > MAX_OBJECTS:
         raise invalid_option_error(
-            "spacing", f"{columns} × {rows} places for trees are too many: give a larger spacing"
+            "spacing", f"{columns} × {rows} positions for trees are too many: use a larger spacing"
         )
     n = int(options.detail)
     x, y = np.linspace(box[0], box[2], n), np.linspace(box[1], box[3], n)
@@ -115,19 +117,19 @@ def terrain(given: Layers, options: Options, source: RandomSource, notes: Deriva
 
 
 def _heights(x: Array, y: Array, options: Options, source: RandomSource) -> Array:
-    """Heights from 0 (the lowest place) to 1, row 0 at the smallest y."""
+    """Return heights from 0 (the lowest point) to 1, row 0 at the smallest y."""
     fractal = Fractal(options.noise, options.feature, options.octaves, options.persistence, options.lacunarity)
     field = noise3(x, y, np.array([options.epoch]), fractal, source.stream("ground"))[0]
     low, high = float(field.min()), float(field.max())
     if high - low < 1e-9:
-        raise CannotGenerate("the ground is flat: give a smaller feature, or more octaves")
+        raise CannotGenerate("the ground is flat: use a smaller feature, or more octaves")
     return np.asarray((field - low) / (high - low), np.float64)
 
 
 def _trees(
     site: Site, ground: tuple[Array, Array, Array], shape: tuple[int, int], options: Options, source: RandomSource
 ) -> int:
-    """A tree in each place of a coarse raster where the vegetation's noise is among the densest; how many."""
+    """Add a tree in each cell of a coarse raster with the densest vegetation; return their number."""
     rows, columns = shape
     low_x, low_y = float(ground[0][0]), float(ground[1][0])
     draw = np.round(source.stream("trees").random((rows, columns, 4)), 6)
@@ -150,9 +152,9 @@ def _trees(
             continue
         count += 1
         base = mm(float(_heights_at(ground, np.array([at[0]]), np.array([at[1]]))[0]))
-        good = 0.5 * (tall + 0.5 + 0.5 * float(soil[r, c]))  # of chance and of the soil, which lasts
+        good = 0.5 * (tall + 0.5 + 0.5 * float(soil[r, c]))  # random and of the soil, which lasts
         radius, height = mm(0.1 + 0.15 * thick), mm(5.0 + 7.0 * good)
-        # Its trunk is to be met above the level's floor, wherever its foot is.
+        # the trunk must reach above the level's floor, wherever its foot is
         stem = mm(0.6 * height - base)
         crown = mm(min(0.22 * height, options.spacing))
         trunk: Mapping[str, Any] = {
@@ -182,10 +184,10 @@ def _trees(
 
 
 def _posts(site: Site, ground: tuple[Array, Array, Array], notes: DerivationNotes) -> None:
-    """A post at each corner of bare ground: without anything that stands there is nothing to find one's place by."""
+    """Add a post at each corner of bare ground: without any object robots cannot localise."""
     inner = shapely.buffer(site.fence, -POST_INSET_METRES, join_style="mitre")
     if inner.is_empty or inner.geom_type != "Polygon":
-        raise CannotGenerate("the ground is too narrow for posts at its corners: give some vegetation")
+        raise CannotGenerate("the ground is too narrow for posts at its corners: set vegetation above 0")
     corners = shapely.get_coordinates(inner.exterior)[:-1]
     for count, (x, y) in enumerate(corners.tolist(), 1):
         base = mm(float(_heights_at(ground, np.array([x]), np.array([y]))[0]))
@@ -208,11 +210,11 @@ def _posts(site: Site, ground: tuple[Array, Array, Array], notes: DerivationNote
             width=0.1,
             height=1.0,
         )
-    notes.fill("posts", len(corners), "no tree stands there: corner posts are what a robot can see")
+    notes.fill("posts", len(corners), "there are no trees; corner posts are landmarks for robots")
 
 
 def _heights_at(ground: tuple[Array, Array, Array], x: Array, y: Array) -> Array:
-    """Heights at points, straight between those of the map."""
+    """Return heights at points, interpolated linearly between those of the map."""
     xs, ys, height = ground
     u = np.clip((x - xs[0]) / (xs[-1] - xs[0]), 0.0, 1.0) * (len(xs) - 1)
     v = np.clip((y - ys[0]) / (ys[-1] - ys[0]), 0.0, 1.0) * (len(ys) - 1)
@@ -224,21 +226,21 @@ def _heights_at(ground: tuple[Array, Array, Array], x: Array, y: Array) -> Array
 
 
 def _steepness(grid: OccupancyGrid, ground: tuple[Array, Array, Array]) -> Array:
-    """The slope at each cell of a grid, metres up a metre: float64 [height, width]."""
+    """Return the slope at each cell of a grid, metres per metre: float64 [height, width]."""
     xs, ys, height = ground
     up_y, up_x = np.gradient(height, ys, xs)
     steep = np.sqrt(up_x * up_x + up_y * up_y)
     r = grid.resolution
     x = np.asarray(grid.origin[0] + (np.arange(grid.width) + 0.5) * r, np.float64)
     out = np.empty((grid.height, grid.width))
-    for row in range(grid.height):  # a row at a time: the arrays in between stay small
+    for row in range(grid.height):  # a row at a time: keeps the intermediate arrays small
         y = np.full(grid.width, grid.origin[1] + (row + 0.5) * r)
         out[row] = _heights_at((xs, ys, steep), x, y)
     return np.round(out, 6)
 
 
 def _costs(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
-    """Nav2's keepout mask: 0 where it is flat, 100 where it is too steep or something stands, between in proportion."""
+    """Return Nav2's keepout mask: 0 if flat, 100 if too steep or occupied, proportional in between."""
     cells = np.where(steep >= 1.0, OCCUPIED, np.floor(np.minimum(steep, 1.0) * 99.0)).astype(np.uint8)
     cells = np.where(grid.cells == FREE, cells, grid.cells).astype(np.uint8)
     properties = {masks.NAME: {"params": masks.params("costs", masks.FilterInfo(masks.KEEPOUT, 0.0, 1.0))}}
@@ -246,7 +248,7 @@ def _costs(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
 
 
 def _speed_mask(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
-    """Nav2's speed mask: percent of the robot's speed; 0, no limit, where it is nobody's business."""
+    """Return Nav2's speed mask: percent of the robot's speed; 0 (no limit) for cells that robots cannot reach."""
     percent = np.maximum(np.rint(100.0 * (1.0 - np.minimum(steep, 1.0))), MIN_SPEED_PERCENT).astype(np.uint8)
     cells = np.where(grid.cells == UNKNOWN, 0, percent).astype(np.uint8)
     info = masks.FilterInfo(masks.SPEED_PERCENT, 0.0, 1.0)
@@ -255,7 +257,7 @@ def _speed_mask(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
 
 
 def _png(grey: U8) -> bytes:
-    """An 8-bit grey PNG that is the same on every machine: nothing is compressed, since how that is done differs."""
+    """Write an 8-bit grey PNG with the same bytes on every machine: uncompressed, because compression differs."""
     rows, columns = grey.shape
     data = np.concatenate([np.zeros((rows, 1), np.uint8), grey], axis=1).tobytes()
     blocks = [b"\x78\x01"]

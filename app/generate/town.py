@@ -1,4 +1,4 @@
-"""A town quarter: streets, blocks, lots and buildings that a grammar makes of a boundary."""
+"""Town quarter: streets, blocks, lots and buildings from a boundary, by a grammar."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ house : width >= 6 & area <= 400 @ 1 -> flat(rand(1, storeys))
 
 STOREY = 2.9
 MAX_AREA_M2 = 25e6
-"""Square metres of a boundary."""
+"""Maximum area of a boundary in square metres."""
 
 MAX_BOUNDARY_POINTS = 1000
 MARGIN = 2.0
@@ -51,29 +51,35 @@ MAX_TREES = 5000
 
 @dataclass(frozen=True, slots=True)
 class Options(SiteOptions):
-    """The boundary, the rules, and the numbers that these use."""
+    """Parameters of a town."""
 
     boundary: tuple[float, ...] | None = parameter(
-        None, "x1,y1,x2,y2,… corners of the town, local metres; default: the fence, else width × depth"
+        None, "x1,y1,x2,y2,… corners of the town, in local metres; default: the fence, else width × depth"
     )
-    width: float = parameter(200.0, "of the town, where no boundary is given", minimum=30.0, maximum=5000.0, unit="m")
-    depth: float = parameter(150.0, "of the town, where no boundary is given", minimum=30.0, maximum=5000.0, unit="m")
+    width: float = parameter(
+        200.0, "width of the town, if there is no boundary", minimum=30.0, maximum=5000.0, unit="m"
+    )
+    depth: float = parameter(
+        150.0, "depth of the town, if there is no boundary", minimum=30.0, maximum=5000.0, unit="m"
+    )
     rules: str | None = parameter(
         None,
-        "a grammar of one's own instead of the built-in one, rules on lines of their own or between semicolons; it may "
+        "grammar instead of the built-in one, rules on separate lines or separated by semicolons; it may "
         "use the constants main, street, block, lot, setback and storeys",
     )
-    main: float = parameter(14.0, "width of main streets, houses to houses", minimum=4.0, maximum=100.0, unit="m")
+    main: float = parameter(14.0, "width of main streets, between house fronts", minimum=4.0, maximum=100.0, unit="m")
     street: float = parameter(11.0, "width of the other streets", minimum=4.0, maximum=100.0, unit="m")
     sidewalk: float = parameter(
         2.5, "width of sidewalks, at most a quarter of a street", minimum=1.0, maximum=20.0, unit="m"
     )
-    block: float = parameter(4500.0, "largest block", minimum=200.0, maximum=1e6, unit="m²")
-    lot: float = parameter(320.0, "usual lot", minimum=50.0, maximum=1e5, unit="m²")
-    setback: float = parameter(3.0, "between a lot's edge and its building", minimum=0.0, maximum=100.0, unit="m")
-    storeys: int = parameter(5, "of the highest building", minimum=1, maximum=50)
+    block: float = parameter(4500.0, "maximum area of a block", minimum=200.0, maximum=1e6, unit="m²")
+    lot: float = parameter(320.0, "typical area of a lot", minimum=50.0, maximum=1e5, unit="m²")
+    setback: float = parameter(
+        3.0, "distance between a lot's edge and its building", minimum=0.0, maximum=100.0, unit="m"
+    )
+    storeys: int = parameter(5, "number of storeys of the highest building", minimum=1, maximum=50)
     trees: bool = parameter(True, "whether parks and gardens have trees and bushes")
-    lamps: bool = parameter(True, "whether lamps stand along the sidewalks")
+    lamps: bool = parameter(True, "whether there are lamps along the sidewalks")
 
 
 @generates(
@@ -82,7 +88,7 @@ class Options(SiteOptions):
     parameters=Options,
 )
 def town(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A town quarter: streets with lanes, sidewalks and crossings, blocks, lots and buildings by a rule grammar."""
+    """Town quarter: streets with lanes, sidewalks and crossings, blocks, lots and buildings by a rule grammar."""
     constants = {
         name: float(getattr(options, name)) for name in ("main", "street", "block", "lot", "setback", "storeys")
     }
@@ -91,12 +97,12 @@ def town(given: Layers, options: Options, source: RandomSource, notes: Derivatio
     boundary = _town_boundary(site, options)
     layout = _blocks.grow(grammar, boundary, source.stream("rules"))
     if not layout.streets:
-        raise CannotGenerate("the rules make no street: use ring or cut", [Problem("no street", where="rules")])
+        raise CannotGenerate("the rules create no street: use ring or cut", [Problem("no street", where="rules")])
     streets = _streets.build_streets(layout.streets, options.sidewalk)
     need = options.robot_radius + SLACK * site.resolution
     if streets.walk / 2 < need:
         raise invalid_option_error(
-            "sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs {2 * need:.2f} m"
+            "sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs at least {2 * need:.2f} m"
         )
     _paint(site, streets, layout, boundary)
     _buildings(site, [lot for lot in layout.lots if lot.use in _blocks.ROOFS])
@@ -114,7 +120,7 @@ def town(given: Layers, options: Options, source: RandomSource, notes: Derivatio
 
 
 def _town_boundary(site: Site, options: Options) -> Any:
-    """The town's boundary: the one that was asked for, else the fence, else a rectangle."""
+    """Return the town's boundary: the requested one, else the fence, else a rectangle."""
     boundary = None if options.boundary is None else _polygon(options.boundary)
     outline = shapely.box(0.0, 0.0, options.width, options.depth) if boundary is None else boundary
     if outline.area > MAX_AREA_M2:
@@ -125,7 +131,7 @@ def _town_boundary(site: Site, options: Options) -> Any:
         return outline
     if boundary is not None:
         if not shapely.contains(fence, boundary):
-            raise invalid_option_error("boundary", "reaches beyond the fence of the environment")
+            raise invalid_option_error("boundary", "extends beyond the fence of the environment")
         return boundary
     inner = [p for p in shapely.get_parts(shapely.buffer(fence, -0.5, join_style="mitre")) if p.area > 0]
     if not inner:
@@ -134,7 +140,7 @@ def _town_boundary(site: Site, options: Options) -> Any:
 
 
 def _polygon(numbers: Sequence[float]) -> Any:
-    """The polygon of x1,y1,x2,y2,…: Invalid where it is none."""
+    """Parse a polygon of x1,y1,x2,y2,…. Raises Invalid if it is none."""
 
     def wrong(problem: str) -> Invalid:
         return Invalid(f"boundary: {problem}", [Problem(problem, where="boundary")])
@@ -142,21 +148,21 @@ def _polygon(numbers: Sequence[float]) -> Any:
     if len(numbers) % 2 or not 6 <= len(numbers) <= 2 * MAX_BOUNDARY_POINTS:
         raise wrong(f"must be x,y of 3 to {MAX_BOUNDARY_POINTS} corners, got {len(numbers)} numbers")
     if max(map(abs, numbers)) > 1e6:
-        raise wrong("must lie within a million metres of the origin")
+        raise wrong("must be within a million metres of the origin")
     ring = [(mm(x), mm(y)) for x, y in zip(numbers[::2], numbers[1::2], strict=True)]
     polygon = shapely.Polygon(ring)
     if not polygon.is_valid:
-        raise wrong(f"is no polygon: {shapely.is_valid_reason(polygon)}")
+        raise wrong(f"is not a valid polygon: {shapely.is_valid_reason(polygon)}")
     if polygon.area < 100.0:
-        raise wrong(f"has an area of {polygon.area:g} m²; a town needs 100 m² at least")
+        raise wrong(f"has an area of {polygon.area:g} m², a town needs at least 100 m²")
     return shapely.normalize(polygon)
 
 
-# --- what is seen -----------------------------------------------------------------------------------------------------
+# --- appearance -------------------------------------------------------------------------------------------------
 
 
 def _paint(site: Site, streets: _streets.Streets, layout: _blocks.Town, boundary: Any) -> None:
-    """Ground and roads."""
+    """Paint ground and roads."""
     site.draw(boundary, "paving")
     for k, link in enumerate(streets.links):
         half = streets.carriage(link) / 2
@@ -176,7 +182,7 @@ def _paint(site: Site, streets: _streets.Streets, layout: _blocks.Town, boundary
 
 
 def _buildings(site: Site, lots: Sequence[Lot]) -> None:
-    """Buildings on their lots."""
+    """Add buildings on their lots."""
     if any(lot.use == "gable" for lot in lots):
         site.files["models/roofs/meshes/gable.obj"] = _plants.obj(_roof(0.5), "roof")
     if any(lot.use == "hip" for lot in lots):
@@ -223,8 +229,10 @@ def _buildings(site: Site, lots: Sequence[Lot]) -> None:
 
 
 def _rectangle(area: Any) -> tuple[Any, tuple[float, float], float, float, float] | None:
-    """The largest rectangle in an area that lies as the one around it: (polygon, middle, yaw, length, width); None
-    where it is hardly more than a shed."""
+    """Return the largest rectangle in an area, aligned with its enclosing rectangle.
+
+    Returns (polygon, middle, yaw, length, width); None if it is hardly larger than a shed.
+    """
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
     a, b = corners[1] - corners[0], corners[2] - corners[1]
     long, short = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
@@ -244,7 +252,7 @@ def _rectangle(area: Any) -> tuple[Any, tuple[float, float], float, float, float
 
 
 def _roof(ridge: float) -> Any:
-    """A roof over a square of one metre, one metre high, its ridge from -ridge to ridge along x: triangles."""
+    """Return a roof over a square of one metre, one metre high, its ridge from -ridge to ridge along x: triangles."""
     a, b, c, d = ((-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0))
     e, f = (-ridge, 0.0, 1.0), (ridge, 0.0, 1.0)
     faces = [(a, b, f), (a, f, e), (c, d, e), (c, e, f), (b, c, f), (d, a, e), (a, d, c), (a, c, b)]
@@ -252,12 +260,10 @@ def _roof(ridge: float) -> Any:
 
 
 def _lamps(site: Site, streets: _streets.Streets, need: float, notes: DerivationNotes) -> None:
-    """Lamps at the kerb, where a robot still passes beside them."""
+    """Add lamps at the kerb if a robot can still pass them."""
     off = streets.walk / 2 - 0.25
     if off - LAMP[0] < need:
-        notes.warn(
-            "there are no lamps: a robot would not pass beside them on the sidewalks, or not in cells of this size"
-        )
+        notes.warn("there are no lamps; a robot could not pass them on the sidewalks at this resolution")
         return
     roads = shapely.STRtree([shapely.buffer(link.line, streets.carriage(link) / 2) for link in streets.links])
     reserved = shapely.STRtree([shapely.Point(at) for at in streets.kept])
@@ -277,7 +283,7 @@ def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Derivation
 
 
 def _green(site: Site, lots: Sequence[Lot], source: RandomSource) -> None:
-    """Trees in parks, bushes and a tree in gardens, benches on squares."""
+    """Add trees in parks, bushes and a tree in gardens, benches on squares."""
     chance = source.stream("green")
     kinds = {name: _plants.grow_plants(name, count, source) for name, count in (("apple", 3), ("pine", 2), ("bush", 2))}
     trees = benches = 0

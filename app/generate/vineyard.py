@@ -19,22 +19,27 @@ class Vineyard(FieldOptions):
     """Parameters of a vineyard."""
 
     rows: int | None = parameter(
-        None, "rows of vines; default: as many as the fence holds, 9 without one", minimum=2, maximum=_field.MAX_ROWS
+        None,
+        "number of vine rows; default: as many as fit into the fence, 9 without one",
+        minimum=2,
+        maximum=_field.MAX_ROWS,
     )
-    row_spacing: float = parameter(2.5, "from row to row", minimum=1.0, maximum=10.0, unit="m")
-    vine_spacing: float = parameter(1.2, "from vine to vine in a row", minimum=0.3, maximum=10.0, unit="m")
-    jitter: float = parameter(0.05, "how far a vine may stand from its place", minimum=0.0, maximum=1.0, unit="m")
-    post_spacing: float = parameter(6.0, "from post to post of the trellis", minimum=1.0, maximum=30.0, unit="m")
-    canopy_width: float = parameter(0.5, "of the leaves on the wires", minimum=0.1, maximum=3.0, unit="m")
+    row_spacing: float = parameter(2.5, "distance between rows", minimum=1.0, maximum=10.0, unit="m")
+    vine_spacing: float = parameter(1.2, "distance between vines in a row", minimum=0.3, maximum=10.0, unit="m")
+    jitter: float = parameter(0.05, "maximum random offset of a vine", minimum=0.0, maximum=1.0, unit="m")
+    post_spacing: float = parameter(6.0, "distance between posts of the trellis", minimum=1.0, maximum=30.0, unit="m")
+    canopy_width: float = parameter(0.5, "thickness of the leaves on the wires", minimum=0.1, maximum=3.0, unit="m")
     canopy_base: float = parameter(
-        0.7, "of the leaves' lower side above the ground", minimum=0.1, maximum=3.0, unit="m"
+        0.7, "height of the leaves' lower side above the ground", minimum=0.1, maximum=3.0, unit="m"
     )
-    canopy_top: float = parameter(1.9, "of the leaves' upper side above the ground", minimum=0.3, maximum=4.0, unit="m")
+    canopy_top: float = parameter(
+        1.9, "height of the leaves' upper side above the ground", minimum=0.3, maximum=4.0, unit="m"
+    )
 
 
 @generates({"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Vineyard, also={"location"})
 def vineyard(given: Layers, options: Vineyard, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A vineyard: vines on trellises with posts and wires that no robot may pass, headlands, and a yard."""
+    """Vineyard: vines on trellises with posts and wires that robots cannot pass, headlands, and a yard."""
     if options.canopy_top <= options.canopy_base:
         raise invalid_option_error("canopy_top", "must be above canopy_base")
     site = Site(given, options, notes, coloured=True)
@@ -48,7 +53,7 @@ def vineyard(given: Layers, options: Vineyard, source: RandomSource, notes: Deri
     )
     vines = sum(int(row.length / options.vine_spacing) + 1 for row in out.rows)
     if vines > _trees.MAX_PLANTS:
-        raise invalid_option_error("vine_spacing", f"there would be {vines} vines; the limit is {_trees.MAX_PLANTS}")
+        raise invalid_option_error("vine_spacing", f"there would be {vines} vines, the maximum is {_trees.MAX_PLANTS}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
         _trellis(site, out, row, options)
@@ -63,7 +68,7 @@ def vineyard(given: Layers, options: Vineyard, source: RandomSource, notes: Deri
 
 
 def _trellis(site: Site, out: Field, row: Row, options: Vineyard) -> None:
-    """Posts with wires between them, and the zone that they close."""
+    """Add posts with wires between them, and their keep-out zone."""
     site.draw(out.strip(row, options.canopy_width + 0.2), "soil")
     step = row.length / max(1, round(row.length / options.post_spacing))
     shapes: list[dict[str, Any]] = []
@@ -84,7 +89,7 @@ def _trellis(site: Site, out: Field, row: Row, options: Vineyard) -> None:
 def _vine(
     site: Site, i: str, out: Field, place: tuple[float, float], row: Row, options: Vineyard, chance: list[float]
 ) -> None:
-    """A vine: a trunk, and its leaves on the wires."""
+    """Add a vine: a trunk, and its leaves on the wires."""
     at = out.to_local(*place)
     low, high = (
         options.canopy_base,
@@ -93,7 +98,7 @@ def _vine(
     wide = options.canopy_width * (0.7 + 0.3 * chance[1])
     along = min(options.vine_spacing, 2 * min(place[0] - row.low, row.high - place[0]) + options.vine_spacing / 2)
     stem = [0.0, 0.0, mm(low / 2), 0.0, 0.0, 0.0]
-    across = row.v - place[1]  # the leaves hang on the wires, wherever the trunk stands
+    across = row.v - place[1]  # the leaves hang on the wires, independent of the trunk's position
     shapes: list[dict[str, Any]] = [
         {"type": "cylinder", "radius": 0.04, "length": mm(low), "pose": stem, "colour": rgb("wood")},
         {

@@ -18,10 +18,10 @@ from app.model.layers import Layers
 from app.parameters import parameter
 
 WALL = 0.2
-"""Metres of a wall's thickness."""
+"""Thickness of a wall in metres."""
 
 BAY = 2.8
-"""Metres from upright to upright of a rack."""
+"""Distance between the uprights of a rack in metres."""
 
 PALLET = (1.2, 0.8)
 
@@ -32,38 +32,41 @@ class Warehouse(FieldOptions):
 
     row_length: float | None = parameter(
         None,
-        "longest rack; default: as long as the fence allows, 24 where there is none",
+        "maximum length of a rack; default: as long as the fence allows, 24 without a fence",
         minimum=3.0,
         maximum=1000.0,
         unit="m",
     )
     headland: float = parameter(
-        4.0, "cross aisle between the racks' ends and the wall", minimum=1.5, maximum=50.0, unit="m"
+        4.0, "width of the cross aisle between the racks' ends and the wall", minimum=1.5, maximum=50.0, unit="m"
     )
     yard: float = parameter(
         8.0, "depth of the dispatch area along the longest side", minimum=6.0, maximum=50.0, unit="m"
     )
-    docks: int = parameter(3, "loading docks in the longest side", minimum=1, maximum=50)
+    docks: int = parameter(3, "number of loading docks in the longest side", minimum=1, maximum=50)
     racks: int | None = parameter(
-        None, "double racks; default: as many as the fence holds, 5 without one", minimum=2, maximum=_field.MAX_ROWS
+        None,
+        "number of double racks; default: as many as fit into the fence, 5 without one",
+        minimum=2,
+        maximum=_field.MAX_ROWS,
     )
-    aisle: float = parameter(2.8, "between two racks", minimum=0.8, maximum=20.0, unit="m")
+    aisle: float = parameter(2.8, "width of the aisle between two racks", minimum=0.8, maximum=20.0, unit="m")
     rack_depth: float = parameter(
-        1.0, "of one of the two racks that stand back to back", minimum=0.3, maximum=5.0, unit="m"
+        1.0, "depth of one of the two racks that stand back to back", minimum=0.3, maximum=5.0, unit="m"
     )
-    rack_height: float = parameter(5.0, "of the racks", minimum=1.0, maximum=15.0, unit="m")
-    filled: float = parameter(0.85, "share of the places on the floor that hold a pallet", minimum=0.0, maximum=1.0)
-    chargers: int = parameter(2, "charging places", minimum=1, maximum=50)
-    parking: int = parameter(2, "parking places", minimum=0, maximum=50)
-    one_way: bool = parameter(False, "whether aisles are driven one way, in turns there and back")
-    wall_height: float = parameter(7.0, "of the hall's walls", minimum=2.0, maximum=20.0, unit="m")
+    rack_height: float = parameter(5.0, "height of the racks", minimum=1.0, maximum=15.0, unit="m")
+    filled: float = parameter(0.85, "share of pallet places on the floor that are occupied", minimum=0.0, maximum=1.0)
+    chargers: int = parameter(2, "number of charging places", minimum=1, maximum=50)
+    parking: int = parameter(2, "number of parking places", minimum=0, maximum=50)
+    one_way: bool = parameter(False, "whether aisles are one-way, in alternating directions")
+    wall_height: float = parameter(7.0, "height of the hall's walls", minimum=2.0, maximum=20.0, unit="m")
 
 
 @generates(
     {"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Warehouse, also={"location"}
 )
 def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """A warehouse: a hall with racks and pallets, aisles (one-way on request), loading docks, chargers and parking."""
+    """Warehouse: a hall with racks and pallets, aisles (optionally one-way), loading docks, chargers and parking."""
     site = Site(given, options, notes, coloured=True)
     lines = [Line("row", k, f"A{k}") for k in range(1, (options.racks or _field.MAX_ROWS) + 1)]
     out = _field.open_field(
@@ -79,7 +82,9 @@ def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: De
     site.draw(site.fence, "floor")
     pallets = sum(4 * row.length / BAY for row in out.rows)
     if pallets > _trees.MAX_PLANTS:
-        raise invalid_option_error("racks", f"there would be {int(pallets)} pallets; the limit is {_trees.MAX_PLANTS}")
+        raise invalid_option_error(
+            "racks", f"there would be {int(pallets)} pallets, the maximum is {_trees.MAX_PLANTS}"
+        )
     for row in out.rows:
         _rack(site, out, row, options, source.stream(f"pallets {row.number}"))
     _field.network(
@@ -95,7 +100,7 @@ def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: De
 
 
 def _rack(site: Site, out: Field, row: Row, options: Warehouse, stream: np.random.Generator) -> None:
-    """Two racks back to back, the pallets on their floor, and the zone that they close."""
+    """Add two racks back to back, the pallets on their floor, and their keep-out zone."""
     depth, height = options.rack_depth, options.rack_height
     bays = max(1, int(row.length / BAY))
     bay = row.length / bays
@@ -140,8 +145,10 @@ def _rack(site: Site, out: Field, row: Row, options: Warehouse, stream: np.rando
 
 
 def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
-    """The dispatch area: doors with docks, chargers, parking places, and walls around the hall. Its nodes on the lane,
-    and their u."""
+    """Build the dispatch area: doors with docks, chargers, parking places, and walls around the hall.
+
+    Returns its nodes on the lane, and their u.
+    """
     lane, radius = out.aisles[0], options.robot_radius
     names = [f"Dock{k + 1}" for k in range(options.docks)]
     names += [f"Charger{k + 1}" for k in range(options.chargers)]
@@ -202,7 +209,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
 
 
 def _walls(site: Site, doors: list[Any], height: float) -> None:
-    """Walls around the hall, open at the doors."""
+    """Add walls around the hall, open at the doors."""
     inside = shapely.buffer(site.fence, -WALL, join_style="mitre")
     walls = shapely.difference(shapely.difference(site.fence, inside), shapely.union_all(doors))
     for k, piece in enumerate(sorted(shapely.get_parts(walls), key=lambda p: p.bounds), 1):
@@ -215,7 +222,7 @@ def _walls(site: Site, doors: list[Any], height: float) -> None:
 
 
 def _door(fence: Any, gap: Any) -> Any:
-    """A door from side to side of a gap in the wall, along it."""
+    """Add a door from side to side of a gap in the wall, along it."""
     middle = shapely.intersection(shapely.boundary(shapely.buffer(fence, -WALL / 2, join_style="mitre")), gap)
     parts = shapely.get_parts(shapely.line_merge(middle))
     return max(parts, key=shapely.length)

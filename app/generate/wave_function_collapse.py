@@ -1,7 +1,7 @@
-"""Wave-function collapse: a site of which every small window stands in a sample (Gumin 2016; ``_wfc``).
+"""Wave-function collapse: a site in which every small window occurs in a sample (Gumin 2016; ``_wfc``).
 
-The sample is one of ours, 5 m × 5 m, or a grid of the environment. With ``order=rows`` the shares of tiles and of
-neighbours stay near the sample's; where the least entropy decides what comes next, rare patterns become rarer.
+The sample is a built-in one, 5 m × 5 m, or a grid of the environment. With ``order=rows`` the shares of tiles and of
+neighbours stay close to the sample's; with lowest entropy first, rare patterns become rarer.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ U8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
 SAMPLE_METRES = 5.0
-"""Metres of our own samples."""
+"""Side of the built-in samples in metres."""
 
 RESOLUTION = 0.05
 
 MAX_SAMPLE_CELLS = 2**18
-"""Tiles of a sample."""
+"""Maximum number of tiles of a sample."""
 
 WALL = 0.1
-"""Metres of a site's outer wall, at least one tile."""
+"""Thickness of a site's outer wall in metres, at least one tile."""
 
 BORDER = 99
-"""How cells of the outer wall are told from what stands inside."""
+"""Object kind of the outer wall's cells, to distinguish them from those inside."""
 
 Rectangles = tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A place to learn from: rectangles (x, y, width, depth in metres) of what stands there."""
+    """Built-in sample: rectangles (x, y, width, depth in metres) of its obstacles."""
 
     look: CellStyle
     rectangles: Rectangles
 
     def cells(self, resolution: float) -> U8:
-        """The sample as a grid: 0 free, 100 occupied; row 0 is the lowest."""
+        """Draw the sample as a grid: 0 free, 100 occupied; row 0 is the lowest."""
         n = max(1, round(SAMPLE_METRES / resolution))
         out = np.full((n, n), FREE, np.uint8)
         for x, y, w, d in self.rectangles:
@@ -82,36 +82,41 @@ SAMPLES: Mapping[str, Sample] = {
 
 @dataclass(frozen=True, slots=True)
 class Options(SiteOptions):
-    """The sample, what is learned of it, and what is made."""
+    """Parameters of wave-function collapse."""
 
     sample: str = parameter(
-        "warehouse", f"one of {', '.join(SAMPLES)}, or the name of a grid of the environment; its cells are the site's"
+        "warehouse",
+        f"sample: {', '.join(SAMPLES)}, or the name of a grid of the environment, whose cell size is used",
     )
-    width: float = parameter(10.0, "along x, where no fence says it", minimum=0.5, maximum=10_000.0, unit="m")
-    depth: float = parameter(10.0, "along y, where no fence says it", minimum=0.5, maximum=10_000.0, unit="m")
+    width: float = parameter(10.0, "size along x, if there is no fence", minimum=0.5, maximum=10_000.0, unit="m")
+    depth: float = parameter(10.0, "size along y, if there is no fence", minimum=0.5, maximum=10_000.0, unit="m")
     model: Literal["overlapping", "tiled"] = parameter(
-        "overlapping", "every window of tiles stands in the sample, or only every pair of neighbours"
+        "overlapping", "overlapping: every window of tiles occurs in the sample; tiled: every pair of neighbours does"
     )
     pattern: int | None = parameter(
-        None, "overlapping: tiles along a window [5]; more is truer, and harder to go on from", minimum=2, maximum=8
+        None,
+        "overlapping: tiles along a window; default: 5; larger is closer to the sample and harder to solve",
+        minimum=2,
+        maximum=8,
     )
-    tile: int | None = parameter(None, "cells along a tile [overlapping: 1, tiled: 2]", minimum=1, maximum=64)
+    tile: int | None = parameter(
+        None, "number of cells along a tile; default: overlapping 1, tiled 2", minimum=1, maximum=64
+    )
     symmetry: Literal["none", "mirror", "rotate", "all"] = parameter(
-        "none", "whether the sample is also taken mirrored, turned by quarters, or both"
+        "none", "whether the sample is also used mirrored, rotated by quarters, or both"
     )
-    wrap: bool = parameter(False, "whether the sample goes on at its other side")
+    wrap: bool = parameter(False, "whether the sample continues at its other side")
     border: Literal["walls", "open", "periodic"] = parameter(
-        "walls", "closed by walls; cut out of something larger; or such that copies fit side by side"
+        "walls",
+        "border: closed by walls; open like a section of a larger site; or periodic, so that copies fit together",
     )
     order: Literal["rows", "entropy"] = parameter(
-        "rows", "what is decided next: row by row, true to the sample's shares, or where the entropy is least"
+        "rows", "order of decisions: row by row, close to the sample's shares, or lowest entropy first"
     )
-    connected: bool = parameter(True, "whether all free cells are to be one piece")
-    free: tuple[float, ...] = parameter((), "x,y,x,y,…: places that stay free", unit="m")
-    blocked: tuple[float, ...] = parameter((), "x,y,x,y,…: places that are to be occupied", unit="m")
-    repairs: int = parameter(
-        20_000, "contradictions in one attempt after which it is given up", minimum=0, maximum=1_000_000
-    )
+    connected: bool = parameter(True, "whether all free cells must be one piece")
+    free: tuple[float, ...] = parameter((), "positions that stay free, as x,y,x,y,…", unit="m")
+    blocked: tuple[float, ...] = parameter((), "positions that are occupied, as x,y,x,y,…", unit="m")
+    repairs: int = parameter(20_000, "maximum number of contradictions in one attempt", minimum=0, maximum=1_000_000)
 
 
 @generates(
@@ -121,10 +126,10 @@ class Options(SiteOptions):
     version=2,
 )
 def wave_function_collapse(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """Wave-function collapse: a place every window of which stands in a sample.
+    """Site by wave-function collapse, in which every window occurs in a sample.
 
-    Raises CannotGenerate for a sample that is not there, too large or too varied, for fixed places that contradict it,
-    and where all attempts fail.
+    Raises CannotGenerate for a sample that does not exist or is too large or too varied, for fixed positions that
+    contradict it, and if all attempts fail.
     """
     sample, known_cells, resolution, look = _sample(given, options, notes)
     pattern = _pattern(options)
@@ -132,20 +137,20 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     sample, known_cells = _whole_tiles(sample, known_cells, tile, notes)
     if sample.size > MAX_SAMPLE_CELLS * tile * tile:
         raise invalid_option_error(
-            "sample", f"has {sample.size // tile**2} tiles, the limit is {MAX_SAMPLE_CELLS}: give a larger tile"
+            "sample", f"has {sample.size // tile**2} tiles, the maximum is {MAX_SAMPLE_CELLS}: use a larger tile"
         )
     site = Site(given, options, notes)
     place = _cells.site_grid_frame(site, options.width, options.depth, resolution, step=tile)
     if options.wrap and options.border == "walls":
         raise invalid_option_error(
-            "wrap", "a sample that goes on at its other side has no walls: give border=open or periodic"
+            "wrap", "a sample that continues at its other side has no walls: use border=open or periodic"
         )
     thick = max(1, round(WALL / (resolution * tile))) if options.border == "walls" else 0
     rows, columns = place.rows // tile, place.columns // tile
     if min(rows, columns) < max(pattern, 2 * thick + 1):
         min_side = max(pattern, 2 * thick + 1) * tile * resolution
         raise invalid_option_error(
-            "width", f"{columns} × {rows} tiles are too few: at least {min_side:g} m along each side are needed"
+            "width", f"{columns} × {rows} tiles are too few: each side must be at least {min_side:g} m"
         )
     if thick:
         ring = max(pattern - 1, thick) * tile
@@ -166,10 +171,10 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
         for x, y in _points(getattr(options, option), option):
             r, c = int((y - place.y) // size), int((x - place.x) // size)
             if not (0 <= r < rows and 0 <= c < columns):
-                raise invalid_option_error(option, f"({x:g}, {y:g}) lies outside of the site")
+                raise invalid_option_error(option, f"({x:g}, {y:g}) is outside the site")
             number = _single_index(mask, option, label)
             if fixed[r, c] not in (-1, number):
-                raise invalid_option_error(option, f"({x:g}, {y:g}) lies on a wall, or is to be free and occupied")
+                raise invalid_option_error(option, f"({x:g}, {y:g}) is on a wall, or both free and occupied")
             fixed[r, c] = number
     tiles = _wfc.collapse_model(
         model,
@@ -192,12 +197,12 @@ def _pattern(options: Options) -> int:
     if options.model == "overlapping":
         return options.pattern or 5
     if options.pattern is not None:
-        raise invalid_option_error("pattern", "belongs to model=overlapping: a tiled model knows only neighbours")
+        raise invalid_option_error("pattern", "applies only to model=overlapping: a tiled model uses only neighbours")
     return 1
 
 
 def _sample(given: Layers, options: Options, notes: DerivationNotes) -> tuple[U8, Bool, float, CellStyle]:
-    """(cells of 0 and 100, which of them are known, metres a cell, what its obstacles are)."""
+    """Return (cells of 0 and 100, which of them are known, metres per cell, kind of its obstacles)."""
     grids = {key.name: grid for key, grid in reversed(given.grids().items())}
     if options.sample in SAMPLES and options.sample not in grids:
         sample = SAMPLES[options.sample]
@@ -209,18 +214,18 @@ def _sample(given: Layers, options: Options, notes: DerivationNotes) -> tuple[U8
         grid_names = ", ".join(sorted(grids)) or "none"
         raise invalid_option_error(
             "sample",
-            f"there is no sample {options.sample[:80]!r}: give one of {', '.join(SAMPLES)}, or a grid ({grid_names})",
+            f"unknown sample {options.sample[:80]!r}: use one of {', '.join(SAMPLES)}, or a grid ({grid_names})",
         )
     resolution = round(grid.resolution, 3)
     if options.resolution is not None and abs(options.resolution - grid.resolution) > 1e-6:
-        raise invalid_option_error("resolution", f"is the sample's, {grid.resolution:g} m: leave it out")
+        raise invalid_option_error("resolution", f"is the sample's, {grid.resolution:g} m: omit it")
     if resolution != grid.resolution:
         notes.fill("resolution", resolution, f"the sample's {grid.resolution!r} m in whole millimetres")
     return *binary(grid), resolution or RESOLUTION, STYLES["obstacle"]
 
 
 def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
-    """A grid's cells as 0 and 100, by its threshold, and which of them are known."""
+    """Return a grid's cells as 0 and 100, by its threshold, and which of them are known."""
     grid = unknown_grey_as_unknown(grid)
     known_cells = grid.cells != UNKNOWN
     occupied = known_cells & (grid.cells >= grid.occupied_thresh * OCCUPIED)
@@ -228,7 +233,7 @@ def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
 
 
 def _whole_tiles(cells: U8, known_cells: Bool, tile: int, notes: DerivationNotes) -> tuple[U8, Bool]:
-    """A sample of whole tiles."""
+    """Crop a sample to whole tiles."""
     rows, columns = (n // tile * tile for n in cells.shape)
     lost = cells.size - rows * columns
     if not rows * columns:
@@ -243,7 +248,7 @@ def _single_index(mask: Bool, option: str, label: str) -> int:
     indices = np.flatnonzero(mask)
     if not len(indices):
         raise invalid_option_error(
-            option, f"the sample has no {label.split(' ', 1)[1]} of this size: give a smaller tile"
+            option, f"the sample has no {label.split(' ', 1)[1]} of this size: use a smaller tile"
         )
     return int(indices[0])
 
@@ -251,6 +256,6 @@ def _single_index(mask: Bool, option: str, label: str) -> int:
 def _points(numbers: tuple[float, ...], option: str) -> list[tuple[float, float]]:
     if len(numbers) % 2:
         raise CannotGenerate(
-            f"{option}: an even number of coordinates is needed", [Problem("x,y,x,y,… is needed", where=option)]
+            f"{option}: must be an even number of coordinates", [Problem("must be x,y,x,y,…", where=option)]
         )
     return list(zip(numbers[::2], numbers[1::2], strict=True))

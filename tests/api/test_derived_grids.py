@@ -170,7 +170,7 @@ def test_regions_without_obstacles_give_no_grid(api: Api) -> None:
     api.upload("sketch", {"a.geojson": json.dumps(drawing).encode()})
     refused: Any = api.get("/maps/sketch/occupancy_grid", expect=None)
     assert refused.status_code == 422
-    assert "stands in a robot's way" in refused.json()["detail"]
+    assert "is an obstacle" in refused.json()["detail"]
 
 
 def test_real_buildings_and_towns_give_grids(api: Api, shared: Path) -> None:
@@ -204,7 +204,7 @@ def test_world_alone_gives_a_slice(api: Api, shared: Path) -> None:
     assert line["steps"][0]["parameters"]["height"] == 0.18
     assert any(name.endswith("wall.dae") for name in line["sources"])
     dropped = {d["what"]: d["why"] for d in fetch_report(api, "arena")["dropped"]}
-    assert dropped["objects include"] == "nothing in a robot's way", "the ground plane, which is on another server"
+    assert dropped["objects include"] == "not an obstacle for robots", "the ground plane, which is on another server"
     assert api.get("/maps/arena/octomap?resolution=0.2").content.startswith(b"# Octomap")
     problem: Any = api.get("/maps/arena/occupancy_grid?height=20", expect=None)
     assert problem.status_code == 422

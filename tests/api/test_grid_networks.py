@@ -72,7 +72,7 @@ def test_real_grid_alone_gives_networks(api: Api, files: dict[str, bytes]) -> No
     assert api.get("/maps/polytunnels/tmap2?samples=7", expect=None).status_code == 422
     answer = api.get("/maps/polytunnels/tmap2?robot_radius=60", expect=None)
     assert answer.status_code == 422
-    assert "Give a robot_radius below" in answer.json()["detail"]
+    assert "use a robot_radius below" in answer.json()["detail"]
     assert api.get("/maps/polytunnels/tmap2?derive=false", expect=None).status_code == 422
 
 
@@ -105,7 +105,7 @@ def test_blank_grid_is_refused_with_advice(api: Api) -> None:
     api.upload("meadow", {"map.yaml": described, "map.pgm": b"P5 40 30 255\n" + b"\xfe" * 1200})
     answer = api.get("/maps/meadow/tmap2", expect=None)
     assert answer.status_code == 422
-    assert "free all over" in answer.json()["detail"]
+    assert "completely free" in answer.json()["detail"]
     table: dict[str, Any] = {r["format"]: r for r in api.get("environments/meadow/versions/1/maps").json()}
     assert table["tmap2"]["state"] == "missing"
-    assert any("free all over" in text for text in table["tmap2"]["missing"])
+    assert any("completely free" in text for text in table["tmap2"]["missing"])

@@ -115,4 +115,4 @@ def test_grid_is_served_as_an_image(api: Api) -> None:
     report = api.get("environments/drawn-plan/versions/latest/reports/satellite?pixel=0.2").json()
     assert report["layers"][0]["information"] == "derived"
     assert report["layers"][0]["steps"][0]["parameters"]["pixel"] == 0.2
-    assert any("no photograph" in w["problem"] for w in report["warnings"])
+    assert any("not a photograph" in w["problem"] for w in report["warnings"])

@@ -1,4 +1,4 @@
-"""Pictures whose content is known: a farm from above, and a floor plan. The lower left corner is the origin."""
+"""Images with known content: a farm from above, and a floor plan. The lower left corner is the origin."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def farm(noise: float = 3.0) -> NDArray[np.uint8]:
 
 
 def local(pixels: NDArray[Any], size: float = SIZE, **properties: Any) -> GeoImage:
-    """A picture whose lower left corner is the local origin."""
+    """Return an image with its lower left corner at the local origin."""
     shaped = pixels if pixels.ndim == 3 else pixels[..., None]
     return GeoImage(shaped, (size, 0.0, 0.0, 0.0, -size, len(shaped) * size), properties=properties)
 

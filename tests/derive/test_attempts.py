@@ -1,4 +1,4 @@
-"""A derivation's trial says the same as the derivation."""
+"""A derivation's trial fails exactly when the derivation fails."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ MAP = ("ground", "map")
 STOCKS: dict[str, tuple[Grids, float]] = {
     "free": ({MAP: grid(FREE)}, 0.0),
     "occupied": ({MAP: grid(OCCUPIED)}, 0.0),
-    "nothing known": ({MAP: grid(UNKNOWN)}, 0.0),
-    "one of two known": ({MAP: grid(UNKNOWN), ("upper", "map"): grid(FREE)}, 0.0),
+    "all unknown": ({MAP: grid(UNKNOWN)}, 0.0),
+    "one of two unknown": ({MAP: grid(UNKNOWN), ("upper", "map"): grid(FREE)}, 0.0),
     "masks alone": ({("ground", next(iter(masks.MASKS))): grid(OCCUPIED)}, 0.0),
     "which one": ({("ground", "a"): grid(FREE), ("ground", "b"): grid(FREE)}, 0.0),
     "far away": ({MAP: grid(OCCUPIED, origin=(9e5, 0.0, 0.0))}, 0.0),
@@ -66,16 +66,16 @@ def test_samples_have_both_outcomes(monkeypatch: pytest.MonkeyPatch) -> None:
         for name, (grids, _) in STOCKS.items()
     }
     assert {name for name, failed in outcomes.items() if failed} == {
-        "nothing known",
+        "all unknown",
         "masks alone",
         "far away",
         "chequered",
     }
 
 
-def test_trial_does_without_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trial_does_not_compute_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> Any:
-        raise AssertionError("the whole result is made")
+        raise AssertionError("the whole result is computed")
 
     monkeypatch.setattr(occupancy_to_voxels, "_leaves", refuse)
     monkeypatch.setattr(occupancy_to_imagery, "_colour_cells", refuse)
@@ -84,7 +84,7 @@ def test_trial_does_without_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
         derive.try_steps((derive.all_derivations()[name].step(),), layers)
 
 
-def test_steps_before_the_last_are_carried_out() -> None:
+def test_steps_before_the_last_are_executed() -> None:
     layers = Layers({PartKey("occupancy"): grid(UNKNOWN)})
     steps = tuple(derive.all_derivations()[name].step() for name in ("occupancy_to_objects", "occupancy_to_voxels"))
     with pytest.raises(CannotDerive) as caught:

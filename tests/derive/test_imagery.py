@@ -1,4 +1,4 @@
-"""Pictures as objects and as grids: what is in a picture that we drew, and in the plans of real buildings."""
+"""Objects and grids from images: drawn images with known content, and plans of real buildings."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def overlap(a: Any, b: Any) -> float:
     return float(shapely.intersection(a, b).area / shapely.union(a, b).area)
 
 
-def test_a_farm_is_told_apart() -> None:
+def test_farm_image_gives_objects_of_each_kind() -> None:
     notes = DerivationNotes()
     part = objects(layers(local(farm())), notes)
     assert part.local.all()
@@ -92,10 +92,10 @@ def test_a_farm_is_told_apart() -> None:
     confidences = [f.properties["confidence"] for f in part if "confidence" in f.properties]
     assert all(0.5 < c <= 1 for c in confidences)
     assert len(confidences) == Counter(f.geometry.geom_type for f in part)["Polygon"]
-    assert any("guessed" in w.problem for w in notes.warnings)
+    assert any("detected automatically" in w.problem for w in notes.warnings)
 
 
-def test_middle_lines_become_a_network() -> None:
+def test_centrelines_give_network() -> None:
     part = objects(layers(local(farm())))
     lines = of(part, "path")
     lines = [line for line in lines if line.geom_type == "LineString"]
@@ -117,7 +117,7 @@ def test_middle_lines_become_a_network() -> None:
     assert np.abs(nodes - [30.0, 20.0]).sum(axis=1).min() < 1.0, "where the branch leaves"
 
 
-def test_a_farm_as_a_grid() -> None:
+def test_farm_image_gives_grid() -> None:
     content = layers(local(farm()))
     g = grid(content)
     assert (g.resolution, g.origin, g.width, g.height) == (0.1, (0.0, 0.0, 0.0), 600, 400)
@@ -137,7 +137,7 @@ def test_a_farm_as_a_grid() -> None:
     assert (rasterised.cells == OCCUPIED).sum() * 0.01 == pytest.approx(true, rel=0.1)
 
 
-def test_the_same_picture_gives_the_same_cells_and_a_seed_is_used() -> None:
+def test_segmentation_is_repeatable_and_seeded() -> None:
     content = layers(local(farm()))
     first, again = grid(content), grid(content)
     assert np.array_equal(first.cells, again.cells)
@@ -153,7 +153,7 @@ def test_the_same_picture_gives_the_same_cells_and_a_seed_is_used() -> None:
     assert first_ids != ids_of(clusters=3)
 
 
-def test_small_things_are_left_out() -> None:
+def test_small_regions_are_dropped() -> None:
     notes = DerivationNotes()
     part = objects(layers(local(farm())), notes, minimum_area=15.0)
     assert not of(part, "tree")
@@ -168,7 +168,7 @@ def on_earth() -> GeoImage:
     return GeoImage(farm(), (float(a), 0.0, float(corner[0]), 0.0, float(e), float(corner[1])), "EPSG:4326")
 
 
-def test_pictures_on_earth_give_objects_on_earth() -> None:
+def test_wgs84_image_gives_wgs84_objects() -> None:
     with_datum = objects(layers(on_earth(), datum=DATUM))
     without = objects(layers(on_earth()))
     for part in (with_datum, without):
@@ -191,8 +191,8 @@ def test_vegetation_by_index() -> None:
     assert (at(g, *TREES[0]), at(g, 41, 29), at(g, 50, 5)) == (OCCUPIED, FREE, FREE), "a roof does not grow"
 
 
-def test_a_near_infrared_band_gives_the_ndvi() -> None:
-    """Painted turf is green and does not grow: only near infrared tells."""
+def test_near_infrared_band_gives_ndvi() -> None:
+    """Painted turf is green but no vegetation: only near infrared shows that."""
     rgb = farm()
     nir = np.where(rgb[..., 1] > rgb[..., 0] + 15, 220, 60).astype(np.uint8)
     nir[:, 300:] = 60
@@ -211,13 +211,13 @@ def test_a_near_infrared_band_gives_the_ndvi() -> None:
     assert shapely.total_bounds(green.geometry)[2] == pytest.approx(60.0, abs=0.5)
     untagged = local(pixels, bands=[{"colour": c} for c in ("grey", *["undefined"] * 3)])
     assert len(objects(layers(untagged), segmentation="index", near_infrared=4))
-    with pytest.raises(CannotConvert, match="does not say which of its bands are red, green and blue: tag them"):
+    with pytest.raises(CannotConvert, match="does not state which of its bands are red, green and blue: tag them"):
         objects(layers(untagged), segmentation="colour")
     with pytest.raises(CannotConvert, match="no band 9"):
         objects(layers(unsaid), segmentation="index", near_infrared=9)
 
 
-def test_a_plan_has_walls_rooms_and_an_outside() -> None:
+def test_floor_plan_gives_walls_rooms_and_outside() -> None:
     notes = DerivationNotes()
     g = grid(layers(local(plan(), 0.02), name="house"), notes)
     assert (g.resolution, g.origin) == (0.05, (0.0, 0.0, 0.0))
@@ -237,7 +237,7 @@ def test_a_plan_has_walls_rooms_and_an_outside() -> None:
     assert (at(free, 1, 6), at(free, 2.1, 6)) == (FREE, OCCUPIED)
 
 
-def test_a_turned_plan_lies_where_its_transform_says() -> None:
+def test_rotated_plan_follows_its_transform() -> None:
     c, s = 0.02 * np.cos(0.5), 0.02 * np.sin(0.5)
     turned = GeoImage(plan()[..., None], (c, s, 100.0, s, -c, 50.0))
     g = grid(layers(turned))
@@ -259,32 +259,36 @@ def test_a_turned_plan_lies_where_its_transform_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "options", "says"),
+    ("pixels", "options", "expected"),
     [
-        (np.full((50, 50, 3), (120, 130, 140), np.uint8), {}, "of one colour"),
-        (np.full((50, 50, 1), 250, np.uint8), {"segmentation": "plan"}, "one shade"),
+        (np.full((50, 50, 3), (120, 130, 140), np.uint8), {}, "a single colour"),
+        (np.full((50, 50, 1), 250, np.uint8), {"segmentation": "plan"}, "a single shade"),
         (np.full((50, 50, 1), 100, np.uint8), {}, "no colours"),
-        (np.zeros((50, 50, 4), np.uint8), {}, "shows nothing"),
-        (np.full((50, 50, 3), (160, 120, 110), np.uint8), {"segmentation": "index"}, "nothing in it grows"),
+        (np.zeros((50, 50, 4), np.uint8), {}, "is empty"),
+        (
+            np.full((50, 50, 3), (160, 120, 110), np.uint8),
+            {"segmentation": "index"},
+            "no vegetation, the vegetation index is at most",
+        ),
         (farm()[:, :, :], {"resolution": 0.001}, "coarser resolution"),
-        (np.full((1, 1, 3), 7, np.uint8), {}, "of one colour"),
+        (np.full((1, 1, 3), 7, np.uint8), {}, "a single colour"),
     ],
 )
-def test_what_shows_nothing_is_no_map(pixels: Any, options: dict[str, Any], says: str) -> None:
+def test_empty_image_raises_cannot_convert(pixels: Any, options: dict[str, Any], expected: str) -> None:
     content = layers(local(pixels))
     for make in (grid, objects):
-        with pytest.raises(CannotConvert, match=says):
+        with pytest.raises(CannotConvert, match=expected):
             make(content, **options)
 
 
-def test_a_plan_with_more_ink_than_paper_is_none() -> None:
+def test_plan_with_more_ink_than_paper_raises_cannot_convert() -> None:
     dark = np.full((100, 100, 1), 30, np.uint8)
     dark[:30, :30] = 240
-    with pytest.raises(CannotConvert, match="dark all over"):
+    with pytest.raises(CannotConvert, match="dark overall"):
         grid(layers(local(dark)), segmentation="plan")
 
 
-def test_which_picture_and_parameters_of_another_method() -> None:
+def test_image_selection_and_parameters_of_another_method() -> None:
     a, b = local(farm()), local(plan(), 0.02)
     with pytest.raises(Ambiguous, match="picture="):
         grid(layers(a, name="a", b=b))
@@ -292,14 +296,14 @@ def test_which_picture_and_parameters_of_another_method() -> None:
     assert at(grid(layers(a, b=b)), 41, 29) == OCCUPIED, "satellite is the usual one"
     with pytest.raises(NotFound, match="there are: satellite"):
         grid(layers(a), picture="other")
-    with pytest.raises(Invalid, match="belongs to segmentation=plan"):
+    with pytest.raises(Invalid, match="applies only to segmentation=plan"):
         grid(layers(a), gap=2.0)
-    with pytest.raises(Invalid, match="belongs to segmentation=colour"):
+    with pytest.raises(Invalid, match="applies only to segmentation=colour"):
         grid(layers(b), clusters=4)
 
 
-def test_pictures_come_last() -> None:
-    """Whatever else is stored goes before a picture; a picture before a blank grid."""
+def test_planner_prefers_other_layers_to_images() -> None:
+    """Other stored layers are preferred to an image; an image is preferred to an empty grid."""
     for better in ("objects", "voxels"):
         plan = derive.plan(frozenset({"imagery", better}), frozenset({"occupancy"}))
         assert plan is not None
@@ -327,7 +331,7 @@ def png(pixels: Any) -> bytes:
     return data.tobytes()
 
 
-def test_a_buildings_drawing_is_a_picture() -> None:
+def test_building_drawing_gives_image() -> None:
     notes = DerivationNotes()
     derived_layers = resources_to_imagery(building({"plan.png": png(plan())}), Drawings(), notes)
     g = grid(derived_layers, level="L1")
@@ -335,17 +339,17 @@ def test_a_buildings_drawing_is_a_picture() -> None:
     assert not notes.warnings
 
 
-def test_drawings_that_cannot_be_read() -> None:
-    for files, says in (
+def test_unreadable_drawings_are_warned_of() -> None:
+    for files, expected in (
         ({}, "was not uploaded"),
         ({"plan.png": b"GIF89a"}, "cannot be read"),
         ({"plan.png": png(plan())[:200]}, "cannot be read"),
-        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "too many"),
+        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "the maximum is"),
     ):
         notes = DerivationNotes()
         with pytest.raises(MissingLayer, match="floor plan"):
             resources_to_imagery(building(files), Drawings(), notes)
-        assert says in notes.warnings[0].problem
+        assert expected in notes.warnings[0].problem
 
 
 def covered(walls: list[Any], g: OccupancyGrid, reach: float = 0.2) -> float:
@@ -365,7 +369,7 @@ def covered(walls: list[Any], g: OccupancyGrid, reach: float = 0.2) -> float:
 def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> None:
     """Walls as people drew them over the plan: at least nine tenths of their length are ink within 20 cm."""
     if not (DATA / "openrmf_building" / folder).is_dir():
-        pytest.skip("the real maps are not here")
+        pytest.skip("the real maps are missing")
     content = real(folder)
     derived_layers = resources_to_imagery(content, Drawings(), DerivationNotes())
     assert len(derived_layers.parts) == levels
@@ -379,7 +383,7 @@ def test_plans_of_real_buildings_have_their_walls(folder: str, levels: int) -> N
         if folder in ("hotel", "office"):
             free = np.argwhere(g.cells == FREE)[::97, ::-1] * g.resolution + g.origin[:2] + g.resolution / 2
             within = shapely.contains_xy(floors.buffer(0.5), free[:, 0], free[:, 1]).mean()
-            # What the office's lines of measure enclose counts as inside, too.
+            # ground enclosed by the office's dimension lines counts as inside, too
             assert within >= (0.95 if folder == "hotel" else 0.8)
 
 
@@ -389,11 +393,11 @@ def real(folder: str) -> Layers:
     return upload_reader.read(files, UploadHints(format="openrmf"), EnvironmentContext(), Limits()).layers(None)
 
 
-def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
+def test_plan_of_robot_map_agrees_with_the_map() -> None:
     """robast_sim: the plan is an older picture of the same storey as the ROS map, here compared cell by cell."""
     folder = DATA / "openrmf_building" / "robast_sim"
     if not folder.is_dir():
-        pytest.skip("the real maps are not here")
+        pytest.skip("the real maps are missing")
     files = {p.name: p.read_bytes() for p in (folder / "ros_map").iterdir()}
     map_layers = upload_reader.read(files, UploadHints(format="occupancy_grid"), EnvironmentContext(), Limits()).layers(
         None
@@ -424,11 +428,11 @@ def test_a_plan_that_a_robot_made_agrees_with_its_map() -> None:
     )  # its grey is not free here
 
 
-def test_the_strawberry_farm_from_above() -> None:
-    """Its large white hall is a building; a picture is placed by the corners that its upload tells."""
+def test_strawberry_farm_image_gives_objects() -> None:
+    """The large white hall is a building; the image is placed by the corners given with its upload."""
     file = DATA / "environment_template/riseholme_park_farm_strawberry_polytunnels/config/location/satellite-auto.png"
     if not file.is_file():
-        pytest.skip("the real maps are not here")
+        pytest.skip("the real maps are missing")
     hints = UploadHints(
         format="satellite", options={"corners": "53.2694,-0.5262,53.2682,-0.5224", "picture": "satellite"}
     )

@@ -1,4 +1,4 @@
-"""Models of the YOLO family: tiny ONNX models made here, whose answers are known."""
+"""Models of the YOLO family: tiny ONNX models with known outputs."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def put(folder: Path, data: bytes, classes: Any = ("building", "tree", None)) ->
 
 
 def content(width: int = SIDE, height: int = SIDE, red: Any = None) -> Layers:
-    """A picture of 1 m pixels, all red unless told where."""
+    """Return an image with pixels of 1 m, red in the window ``red``, by default everywhere."""
     pixels = np.zeros((height, width, 3), np.uint8)
     pixels[..., 0] = 255 if red is None else 0
     if red is not None:
@@ -117,7 +117,7 @@ def test_boxes_become_objects_and_cells(folder: Path) -> None:
     assert things["tree"][0].equals(shapely.box(43, 11, 53, 21))
     assert [d.count for d in notes.dropped if d.subject == "things"] == [1]
     # Where the model sees nothing is unknown, so a map of obstacles alone has no free cell.
-    with pytest.raises(CannotConvert, match="nothing that is free"):
+    with pytest.raises(CannotConvert, match="shows no free ground"):
         imagery_to_occupancy(
             content(), GridParameters(segmentation="model", model="tiny", resolution=1.0), DerivationNotes()
         )
@@ -130,7 +130,7 @@ def test_boxes_become_objects_and_cells(folder: Path) -> None:
     assert ((grid.cells == OCCUPIED).sum(), (grid.cells == FREE).sum()) == (200, 100)
 
 
-def test_masks_cut_a_thing_out_of_its_box(folder: Path) -> None:
+def test_masks_limit_objects_within_their_boxes(folder: Path) -> None:
     left = np.where(np.arange(16) < 5, 8.0, -8.0)[None, :].repeat(16, axis=0)  # the left 20 of 64 pixels
     rows = np.concatenate([ROWS, [[1.0] * 5, [0.0] * 5]])
     put(folder, model(rows, np.stack([left, np.zeros((16, 16))])))
@@ -140,14 +140,14 @@ def test_masks_cut_a_thing_out_of_its_box(folder: Path) -> None:
     assert shapely.bounds(things["building"][0])[2] == pytest.approx(20, abs=1)
 
 
-def test_the_older_layout_with_objectness(folder: Path) -> None:
+def test_older_yolo_layout_with_objectness_is_read(folder: Path) -> None:
     older = np.array([[*r[:4], 1.0, *r[4:]] for r in (HOUSE, TWICE, TREE, CAR, UNSURE)])
     put(folder, model(older))  # [n, 5 + classes]
     things = detect(content(), confidence=0.5)
     assert things["building"][0].equals(shapely.box(10, 39, 30, 49))
 
 
-def test_large_pictures_are_cut_and_seams_do_not_show(folder: Path) -> None:
+def test_large_images_are_tiled_without_seams(folder: Path) -> None:
     """The model answers for a tile with any red in it: that of the far corner only, here."""
     put(folder, model(np.array([TREE]).T))
     layers = content(200, 100, red=(slice(90, 100), slice(190, 200), 0))
@@ -159,24 +159,24 @@ def test_large_pictures_are_cut_and_seams_do_not_show(folder: Path) -> None:
     assert shapely.bounds(small["tree"][0]).tolist() == [43, 2, 53, 12], "a tile of the lower right, padded"
 
 
-def test_names_in_the_model_itself(folder: Path) -> None:
+def test_class_names_are_read_from_model_metadata(folder: Path) -> None:
     put(folder, model(ROWS, names="{0: 'building', 1: 'tree', 2: 'car'}"), None)
     assert set(detect(content())) == {"building", "tree"}
     put(folder, model(ROWS), None)
-    with pytest.raises(CannotConvert, match=r"put tiny\.json beside it"):
+    with pytest.raises(CannotConvert, match=r"add tiny\.json beside it"):
         detect(content())
 
 
-def test_the_same_model_gives_the_same(folder: Path) -> None:
+def test_yolo_model_is_repeatable(folder: Path) -> None:
     put(folder, model(ROWS))
     assert str(detect(content(150, 90))) == str(detect(content(150, 90)))
 
 
-def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(NotFound, match="there are: none"):
+def test_unusable_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(NotFound, match="available: none"):
         detect(content())
     put(folder, model(ROWS), ("building", "tree", None, None, None))
-    with pytest.raises(CannotConvert, match="other than 5 classes"):
+    with pytest.raises(CannotConvert, match="does not have 5 classes"):
         detect(content())
     put(folder, model(ROWS), ("building", "castle", None))
     with pytest.raises(CannotConvert, match="must be null or one of"):
@@ -188,11 +188,11 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(CannotConvert, match="finds nothing"):
         detect(content(), confidence=0.95)
     for name in ("../tiny", "other", "tiny.onnx"):
-        with pytest.raises(NotFound, match="there are: tiny"):
+        with pytest.raises(NotFound, match="available: tiny"):
             _onnx.find_model(name)
-    with pytest.raises(Invalid, match="name one"):
+    with pytest.raises(Invalid, match="name a model"):
         imagery_to_objects(content(), Parameters(segmentation="model"), DerivationNotes())
-    with pytest.raises(Invalid, match="belongs to segmentation=model"):
+    with pytest.raises(Invalid, match="applies only to segmentation=model"):
         imagery_to_objects(content(), Parameters(model="tiny", segmentation="colour"), DerivationNotes())
     real = importlib.import_module
 
@@ -209,7 +209,7 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
         detect(content())
 
 
-def test_through_the_server(folder: Path, tmp_path: Path) -> None:
+def test_yolo_model_works_through_server(folder: Path, tmp_path: Path) -> None:
     """In a confined worker, with its limit of memory."""
     put(folder, model(ROWS))
     ok, png = cv2.imencode(".png", np.full((SIDE, SIDE, 3), (0, 0, 255), np.uint8))

@@ -1,4 +1,4 @@
-"""Models of the Segment-Anything family, and such as tell pixels: tiny ONNX models whose answers are known."""
+"""Models of the Segment-Anything family and pixel classification models: tiny ONNX models with known outputs."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def alike(a: Any, b: Any) -> float:
 
 
 def check(things: dict[str, list[tuple[Any, dict[str, Any]]]], height: int = 64) -> None:
-    """What the yard holds, each thing once."""
+    """Objects of the yard, each once."""
     assert {kind: len(of) for kind, of in things.items()} == {"building": 1, "tree": 1, "field": 1, "area": 1}
     assert alike(things["building"][0][0], box(BUILDING, height)) > 0.85
     crown = shapely.Point((TREE[0] + 0.5) / 2, (height - TREE[1] - 0.5) / 2).buffer(TREE[2] / 2)
@@ -108,7 +108,7 @@ def check(things: dict[str, list[tuple[Any, dict[str, Any]]]], height: int = 64)
     ],
     ids=["export", "several masks", "large masks", "mobile, preprocessing", "free size", "sam 2"],
 )
-def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict[str, Any]]) -> None:
+def test_masks_become_objects_classified_by_colour(folder: Path, how: dict[str, dict[str, Any]]) -> None:
     put(folder, tiny_sam.encoder(SIDE, **how.get("encoder", {})), tiny_sam.decoder(SIDE, **how.get("decoder", {})))
     notes = DerivationNotes()
     things = detect(content(yard()), notes, stability=0.7)
@@ -117,10 +117,10 @@ def test_things_are_cut_out_and_told_by_colour(folder: Path, how: dict[str, dict
     assert properties["model"] == "sam"
     assert 0.3 < properties["confidence"] <= 0.95
     assert properties["stability"] > 0.9
-    assert any("3 are told by colour and shape, 1 cannot be and are of kind area" in w.problem for w in notes.warnings)
+    assert any("3 were classified by colour and shape, 1 have kind area" in w.problem for w in notes.warnings)
 
 
-def test_cells_of_what_is_not_known_stay_unknown(folder: Path) -> None:
+def test_cells_of_unclassified_masks_stay_unknown(folder: Path) -> None:
     put(folder)
     how = GridParameters(segmentation="model", model="sam", resolution=0.5, minimum_area=5.0)
     (grid,) = imagery_to_occupancy(content(yard()), how, DerivationNotes()).parts.values()
@@ -129,8 +129,8 @@ def test_cells_of_what_is_not_known_stay_unknown(folder: Path) -> None:
     assert [cells[14, 16], cells[TREE[1], TREE[0]], cells[44, 42], cells[60, 4]] == [OCCUPIED, OCCUPIED, UNKNOWN, FREE]
 
 
-def test_large_pictures_are_cut_into_tiles_and_seen_as_a_whole(folder: Path) -> None:
-    """Wide: a whole picture made half as large, and tiles from 0, 128 and 160 on; none cuts what it has from there."""
+def test_large_images_are_processed_in_tiles_and_as_a_whole(folder: Path) -> None:
+    """Wide image: as a whole at half size, and tiles from 0, 128 and 160 on; none cuts objects that begin there."""
     put(folder, tiny_sam.encoder(160), tiny_sam.decoder(160))
     image = np.full((64, 320, 3), GRASS, np.uint8)
     houses = [(64, 8, 80, 24), (152, 8, 168, 24)]  # the second is cut by the first tile
@@ -147,9 +147,9 @@ def test_large_pictures_are_cut_into_tiles_and_seen_as_a_whole(folder: Path) -> 
     assert road[1]["width"] == pytest.approx(4, abs=0.3)
 
 
-def test_what_the_model_is_not_sure_of_is_left_out(folder: Path) -> None:
+def test_masks_below_thresholds_are_dropped(folder: Path) -> None:
     put(folder, decoder=tiny_sam.decoder(SIDE, iou=0.6))
-    with pytest.raises(CannotConvert, match=r"confidence of 0\.88 and a stability of 0\.95"):
+    with pytest.raises(CannotConvert, match=r"confidence of at least 0\.88 and a stability of at least 0\.95"):
         detect(content(yard()))
     assert detect(content(yard()), confidence=0.55)["tree"][0][1]["confidence"] <= 0.6
     put(folder, decoder=tiny_sam.decoder(SIDE, steep=0.5))  # its logits are all near the threshold
@@ -158,31 +158,33 @@ def test_what_the_model_is_not_sure_of_is_left_out(folder: Path) -> None:
     assert detect(content(yard()), stability=0.0)
 
 
-def test_one_point_finds_one_thing(folder: Path) -> None:
+def test_single_prompt_finds_one_object(folder: Path) -> None:
     put(folder)
     assert set(detect(content(yard()), points=1)) == {"field"}
 
 
-def test_grey_pictures_have_no_kinds(folder: Path) -> None:
+def test_masks_of_grey_image_have_kind_area(folder: Path) -> None:
     put(folder)
     notes = DerivationNotes()
     grey = cv2.cvtColor(yard(), cv2.COLOR_RGB2GRAY)
     assert set(detect(content(grey), notes)) == {"area"}
-    assert any("0 are told" in w.problem for w in notes.warnings)
+    assert any("0 were classified" in w.problem for w in notes.warnings)
 
 
-def test_the_same_model_gives_the_same(folder: Path) -> None:
+def test_sam_model_is_repeatable(folder: Path) -> None:
     put(folder)
     assert str(detect(content(yard(150, 90)))) == str(detect(content(yard(150, 90))))
 
 
-def test_what_a_wrong_model_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_models_raise_errors(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = r"image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size"
     put(folder, decoder=tiny_sam.encoder(SIDE))
-    with pytest.raises(CannotConvert, match=expected + r".*sam\.decoder\.onnx\) is \(x \[batch, 3, 128, 128\]\)"):
+    with pytest.raises(
+        CannotConvert, match=expected + r".*sam\.decoder\.onnx\) has the signature \(x \[batch, 3, 128, 128\]\)"
+    ):
         detect(content(yard()))
     put(folder, encoder=tiny_sam.decoder(SIDE))
-    with pytest.raises(CannotConvert, match=expected + r".*sam\.encoder\.onnx\) is"):
+    with pytest.raises(CannotConvert, match=expected + r".*sam\.encoder\.onnx\) has the signature"):
         detect(content(yard()))
     put(folder, decoder=tiny_sam.decoder(SIDE, second=True))
     with pytest.raises(CannotConvert, match="high_res_feats"):
@@ -194,30 +196,30 @@ def test_what_a_wrong_model_is_told(folder: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(CannotConvert, match=r"cannot be loaded: sam\.encoder\.onnx"):
         detect(content(yard()))
     put(folder, encoder=tiny_sam.encoder(64))  # an embedding that the decoder does not take
-    with pytest.raises(CannotConvert, match=r"the model sam \(sam\.decoder\.onnx\) fails"):
+    with pytest.raises(CannotConvert, match=r"the model sam \(sam\.decoder\.onnx\) failed"):
         detect(content(yard()))
     put(folder)
     monkeypatch.setenv(_onnx.LARGEST, "1000")
-    with pytest.raises(TooLarge, match="larger than 1000 bytes: the operator may set FLEETMAP_MODELS_MAX_BYTES"):
+    with pytest.raises(TooLarge, match="larger than 1000 bytes: raise FLEETMAP_MODELS_MAX_BYTES"):
         detect(content(yard()))
     monkeypatch.delenv(_onnx.LARGEST)
     big = Layers({PartKey("imagery", "ground", "satellite"): local(np.zeros((3000, 3000, 3), np.uint8), 0.5)})
-    with pytest.raises(CannotConvert, match="give a coarser resolution than"):
+    with pytest.raises(CannotConvert, match="use a resolution coarser than"):
         detect(big)
     (folder / "sam.decoder.onnx").unlink()
     with pytest.raises(NotFound, match=r"there are: sam\.encoder$"):
         detect(content(yard()))
 
 
-def test_names_of_the_two_files(folder: Path) -> None:
+def test_model_file_names_are_paired(folder: Path) -> None:
     for name in ("vit_b_encoder", "vit_b_decoder", "m.Encoder", "m.decoder", "yolo", "lone.decoder"):
         (folder / f"{name}.onnx").write_bytes(b"?")
-    with pytest.raises(NotFound, match=r"there are: lone\.decoder, m, vit_b, yolo$"):
+    with pytest.raises(NotFound, match=r"available: lone\.decoder, m, vit_b, yolo$"):
         _onnx.find_model("x")
     assert [f.name for f in _onnx.find_model("vit_b").files] == ["vit_b_encoder.onnx", "vit_b_decoder.onnx"]
 
 
-# --- models that tell pixels ------------------------------------------------------------------------------------------
+# --- pixel classification models ---------------------------------------------------------------------------------
 def pixels(side: int | None = 64, count: int = 3, coarse: int = 2) -> bytes:
     """[1, 3, side, side] -> logits [1, 3, side / coarse, …]: 8 times each normalised colour (of ``count`` of them)."""
     make, dtype = onnx.helper, onnx.TensorProto.FLOAT
@@ -250,7 +252,7 @@ def write_model(folder: Path, data: bytes, metadata: Any) -> None:
     (folder / "pixels.json").write_text(json.dumps(metadata))
 
 
-def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
+def test_pixel_classes_are_continuous_across_tiles(folder: Path) -> None:
     """Red is a building, green a field, blue nothing; a red band runs through three tiles without a seam."""
     write_model(folder, pixels(), PLAIN)
     image = np.full((80, 150, 3), (0, 255, 0), np.uint8)
@@ -267,7 +269,7 @@ def test_each_pixel_is_told_across_tiles(folder: Path) -> None:
         detect(content(np.full((80, 80, 3), 128, np.uint8)), model="pixels")  # a third each
 
 
-def test_classes_that_are_ways_have_a_width(folder: Path) -> None:
+def test_path_classes_have_width(folder: Path) -> None:
     write_model(folder, pixels(), {**PLAIN, "classes": ["path", "field", None]})
     image = np.full((64, 64, 3), (0, 255, 0), np.uint8)
     image[30:36] = (255, 0, 0)
@@ -275,26 +277,28 @@ def test_classes_that_are_ways_have_a_width(folder: Path) -> None:
     assert things["path"][0][1]["width"] == pytest.approx(3, abs=0.5)
 
 
-def test_usual_mean_and_wrong_words(folder: Path) -> None:
+def test_pixel_model_uses_default_mean_and_rejects_wrong_metadata(folder: Path) -> None:
     write_model(folder, pixels(None), ["building", "field", None])
     image = np.full((64, 64, 3), (124, 116, 104), np.uint8)  # ImageNet's mean: nothing is more likely than the rest
     image[10:30, 10:30] = (255, 0, 0)
     assert set(detect(content(image), model="pixels")) == {"building"}
     write_model(folder, pixels(), {**PLAIN, "classes": ["building", "field"]})
-    with pytest.raises(CannotConvert, match=r"other than 2 classes: it gives \(1, 3, 32, 32\)"):
+    with pytest.raises(CannotConvert, match=r"does not have 2 classes: it returns \(1, 3, 32, 32\)"):
         detect(content(image), model="pixels")
     for wrong in ({"std": [1, 0, 1]}, {"mean": [1, 2]}, {"mean": "abc"}, {"std": None}):
         write_model(folder, pixels(), {**PLAIN, **wrong})
         with pytest.raises(CannotConvert, match=r"pixels\.json: (std|mean) must be"):
             detect(content(image), model="pixels")
     write_model(folder, pixels(), PLAIN)
-    with pytest.raises(Invalid, match="points: belongs to models of the Segment-Anything family, and pixels is none"):
+    with pytest.raises(
+        Invalid, match="points: applies only to models of the Segment-Anything family, which pixels is not"
+    ):
         detect(content(image), model="pixels", points=8)
-    with pytest.raises(Invalid, match="stability: belongs to segmentation=model"):
+    with pytest.raises(Invalid, match="stability: applies only to segmentation=model"):
         imagery_to_objects(content(image), Parameters(stability=0.5, segmentation="colour"), DerivationNotes())
 
 
-def test_through_the_server(folder: Path, tmp_path: Path) -> None:
+def test_sam_model_works_through_server(folder: Path, tmp_path: Path) -> None:
     """In a confined worker, with its limit of memory."""
     put(folder)
     ok, png = cv2.imencode(".png", yard()[..., ::-1])
@@ -318,4 +322,4 @@ def test_through_the_server(folder: Path, tmp_path: Path) -> None:
         wrong = api.problem(
             "POST", path, 422, json={"method": "imagery_to_objects", "parameters": {**parameters, "points": 9}}
         )
-        assert "expected are an encoder" in wrong["detail"]
+        assert "expected an encoder" in wrong["detail"]

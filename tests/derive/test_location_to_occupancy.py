@@ -1,4 +1,4 @@
-"""A fence as a blank grid."""
+"""Empty grid of a fence."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def blank(fence: Any, anchor: Any = "local", notes: DerivationNotes | None = Non
     return grid
 
 
-def test_free_inside_unknown_outside() -> None:
+def test_fence_grid_is_free_inside_and_unknown_outside() -> None:
     notes = DerivationNotes()
     g = blank(shapely.Polygon([(-1, -1), (3, -1), (-1, 3)]), notes=notes, resolution=0.1)
     assert (g.origin, g.width, g.height, g.resolution) == ((-1, -1, 0), 40, 40, 0.1)
     assert g.counts() == {"occupied": 0, "free": 780, "unknown": 820, "other": 0}
-    assert "blank" in notes.warnings[0].problem
+    assert "empty" in notes.warnings[0].problem
 
 
-def test_a_fence_on_earth() -> None:
+def test_wgs84_fence_gives_grid() -> None:
     g = blank(shapely.box(10.0, 52.0, 10.001, 52.001), "wgs84")
     assert g.resolution == 0.05
     assert g.width * 0.05 == pytest.approx(68.7, abs=0.3)
@@ -45,7 +45,7 @@ def test_a_fence_on_earth() -> None:
     assert g.counts()["unknown"] < 0.01 * g.cells.size
 
 
-def test_large_fences_get_coarser_cells_and_absurd_ones_are_refused() -> None:
+def test_large_fence_gets_coarser_cells_up_to_a_limit() -> None:
     notes = DerivationNotes()
     assert blank(shapely.box(0, 0, 2000, 2000), notes=notes).resolution == 0.5
     assert notes.template[0].value == 0.5
@@ -55,7 +55,7 @@ def test_large_fences_get_coarser_cells_and_absurd_ones_are_refused() -> None:
         blank(shapely.box(-9e6, -9e6, 9e6, 9e6))
 
 
-def test_without_a_fence_there_is_none() -> None:
+def test_grid_without_fence_raises_missing_layer() -> None:
     for layers in (Layers({}, DATUM), Layers({PartKey("location", "ground", SITE): features([], "local")}, DATUM)):
         with pytest.raises(MissingLayer, match="needs a fence"):
             location_to_occupancy(layers, Parameters(), DerivationNotes())
@@ -63,7 +63,7 @@ def test_without_a_fence_there_is_none() -> None:
         blank(shapely.Point(0, 0))
 
 
-def test_it_is_the_last_way_to_a_grid() -> None:
+def test_planner_uses_fence_grid_last() -> None:
     both: frozenset[Any] = frozenset({"location", "objects"})
     plan = derive.plan(both, frozenset({"occupancy"}))
     assert plan is not None

@@ -1,4 +1,4 @@
-"""Objects as a grid: what stands in the way at a height, what is free, and what it says when there is nothing."""
+"""Grids from objects: obstacles at a height, free ground, and errors if there is nothing."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_solids_are_cut_at_the_laser_and_filled() -> None:
     assert set(np.unique(g.cells)) == {0, 100}
 
 
-def test_height_and_band() -> None:
+def test_height_and_band_select_obstacles() -> None:
     table = {
         "kind": "model",
         "shapes": [
@@ -107,13 +107,13 @@ def test_height_and_band() -> None:
         grid(content, band=(2.0, 3.0))
 
 
-def test_a_band_inside_a_solid_is_full() -> None:
+def test_band_inside_solid_is_filled() -> None:
     g = grid(layers(objects((None, {"kind": "model", "shapes": [BOX]}))), band=(1.0, 1.1), padding=0.0)
     assert (g.cells == 100).all()
     assert occupied(g) == pytest.approx(2)
 
 
-def test_a_hollow_wall_stays_hollow() -> None:
+def test_hollow_wall_stays_hollow() -> None:
     """A ring-shaped room as one closed mesh: the room inside is free."""
     rings = [[[-3, -3], [3, -3], [3, 3], [-3, 3]], [[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]]
     g = grid(layers(objects((None, {"kind": "model", "shapes": [{"type": "polyline", "points": rings, "height": 2}]}))))
@@ -121,7 +121,7 @@ def test_a_hollow_wall_stays_hollow() -> None:
     assert at(g, 0, 0) == 0
 
 
-def test_levels_have_their_own_floor() -> None:
+def test_each_level_is_cut_above_its_own_floor() -> None:
     upstairs = {"kind": "model", "shapes": [BOX], "pose": [0, 0, 10, 0, 0, 0]}
     content = Layers(
         {
@@ -134,7 +134,7 @@ def test_levels_have_their_own_floor() -> None:
     assert occupied(grid(content, level="L2")) == pytest.approx(2)
 
 
-def test_walls_doors_floors_and_holes_of_a_building() -> None:
+def test_building_walls_doors_floors_and_holes_are_drawn() -> None:
     floor = shapely.box(0, 0, 10, 6)
     rows: list[Any] = [
         (floor, {"kind": "floor"}),
@@ -158,7 +158,7 @@ def test_walls_doors_floors_and_holes_of_a_building() -> None:
     }
 
 
-def test_a_fence_says_how_far_the_site_reaches() -> None:
+def test_fence_limits_the_grid() -> None:
     fence = shapely.Polygon([(0, 0), (10, 0), (0, 10)])
     rows = (shapely.box(1, 1, 2, 2), {"kind": "building"})
     g = grid(layers(objects(rows), fence=fence))
@@ -173,7 +173,7 @@ def test_a_fence_says_how_far_the_site_reaches() -> None:
     assert (at(g, 2.5, 2.5), at(g, 4, 4)) == (0, 255), "within the fence only floors are free"
 
 
-def test_a_fence_on_earth_without_a_datum_is_told_and_left() -> None:
+def test_wgs84_fence_without_datum_is_dropped_with_warning() -> None:
     notes = DerivationNotes()
     content = layers(
         objects((shapely.box(1, 1, 2, 2), {"kind": "wall"})), fence=shapely.box(9, 51, 10, 52), anchor="wgs84"
@@ -182,7 +182,7 @@ def test_a_fence_on_earth_without_a_datum_is_told_and_left() -> None:
     assert "the fence is ignored" in notes.warnings[0].problem
 
 
-def test_places_on_earth_need_a_datum() -> None:
+def test_wgs84_objects_without_datum_raise_missing_datum() -> None:
     house = shapely.box(10.001, 52.001, 10.0012, 52.0011)
     part = objects((house, {"kind": "building"}), anchor="wgs84")
     with pytest.raises(MissingDatum, match="no datum"):
@@ -219,13 +219,13 @@ def test_places_on_earth_need_a_datum() -> None:
         ({"amenity": "parking"}, False),
     ],
 )
-def test_the_tags_of_openstreetmap(tags: dict[str, str], expected: bool) -> None:
+def test_openstreetmap_tags_decide_obstacles(tags: dict[str, str], expected: bool) -> None:
     properties = {"kind": next(iter(tags)), "osm": {"tags": tags}}
     content = layers(objects((shapely.box(0, 0, 2, 2), properties), (shapely.box(9, 9, 9.1, 9.1), {"kind": "post"})))
     assert (at(grid(content), 1, 1) == 100) is expected
 
 
-def test_widths_and_discs_of_lines_and_points() -> None:
+def test_lines_and_points_are_drawn_with_width_and_radius() -> None:
     def square_metres(geometry: Any, **properties: Any) -> float:
         return occupied(grid(layers(objects((geometry, properties))), resolution=0.01))
 
@@ -242,7 +242,7 @@ def test_widths_and_discs_of_lines_and_points() -> None:
     assert square_metres(shapely.box(0, 0, 1, 1), kind="something", height=1.0) == pytest.approx(1, 0.05)
 
 
-def test_multipolygons_are_put_together_from_their_ways() -> None:
+def test_multipolygons_are_assembled_from_their_ways() -> None:
     def way(i: int, *refs: tuple[float, float]) -> tuple[str, Any, dict[str, Any]]:
         return f"w{i}", shapely.LineString(refs), {"kind": "line", "osm": {"tags": {}}}
 
@@ -262,7 +262,7 @@ def test_multipolygons_are_put_together_from_their_ways() -> None:
     assert "1 object has an unknown extent (r1): their ways or nodes are missing" in notes.warnings[0].problem
 
 
-def test_ground_of_an_area_that_is_not_complete_is_unknown() -> None:
+def test_ground_of_incomplete_area_is_unknown() -> None:
     """Half of a house of 8 × 6 m is there, and with it the disc that a corner of a right angle would lie on."""
     tags = {"type": "multipolygon", "building": "yes"}
     half = shapely.LineString([(0, 0), (8, 0), (8, 6)])
@@ -286,7 +286,7 @@ def test_ground_of_an_area_that_is_not_complete_is_unknown() -> None:
     assert "2 objects have an unknown extent (r1, w3)" in notes.warnings[0].problem
 
 
-def test_resolution_inflation_and_padding() -> None:
+def test_resolution_inflation_and_padding_are_applied() -> None:
     content = layers(objects((shapely.box(0, 0, 1, 1), {"kind": "building"})))
     g = grid(content, resolution=0.25, padding=2.0)
     assert (g.resolution, g.width) == (0.25, 20)
@@ -294,7 +294,7 @@ def test_resolution_inflation_and_padding() -> None:
     assert occupied(grown) == pytest.approx(1 + 4 * 0.5 + math.pi * 0.25, rel=0.02)
 
 
-def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
+def test_town_gets_coarser_cells_up_to_a_limit() -> None:
     house = (shapely.box(0, 0, 10, 10), {"kind": "building"})
     town = layers(objects(house, (shapely.box(3000, 3000, 3010, 3010), {"kind": "wall"})))
     notes = DerivationNotes()
@@ -323,13 +323,13 @@ def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
         [(None, {"kind": "model", "shapes": "nonsense"})],
     ],
 )
-def test_nothing_in_the_way_is_a_clear_problem(rows: list[Any]) -> None:
-    with pytest.raises(MissingLayer, match="stands in a robot's way"):
+def test_site_without_obstacles_raises_missing_layer(rows: list[Any]) -> None:
+    with pytest.raises(MissingLayer, match="object is an obstacle"):
         grid(layers(objects(*rows)))
 
 
-def test_ground_that_nothing_encloses_is_unknown() -> None:
-    """Without floor and fence only what walls close off from the border is free."""
+def test_unenclosed_ground_is_unknown() -> None:
+    """Without floor and fence only ground that walls separate from the border is free."""
     ring = [[[-3, -3], [3, -3], [3, 3], [-3, 3]], [[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]]
     room = (None, {"kind": "model", "shapes": [{"type": "polyline", "points": ring, "height": 2}]})
     notes = DerivationNotes()
@@ -339,9 +339,7 @@ def test_ground_that_nothing_encloses_is_unknown() -> None:
     assert not notes.warnings
     alone = grid(layers(objects((None, {"kind": "model", "shapes": [BOX]}))), notes, outside_free=False)
     assert not alone.counts()["free"]
-    assert (
-        "no cell of the level ground is free: nothing encloses any ground; upload a fence" in notes.warnings[0].problem
-    )
+    assert "no cell of level ground is free: nothing encloses any ground; upload a fence" in notes.warnings[0].problem
     fenced = layers(objects((None, {"kind": "model", "shapes": [BOX]})), fence=shapely.box(-5, -5, 5, 5))
     assert at(grid(fenced, outside_free=False), 3, 3) == 0
     floor = (shapely.box(-5, -5, 5, 5), {"kind": "floor"})
@@ -359,7 +357,7 @@ def test_ground_that_nothing_encloses_is_unknown() -> None:
     ],
     ids=lambda shape: str(shape.get("file") or shape.get("uri")),
 )
-def test_ground_around_a_solid_that_cannot_be_read_is_unknown(lost: dict[str, Any]) -> None:
+def test_ground_around_unreadable_solid_is_unknown(lost: dict[str, Any]) -> None:
     """Never free, also within a fence; the object's other solids stay."""
     rows = [
         (
@@ -373,7 +371,7 @@ def test_ground_around_a_solid_that_cannot_be_read_is_unknown(lost: dict[str, An
     notes = DerivationNotes()
     g = grid(layers(objects(*rows), fence=fence, files=files), notes)
     assert (at(g, 10, 0), at(g, 13, 0), at(g, 13, 4.9), at(g, 13, 5.2)) == (100, 255, 255, 0)
-    assert (at(g, 30, 9.8), at(g, 30, 10.2)) == (255, 0), "what an object says of its size counts"
+    assert (at(g, 30, 9.8), at(g, 30, 10.2)) == (255, 0), "an object's own size counts"
     (warning,) = notes.warnings
     assert "2 objects have a solid that cannot be read (shed, barn): " in warning.problem
     assert str(lost.get("file") or lost.get("uri")) in warning.problem
@@ -381,7 +379,7 @@ def test_ground_around_a_solid_that_cannot_be_read_is_unknown(lost: dict[str, An
     assert at(grid(layers(objects(*rows), fence=fence, files=files), surroundings=1.0), 13, 2) == 0
 
 
-def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
+def test_unreadable_solids_without_known_ground_raise_missing_layer() -> None:
     lost = {"kind": "model", "shapes": [{"type": "mesh", "uri": "model://house/walls.dae"}]}
     floor = (shapely.box(-9, -9, 9, 9), {"kind": "floor"})
     for rows, more in (
@@ -396,17 +394,17 @@ def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
     with pytest.raises(MissingLayer, match=r"known to have a body.*walls\.dae"):
         objects_to_voxels(layers(objects((None, lost))), VoxelParameters(), DerivationNotes())
     content = layers(objects((None, lost)), fence=shapely.box(-9, -9, 9, 9))
-    with pytest.raises(MissingLayer, match=r"a blank grid.*walls\.dae"):
+    with pytest.raises(MissingLayer, match=r"an empty grid.*walls\.dae"):
         location_to_occupancy(content, BlankParameters(), DerivationNotes())
 
 
-def test_no_grid_is_made_of_the_voxels_of_objects() -> None:
-    """The way round by voxels would give what the slice refuses: nothing but obstacles."""
+def test_voxels_of_objects_give_no_grid() -> None:
+    """A chain through voxels must not give what the slice refuses: only obstacles."""
     plan = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}), frozenset({"objects_to_occupancy"}))
     assert plan is None or "objects_to_voxels" not in [step.name for step in plan.steps]
 
 
-def test_what_cannot_be_read_is_left_out_and_told() -> None:
+def test_unreadable_objects_are_dropped_with_reason() -> None:
     mesh = {"type": "mesh", "file": "bad.stl"}
     rows: list[Any] = [
         (None, {"kind": "model", "shapes": [BOX]}),
@@ -422,7 +420,7 @@ def test_what_cannot_be_read_is_left_out_and_told() -> None:
     assert notes.dropped == []
 
 
-def test_bodies_without_files_are_told_apart_from_marks() -> None:
+def test_bodies_without_files_are_distinguished_from_marks() -> None:
     rows: list[Any] = [
         (None, {"kind": "model", "shapes": [BOX]}),
         (shapely.Point(0, 0), {"kind": "include", "name": "table"}),
@@ -432,9 +430,9 @@ def test_bodies_without_files_are_told_apart_from_marks() -> None:
     notes = DerivationNotes()
     grid(layers(objects(*rows)), notes)
     assert {d.subject: d.why for d in notes.dropped} == {
-        "objects light": "nothing in a robot's way",
-        "objects model": "nothing in a robot's way",
-        "objects include": "they say neither shapes nor a size: upload the files of their models with them",
+        "objects light": "not an obstacle for robots",
+        "objects model": "not an obstacle for robots",
+        "objects include": "they have neither shapes nor a size: upload the files of their models too",
     }
 
 
@@ -470,25 +468,25 @@ def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None
     g = grid(content, notes, surroundings=2.0)
     for x in (0, 5, -5):
         assert (at(g, x, 0), at(g, x + 0.65, 0), at(g, x + 0.8, 0)) == (255, 255, 0)
-    assert (at(g, 3.5, -5), at(g, 3.7, -5)) == (255, 0), "half the diagonal of what it says of its size"
+    assert (at(g, 3.5, -5), at(g, 3.7, -5)) == (255, 0), "half the diagonal of its stated size"
     assert (at(g, 11.9, -5), at(g, 12.1, -5), at(g, -5, -5), at(g, -5, -5.8)) == (255, 0, 255, 0)
-    assert (at(g, -10, -5), at(g, -9.4, -5), at(g, -9.4, 0)) == (100, 255, 0), "of a point only the middle is known"
+    assert (at(g, -10, -5), at(g, -9.4, -5), at(g, -9.4, 0)) == (100, 255, 0), "only the centre of a point is known"
     assert at(grid(content, unknown_radius=2.0), 1.9, 0) == 255
     assert at(grid(content, inflate=0.2), 0, 0) == 255
     (files, poses, points) = [w for w in notes.warnings if "an unknown extent" in w.problem]
-    assert files.problem.startswith("2 objects have an unknown extent (chair, table): they say neither shapes nor")
+    assert files.problem.startswith("2 objects have an unknown extent (chair, table): they have neither shapes nor")
     assert poses.problem.startswith("3 objects have an unknown extent (o2, o3, o5): pose")
     assert points.problem.startswith("1 object has an unknown extent (o6): they are points")
     assert ("unknown_radius", 0.7) in [(t.subject, t.value) for t in notes.template]
 
 
 def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
-    """Also where they are all that there is, on a floor and on the blank grid of a fence."""
+    """Even if they are the only objects, on a floor and on the empty grid of a fence."""
     chair = (shapely.Point(0, 0), {"kind": "model"})
     notes = DerivationNotes()
     g = grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes)
     assert (at(g, 0.6, 0), at(g, 0.8, 0)) == (255, 0)
-    assert any("is free but the ground around objects of unknown extent" in w.problem for w in notes.warnings)
+    assert any("is free except the ground around objects of unknown extent" in w.problem for w in notes.warnings)
     content = layers(objects(chair), fence=FENCE)
     with pytest.raises(MissingLayer, match="upload the files of their models"):
         grid(content)
@@ -498,24 +496,24 @@ def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
     assert "1 object has an unknown extent" in notes.warnings[0].problem
     notes = DerivationNotes()
     assert not grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes, unknown_radius=100.0).counts()["free"]
-    assert "or ask with a smaller unknown_radius" in notes.warnings[-1].problem
+    assert "or set a smaller unknown_radius" in notes.warnings[-1].problem
 
 
-def test_object_without_a_place_is_warned_of() -> None:
+def test_object_without_position_is_warned_of() -> None:
     notes = DerivationNotes()
     rows: list[Any] = [WALL, (None, {"kind": "building", "name": "barn"}), (None, {"kind": "model"})]
     grid(layers(objects(*rows)), notes)
     (warning,) = notes.warnings
-    assert "2 objects have no known place (barn, o2)" in warning.problem
+    assert "2 objects have no known position (barn, o2)" in warning.problem
 
 
-def test_box_without_a_geometry_stands_at_its_pose() -> None:
+def test_box_without_geometry_is_drawn_at_its_pose() -> None:
     g = grid(layers(objects((None, {"kind": "crate", "size": [2, 1], "pose": [3, 4]}))))
     assert occupied(g) == pytest.approx(2)
     assert at(g, 3.9, 4.4) == 100
 
 
-def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
+def test_broken_object_is_reported_and_others_are_drawn() -> None:
     rows: list[Any] = [
         (shapely.Point(0, 0), {"kind": "include"}),
         (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "a.dae"}]}),
@@ -524,7 +522,7 @@ def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
         grid(layers(objects(*rows)))
 
 
-def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_placed_many_times_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     from app.derive import _obstacles
     from app.model import solids
 
@@ -538,13 +536,13 @@ def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatc
     assert "more than 20 triangles" in notes.warnings[0].problem
 
 
-def test_objects_beyond_the_local_frame_are_a_clear_problem() -> None:
+def test_objects_beyond_local_frame_raise_cannot_convert() -> None:
     far = objects((shapely.box(100, -50, 100.1, -49.9), {"kind": "building"}), anchor="wgs84")
     with pytest.raises(CannotConvert, match="too far from the datum"):
         grid(layers(far, datum=DATUM))
 
 
-def test_visuals_count_only_where_asked() -> None:
+def test_visuals_count_only_when_requested() -> None:
     content = layers(objects((None, {"kind": "model", "shapes": [{**BOX, "visual": True}]})))
     assert occupied(grid(content, visuals=True)) == pytest.approx(2)
 
@@ -594,14 +592,14 @@ PLACES = st.sampled_from(
 
 @given(st.lists(st.tuples(PLACES, SAID), min_size=1, max_size=3))
 @settings(max_examples=300, deadline=None)
-def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> None:
-    """What is wrong with one object is told, and the others are there all the same."""
+def test_random_objects_give_grid_or_error(rows: list[Any]) -> None:
+    """Problems of one object are reported, and the others are drawn."""
     content = layers(objects(*rows, (shapely.box(0, 0, 1, 1), {"kind": "building"})), files={"a.stl": stl()})
     try:
         derived_grid = grid(content, resolution=0.5, doors="closed")
     except CannotConvert as error:
-        expected = ("resolution of at least", "no free ground of the level ground is known, since solids")
-        assert any(text in error.detail for text in expected), "what lies far away makes it large"
+        expected = ("resolution of at least", "no free ground of level ground is known, because solids")
+        assert any(text in error.detail for text in expected), "distant objects make it large"
     else:
         assert at(derived_grid, 0.5, 0.5) == 100
     try:
@@ -610,7 +608,7 @@ def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> N
         assert "coarser resolution" in error.detail or "resolution of at least" in error.detail
 
 
-def test_parameters_are_checked() -> None:
+def test_grid_parameters_are_validated() -> None:
     chosen = parameters.parse(Parameters, {"band": "0.1,1.5", "doors": "closed"})
     assert chosen.band == (0.1, 1.5)
     for wrong in ({"height": "a"}, {"band": "1"}, {"resolution": "0"}, {"doors": "ajar"}, {"inflate": "-1"}):
@@ -619,11 +617,11 @@ def test_parameters_are_checked() -> None:
     content = layers(objects((None, {"kind": "model", "shapes": [BOX]})))
     with pytest.raises(Invalid, match="exclude each other"):
         grid(content, height=1.0, band=(0.0, 1.0))
-    with pytest.raises(Invalid, match="low height comes first"):
+    with pytest.raises(Invalid, match="band must be low,high with low <= high"):
         grid(content, band=(1.0, 0.0))
 
 
-def test_it_is_planned_with_what_it_may_also_read() -> None:
+def test_plan_includes_optional_layers() -> None:
     plan = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}))
     assert plan is not None
     assert [s.name for s in plan.steps] == ["objects_to_occupancy"]
@@ -658,7 +656,7 @@ def xy_of(listed: list[dict[str, Any]], scale: float) -> Any:
         ("robast_sim/tiplu.building.yaml", "Tiplu", 21, 1),
     ],
 )
-def test_a_real_building_is_its_walls_and_floors(
+def test_real_building_gives_walls_and_floors(
     shared: Path, name: str, level: str, walls: int | None, floor: int | None
 ) -> None:
     """Against shapely on the file's own numbers, read with a plain YAML loader."""
@@ -698,7 +696,7 @@ def test_a_real_building_is_its_walls_and_floors(
     assert g.counts()["free"] > 0.5 * (inside & (g.cells != 100)).sum(), "rooms stay mostly free"
 
 
-def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
+def test_robast_sim_walls_match_its_ros_map(shared: Path) -> None:
     """The building was drawn by hand over the picture of the ROS map, so pixels are cells."""
     import yaml
     from scipy import ndimage
@@ -722,10 +720,10 @@ def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
 
 
 @pytest.mark.parametrize("door", ["left", ["x", "y"], 7, None])
-def test_lifts_of_which_nothing_says_where_they_are_open_have_no_walls(door: Any) -> None:
+def test_lifts_without_door_positions_have_no_walls(door: Any) -> None:
     lift = {"kind": "lift", "size": [2.0, 2.0], "openrmf": {"says": {"doors": {"d": door}}}}
     assert obstacles.object_body(lift, shapely.Point(4, 4)) is None
     good = {"x": 1.0, "y": 0.0, "motion_axis_orientation": 1.57, "width": 1.0}
     lift["openrmf"] = {"says": {"doors": {"d": good}}}
     assert obstacles.object_body(lift, shapely.Point(4, 4)) is not None
-    assert obstacles.object_body(lift, shapely.Point()) is None, "nothing says where it is"
+    assert obstacles.object_body(lift, shapely.Point()) is None, "it has no position"

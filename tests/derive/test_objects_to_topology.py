@@ -1,4 +1,4 @@
-"""The derivation: which lines count, on which level, and what it says when there are none."""
+"""Derivation of networks from objects: which lines count, on which level, and the error without any."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def network(layers: Layers, **options: Any) -> dict[str, Features]:
     return {k.level: p for k, p in derived_layers.parts.items() if isinstance(p, Features)}
 
 
-def test_one_network_for_each_level() -> None:
+def test_each_level_gets_one_network() -> None:
     parts = {
         PartKey("objects", "ground", "kml"): objects(PATH),
         PartKey("objects", "ground", "geojson"): objects(shapely.LineString([(5, 0.05), (9, 9)])),
@@ -53,7 +53,7 @@ def test_only_drawings_and_paths_count() -> None:
     assert len(network(Layers(parts))["ground"]) == 2 + 2
 
 
-def test_it_is_planned_and_its_parameters_are_checked() -> None:
+def test_network_derivation_is_planned_and_validates_parameters() -> None:
     plan = derive.plan(frozenset({"objects"}), frozenset({"topology"}))
     assert plan is not None
     assert [s.name for s in plan.steps] == ["objects_to_topology"]

@@ -32,7 +32,7 @@ def model(*shapes: dict[str, Any], **more: Any) -> Layers:
     return layers(objects((None, {"kind": "model", "shapes": list(shapes), **more})))
 
 
-def test_a_box_is_its_voxels() -> None:
+def test_box_fills_its_voxels() -> None:
     v = voxels(model(BOX))
     assert v.voxel_counts() == {"occupied": 10 * 20 * 30, "free": 0}
     assert v.bounds() == (-0.5, -1.0, 0.0, 0.5, 1.0, 3.0)
@@ -42,7 +42,7 @@ def test_a_box_is_its_voxels() -> None:
     assert voxels(model(BOX), resolution=0.5).voxel_counts()["occupied"] == 2 * 4 * 6
 
 
-def test_a_sphere_has_its_volume_and_trimesh_agrees() -> None:
+def test_sphere_volume_agrees_with_trimesh() -> None:
     import trimesh
 
     v = voxels(model({"type": "sphere", "radius": 2, "pose": [5, 0, 0, 0, 0, 0]}))
@@ -70,10 +70,10 @@ def test_footprints_are_extruded_from_their_base_to_their_top() -> None:
     assert v.bounds() == (0.0, 0.0, 0.0, 7.1, 1.0, 3.0)
     (line,) = notes.template
     assert (line.subject, line.value, line.option) == ("height", 3.0, "extrude")
-    assert line.why == "1 footprints do not say how high they are"
+    assert line.why == "1 footprints state no height"
 
 
-def test_all_levels_stand_in_one_map() -> None:
+def test_all_levels_share_one_voxel_map() -> None:
     content = Layers(
         {
             PartKey("objects", "ground", "a"): objects((shapely.box(0, 0, 1, 1), {"kind": "crate", "height": 1.0})),
@@ -89,13 +89,13 @@ def test_all_levels_stand_in_one_map() -> None:
     assert v.voxel_counts()["occupied"] == 1000 + 1000 + 6000
 
 
-def test_nothing_with_a_body_is_a_clear_problem() -> None:
+def test_objects_without_body_raise_missing_layer() -> None:
     for rows in ([], [(shapely.box(0, 0, 1, 1), {"kind": "region"})], [(shapely.box(0, 0, 1, 1), {"kind": "hole"})]):
         with pytest.raises(MissingLayer, match="no stored object has a body"):
             voxels(layers(objects(*rows)))
 
 
-def test_limits_come_before_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_are_checked_before_memory_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CannotConvert, match=r"resolution of at least 3\.05"):
         voxels(model(BOX, pose=[1e5, 0, 0, 0, 0, 0]), resolution=1.0)
     assert voxels(model(BOX, pose=[1e4, 0, 0, 0, 0, 0])).resolution == 0.5

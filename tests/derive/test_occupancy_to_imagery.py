@@ -1,4 +1,4 @@
-"""Occupancy -> imagery: where things lie on the plan, which colours they have, and what it says of itself."""
+"""Occupancy -> imagery: positions and colours on the plan, and its warnings."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def drawn(layers: Layers, notes: DerivationNotes | None = None, **values: Any) -
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_each_cell_is_a_pixel_in_its_place(yaw: float) -> None:
+def test_each_cell_becomes_a_pixel_at_its_position(yaw: float) -> None:
     cells = room()
     picture = drawn(Layers({GRID: OccupancyGrid(cells, 0.1, (3.0, -2.0, yaw))}))
     assert picture.pixels.shape == (20, 40, 4)
     assert (picture.pixels[::-1][cells == FREE] == (*plan.PAPER, 255)).all()
     assert (picture.pixels[::-1][cells == OCCUPIED] == (*plan.INK, 255)).all()
-    assert (picture.pixels[::-1][cells == UNKNOWN][:, 3] == 0).all(), "what nobody knows is transparent"
+    assert (picture.pixels[::-1][cells == UNKNOWN][:, 3] == 0).all(), "unknown cells are transparent"
     # The middle of the cell in column 5, row 2 by the grid's own rule, and of its pixel by the picture's.
     u, v, c, s = 0.55, 0.25, math.cos(yaw), math.sin(yaw)
     (xy,) = pixel_positions(picture.transform, np.array([5.5]), np.array([20 - 2.5]))
@@ -63,7 +63,7 @@ def test_costs_are_shades_between_paper_and_ink() -> None:
     assert grey[2] == round((plan.PAPER[0] + plan.INK[0]) / 2)
 
 
-def test_a_pixel_of_many_cells_shows_what_matters_most() -> None:
+def test_pixel_of_many_cells_shows_occupied_first() -> None:
     cells = room()
     cells[10, 21] = OCCUPIED
     picture = drawn(Layers({GRID: OccupancyGrid(cells, 0.1)}), pixel=0.3)
@@ -105,31 +105,31 @@ def test_objects_and_edges_are_drawn_over_the_cells() -> None:
     assert (plain[..., :3] == plan.PAPER).all()
 
 
-def test_places_on_earth_without_a_datum_are_left_out_and_told() -> None:
+def test_wgs84_objects_without_datum_are_dropped_with_warning() -> None:
     house = [("house", shapely.box(5.0, 52.0, 5.1, 52.1), {"kind": "building"})]
     notes = DerivationNotes()
     layers = Layers({GRID: OccupancyGrid(room(), 0.1), PartKey("objects"): features(house, "wgs84")})
     drawn(layers, notes)
     assert notes.dropped[0].count == 1
-    assert notes.warnings[-1].problem == "the picture is a plan drawn from the map, no photograph"
+    assert notes.warnings[-1].problem == "the image is a plan drawn from the map, not a photograph"
 
 
-def test_several_grids_want_a_name() -> None:
+def test_several_grids_raise_ambiguous() -> None:
     two = Layers({PartKey("occupancy", GROUND, n): OccupancyGrid(room(), 0.1) for n in ("a", "b")})
     with pytest.raises(Ambiguous, match="name one with grid="):
         drawn(two)
     assert drawn(two, grid="a").pixels.shape == (20, 40, 4)
 
 
-def test_nothing_is_derived_from_a_drawn_plan() -> None:
+def test_drawn_plan_is_no_source_of_other_layers() -> None:
     have: frozenset[Layer] = frozenset({"occupancy"})
     assert derive.plan(have, frozenset({"imagery"})) is not None
     derivation_plan = derive.plan(have, frozenset({"objects"}), without=frozenset({"occupancy_to_objects"}))
     assert derivation_plan is None or all(step.name != "occupancy_to_imagery" for step in derivation_plan.steps)
 
 
-def test_a_stored_plan_is_no_evidence_either() -> None:
-    """Neither what was drawn from a grid nor a blank grid is a source of other layers; an edited one is."""
+def test_stored_plan_is_no_source_of_other_layers() -> None:
+    """Neither a plan drawn from a grid nor an empty grid is a source of other layers; an edited one is."""
     now = datetime.fromtimestamp(0, UTC)
 
     def version(information: Any, edited: bool = False) -> Version:
@@ -147,7 +147,7 @@ def test_a_stored_plan_is_no_evidence_either() -> None:
     assert recipe(version("derived"), "satellite", {}).steps == ()
 
 
-def test_a_derivation_that_finds_nothing_is_missing_and_says_what_to_supply() -> None:
+def test_derivation_without_result_is_missing_with_advice() -> None:
     empty = OccupancyGrid(np.full((4, 4), 255, np.uint8), 0.5)
     layers = Layers({PartKey("occupancy"): empty})
     for fmt in ("octomap", "geojson", "tmap2"):

@@ -1,4 +1,4 @@
-"""Grids become objects: known discs, walls and boxes are found where they are, all of them, and nothing else is."""
+"""Grids become objects: known discs, walls and boxes are found at their positions, and nothing else."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def apart(a: float, b: float, period: float) -> float:
 
 @pytest.mark.parametrize("hollow", [False, True])
 @pytest.mark.parametrize("context", CONTEXTS)
-def test_what_is_there_is_found_where_it_is(context: str, *, hollow: bool) -> None:
+def test_shapes_are_found_at_their_positions(context: str, *, hollow: bool) -> None:
     f = find_objects(scene(hollow=hollow), context=context)
     setting = CONTEXTS[context]
     assert kinds(f) == {setting.post: len(DISCS), "wall": len(WALLS), setting.furniture: len(BOXES)}
@@ -122,7 +122,7 @@ def test_what_is_there_is_found_where_it_is(context: str, *, hollow: bool) -> No
 
 
 @pytest.mark.parametrize("origin", [(-6.0, 3.5, 0.0), (100.0, -20.0, 0.7), (0.05, 0.05, -2.5)])
-def test_any_origin_and_yaw_moves_the_objects_as_a_whole(origin: tuple[float, float, float]) -> None:
+def test_grid_origin_and_yaw_move_all_objects(origin: tuple[float, float, float]) -> None:
     plain, g = find_objects(scene()), scene()
     moved = find_objects(grid(g.cells, origin))
     assert plain.ids == moved.ids
@@ -137,8 +137,8 @@ def test_any_origin_and_yaw_moves_the_objects_as_a_whole(origin: tuple[float, fl
         assert a["size"] == b["size"]
 
 
-def test_solids_stand_where_the_outlines_are() -> None:
-    """A cylinder or box by its pose covers what the footprint covers, and is as high."""
+def test_solids_match_outlines() -> None:
+    """A cylinder or box at its pose covers the footprint, and has its height."""
     f = find_objects(scene(), height=2.0)
     reader = solids.Solids({})
     for item in f:
@@ -160,7 +160,7 @@ def room() -> NDArray[np.uint8]:
     return cells
 
 
-def test_a_room_is_its_walls() -> None:
+def test_room_becomes_walls() -> None:
     f = find_objects(grid(room()))
     assert kinds(f) == {"wall": 5}
     walls = [((3.1, 0.175), 6.0), ((3.1, 4.025), 6.0), ((0.175, 2.1), 4.0), ((6.025, 2.1), 4.0), ((3.075, 2.1), 4.0)]
@@ -172,7 +172,7 @@ def test_a_room_is_its_walls() -> None:
         assert min(apart(near["pose"][5], k * math.pi / 2, math.tau) for k in range(4)) < 0.03
 
 
-def test_what_is_thick_in_a_wall_is_no_wall() -> None:
+def test_thick_part_of_wall_is_no_wall() -> None:
     cells = room()
     cells[20:50, 5:30] = OCCUPIED  # 1.25 × 1.5 m at the wall on the left
     assert kinds(find_objects(grid(cells)))["furniture"] == 1
@@ -189,7 +189,7 @@ def test_what_is_thick_in_a_wall_is_no_wall() -> None:
     assert len(around.interiors) == 1
 
 
-def test_a_rim_around_free_cells_is_a_room() -> None:
+def test_rim_around_free_cells_is_room() -> None:
     g = scene(hollow=True)
     cells = g.cells.copy()
     cells[cells == UNKNOWN] = FREE
@@ -198,7 +198,7 @@ def test_a_rim_around_free_cells_is_a_room() -> None:
     assert kinds(f)["wall"] >= len(WALLS) + 4 * len(BOXES)
 
 
-def test_specks_are_left_out_and_said() -> None:
+def test_specks_are_dropped_with_note() -> None:
     cells = scene().cells.copy()
     cells[100, 5], cells[120, 5], cells[140, 5] = OCCUPIED, OCCUPIED, OCCUPIED
     notes = DerivationNotes()
@@ -213,7 +213,7 @@ def test_specks_are_left_out_and_said() -> None:
     assert notes.dropped[0].count == 3 + len(DISCS)
 
 
-def test_what_is_made_up_is_said() -> None:
+def test_filled_in_heights_are_noted() -> None:
     notes = DerivationNotes()
     find_objects(scene(), notes, context="orchard")
     assert {(t.subject, t.value) for t in notes.template} == {
@@ -229,14 +229,14 @@ def test_what_is_made_up_is_said() -> None:
     assert {p["height"] for p in f.properties} == {1.75}
 
 
-def test_a_trunk_of_any_shape_is_a_tree_among_trees() -> None:
+def test_trunk_of_any_shape_is_tree_in_forest() -> None:
     cells = np.full((60, 60), FREE, np.uint8)
     cells[20:24, 20:32], cells[24:30, 20:24] = OCCUPIED, OCCUPIED  # an angle, half a metre long
     assert kinds(find_objects(grid(cells), context="forest")) == {"tree": 1}
     assert "post" not in kinds(find_objects(grid(cells)))
 
 
-def test_tolerance_and_wall_width() -> None:
+def test_tolerance_and_wall_width_are_applied() -> None:
     x, y = middles(120, 200)
     cells = np.full(x.shape, FREE, np.uint8)
     cells[abs(y - 3.0 - 0.6 * np.sin(x)) < 0.12] = OCCUPIED
@@ -248,7 +248,7 @@ def test_tolerance_and_wall_width() -> None:
     assert kinds(find_objects(grid(cells), wall_width=0.15)).get("obstacle") == 1
 
 
-def test_thresholds_and_unknown() -> None:
+def test_thresholds_and_unknown_cells_are_respected() -> None:
     cells = scene().cells.copy()
     cells[cells == OCCUPIED] = 70
     assert find_objects(grid(cells)).ids == find_objects(scene()).ids
@@ -264,13 +264,13 @@ def bad(cells: Any, **values: Any) -> str:
     return caught.value.detail
 
 
-def test_grids_without_objects_say_what_to_do() -> None:
+def test_grids_without_objects_raise_cannot_convert() -> None:
     assert "no occupied cell (3000 free)" in bad(np.full((50, 60), FREE))
     assert "no occupied cell (3000 unknown)" in bad(np.full((50, 60), UNKNOWN))
-    assert "occupied all over" in bad(np.full((50, 60), OCCUPIED))
+    assert "completely occupied" in bad(np.full((50, 60), OCCUPIED))
     assert "no occupied cell (1 free)" in bad([[FREE]])
     assert "no occupied cell (1 unknown)" in bad([[UNKNOWN]])
-    assert "occupied all over" in bad([[OCCUPIED]])
+    assert "completely occupied" in bad([[OCCUPIED]])
     one = np.full((9, 9), FREE)
     one[4, 4] = OCCUPIED
     assert "1 specks less than 0.1 m" in bad(one)
@@ -279,7 +279,7 @@ def test_grids_without_objects_say_what_to_do() -> None:
     assert kinds(find_objects(grid(one), minimum_size=0.05)) == {"post": 1}
 
 
-def test_noise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_raises_cannot_convert(monkeypatch: pytest.MonkeyPatch) -> None:
     random = np.random.default_rng(0)
     cells = np.where(random.random((200, 200)) < 0.3, OCCUPIED, FREE)
     labels = find_objects(grid(cells), minimum_size=0.0)
@@ -301,7 +301,7 @@ def test_pieces_are_never_fewer_than_opencv_counts() -> None:
         assert len(contours) <= known_figures.pieces(mask) <= 6 * len(contours)
 
 
-def test_which_grid_and_levels() -> None:
+def test_grid_is_selected_per_level() -> None:
     g = scene()
     parts = {PartKey("occupancy", "ground", n): g for n in ("keepout", MAP)}
     parts[PartKey("occupancy", "L2", "only")] = g
@@ -321,7 +321,7 @@ def test_which_grid_and_levels() -> None:
         occupancy_to_objects(Layers({PartKey("occupancy", "ground", "keepout"): g}), Parameters(), DerivationNotes())
 
 
-def test_parameters_are_checked_and_the_planner_prefers_all_other_ways() -> None:
+def test_object_derivation_validates_parameters_and_is_planned_last() -> None:
     for wrong in ({"context": "moon"}, {"minimum_size": "-1"}, {"height": "0"}, {"wall_width": "x"}):
         with pytest.raises(Invalid):
             parameters.parse(Parameters, wrong)
@@ -349,8 +349,8 @@ def load(folder: Path) -> Layers:
     return upload_bundle.layers(None)
 
 
-def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
-    """The map that a robot made: its round pieces are the world's cylinders, as the model file tells them."""
+def test_turtlebot3_world_gives_nine_pillars(shared: Path) -> None:
+    """Map recorded by a robot: its round pieces are the world's cylinders, as in the model file."""
     root = shared / "data/gazebo_sdf/turtlebot3_world"
     model = etree.parse(str(root / "models/turtlebot3_world/model.sdf"))
     pillars = []
@@ -376,7 +376,7 @@ def test_the_nine_pillars_of_turtlebot3_world(shared: Path) -> None:
         "occupancy_grid/nav2_map_circular",
     ],
 )
-def test_the_objects_of_real_maps_stand_where_the_map_is_occupied(shared: Path, folder: str) -> None:
+def test_objects_of_real_maps_cover_occupied_cells(shared: Path, folder: str) -> None:
     layers = load(shared / "data" / folder)
     (g,) = layers.grids().values()
     derived_layers = occupancy_to_objects(layers, Parameters(), DerivationNotes())
@@ -389,12 +389,12 @@ def test_the_objects_of_real_maps_stand_where_the_map_is_occupied(shared: Path, 
         return np.asarray((np.column_stack([columns, rows]) + 0.5) * one.resolution + one.origin[:2])
 
     a, b = occupied(g), occupied(again)
-    # What is not covered are specks.
+    # only specks are not covered
     assert (cKDTree(b).query(a)[0] <= 1.5 * g.resolution).mean() > 0.95
     assert (cKDTree(a).query(b)[0] <= 1.5 * g.resolution).mean() > 0.95
 
 
-def test_the_same_grid_gives_the_same_objects(shared: Path) -> None:
+def test_object_derivation_is_repeatable(shared: Path) -> None:
     layers = load(shared / "data/occupancy_grid/turtlebot3_map_office_raw")
     a, b = (occupancy_to_objects(layers, Parameters(), DerivationNotes()).vector("objects") for _ in range(2))
     for one, other in zip(a.values(), b.values(), strict=True):
@@ -403,7 +403,7 @@ def test_the_same_grid_gives_the_same_objects(shared: Path) -> None:
         assert shapely.to_wkb(one.geometry).tolist() == shapely.to_wkb(other.geometry).tolist()
 
 
-def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
+def test_gazebo_world_of_objects_has_their_cylinders_and_boxes() -> None:
     derived_layers = occupancy_to_objects(Layers({PartKey("occupancy"): scene()}), Parameters(), DerivationNotes())
     gazebo = formats.get_format("gazebo")
     files = gazebo.write(derived_layers, formats.WriteContext(title="scene", options=gazebo.write_options()))
@@ -412,12 +412,12 @@ def test_a_gazebo_world_of_the_objects_has_their_cylinders_and_boxes() -> None:
     assert len(world.findall(".//collision/geometry/box")) == len(BOXES) + len(WALLS)
 
 
-def test_a_grid_alone_still_is_a_gazebo_world_of_its_cells() -> None:
+def test_grid_alone_gives_gazebo_world_of_its_cells() -> None:
     gazebo = formats.get_format("gazebo")
     key = PartKey("occupancy")
     chain = recipe.plan_chain(gazebo, recipe.AvailableLayers(frozenset({key}), datum=False), gazebo.write_options())
     assert chain == recipe.DerivationChain((), (key,))
-    # Objects that were made of it stand for it, unless it is named.
+    # objects derived from it replace it, unless it is named
     both = [PartKey("objects", "ground", NAME), key]
     assert gazebo.selection.choose(both, gazebo.write_options()) == both[:1]
     assert gazebo.selection.choose(both, gazebo.write_options(grid=MAP)) == both

@@ -100,7 +100,7 @@ def cells_at(g: OccupancyGrid, xy: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def distances(g: OccupancyGrid) -> NDArray[np.float64]:
-    """Metres from cell centre to the nearest obstacle's centre, what is beyond the grid being one; by scipy."""
+    """Metres from cell centre to the nearest obstacle's centre, with obstacles beyond the grid; by scipy."""
     free = np.pad(g.cells == FREE, 1)
     return np.asarray(ndimage.distance_transform_edt(free))[1:-1, 1:-1] * g.resolution
 
@@ -130,9 +130,9 @@ def check(g: OccupancyGrid, f: Features, radius: float) -> nx.DiGraph:
     for piece in pieces:
         at = cells_at(g, np.array([network.nodes[n]["at"] for n in piece]))
         inside = set(place[at[:, 0], at[:, 1]].tolist())
-        assert len(inside) == 1, "edges join what free space does not"
+        assert len(inside) == 1, "edges join unconnected free space"
         labels += inside
-    assert len(set(labels)) == len(labels), "free space joins what the network does not"
+    assert len(set(labels)) == len(labels), "connected free space has separate networks"
     sizes = np.bincount(place.ravel())[1:]
     assert int(np.argmax(sizes)) + 1 in labels
     return network
@@ -141,7 +141,7 @@ def check(g: OccupancyGrid, f: Features, radius: float) -> nx.DiGraph:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("radius", [0.0, 0.15, 0.3])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_every_edge_is_free_and_what_is_connected_stays_connected(method: str, radius: float, seed: int) -> None:
+def test_edges_are_free_and_connected_space_stays_connected(method: str, radius: float, seed: int) -> None:
     g = grid(rooms(seed))
     network = check(g, derived(g, method=method, robot_radius=radius, island=0.0), radius)
     assert nx.number_weakly_connected_components(network) >= 2 or method == "roadmap", "the sealed room has ways too"
@@ -150,7 +150,7 @@ def test_every_edge_is_free_and_what_is_connected_stays_connected(method: str, r
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_any_origin_and_yaw_moves_the_network_as_a_whole(method: str) -> None:
+def test_grid_origin_and_yaw_move_the_network(method: str) -> None:
     cells = rooms(3)
     for origin in ((-6.0, 3.5, 0.0), (100.0, -20.0, 0.7), (0.05, 0.05, -2.5)):
         g = grid(cells, origin=origin)
@@ -162,7 +162,7 @@ def test_any_origin_and_yaw_moves_the_network_as_a_whole(method: str) -> None:
     assert np.allclose(moved, shapely.get_coordinates(turned.select_kinds("node").geometry), atol=1e-8)
 
 
-def test_a_corridor_by_hand() -> None:
+def test_corridor_gives_expected_network() -> None:
     """Seven free cells of 0.1 m between walls, 40 long: one line along the middle row, 0.7 m wide."""
     cells = np.full((9, 42), OCCUPIED)
     cells[1:8, 1:41] = FREE
@@ -174,12 +174,12 @@ def test_a_corridor_by_hand() -> None:
     assert {e.properties["width"] for e in long} == {0.7}
     assert rows.min() >= 0.4
     assert rows.max() <= 0.5
-    with pytest.raises(CannotConvert, match=r"farthest that a free cell is from obstacles is 0\.4 m"):
+    with pytest.raises(CannotConvert, match=r"free cells are at most 0\.4 m from obstacles"):
         derived(grid(cells), robot_radius=0.4)
     assert len(derived(grid(cells), robot_radius=0.399, spacing=0.0)) == 2 + 2
 
 
-def test_a_ring_around_a_post_stays_a_ring() -> None:
+def test_ring_around_post_stays_ring() -> None:
     cells = np.full((61, 61), FREE)
     cells[[0, -1]], cells[:, [0, -1]] = OCCUPIED, OCCUPIED
     cells[25:36, 25:36] = OCCUPIED
@@ -190,7 +190,7 @@ def test_a_ring_around_a_post_stays_a_ring() -> None:
     assert ring.contains(shapely.box(2.5, 2.5, 3.6, 3.6))
 
 
-def test_unknown_is_an_obstacle_unless_said() -> None:
+def test_unknown_cells_are_obstacles_by_default() -> None:
     cells = rooms(1)
     cells[cells == OCCUPIED] = UNKNOWN
     g = grid(cells)
@@ -203,14 +203,14 @@ def test_unknown_is_an_obstacle_unless_said() -> None:
     assert nx.number_weakly_connected_components(graph) == 1
 
 
-def test_islands_go_but_never_all() -> None:
+def test_islands_are_dropped_except_the_largest() -> None:
     cells = rooms(2)
     assert nx.number_weakly_connected_components(graph_of(derived(grid(cells), island=0.0))) > 1
     assert nx.number_weakly_connected_components(graph_of(derived(grid(cells), island=6.0))) == 1
     assert len(derived(grid(cells), island=1e6)) > 10
 
 
-def test_what_is_left_out_is_said() -> None:
+def test_dropped_places_are_noted() -> None:
     notes = DerivationNotes()
     layers = Layers({PartKey("occupancy"): grid(rooms(2))})
     occupancy_to_topology(layers, Parameters(island=6.0), notes)
@@ -218,13 +218,13 @@ def test_what_is_left_out_is_said() -> None:
     assert not notes.warnings
     notes = DerivationNotes()
     occupancy_to_topology(layers, Parameters(island=0.0), notes)
-    assert [w.problem[:26] for w in notes.warnings] == ["the network is in 2 pieces"]
+    assert [w.problem[:26] for w in notes.warnings] == ["the network has 2 disconnected pieces"]
     assert not notes.dropped
     occupancy_to_topology(layers, Parameters(island=6.0, method="roadmap"), notes)
     assert {d.subject for d in notes.dropped} == {"places", "samples"}
 
 
-def test_the_open_is_covered_without_detours() -> None:
+def test_open_space_is_covered_without_detours() -> None:
     cells = np.full((200, 200), FREE)
     cells[[0, -1]], cells[:, [0, -1]] = OCCUPIED, OCCUPIED
     cells[90:110, 60:140] = OCCUPIED
@@ -247,7 +247,7 @@ def test_the_open_is_covered_without_detours() -> None:
     assert len(sparse) < len(network) / 3
 
 
-def test_a_spur_is_cut_and_a_dead_end_is_not() -> None:
+def test_spur_is_cut_and_dead_end_is_not() -> None:
     cells = np.full((60, 120), OCCUPIED)
     cells[20:41, 2:118] = FREE
     cells[15:20, 60] = FREE  # a notch in the wall
@@ -263,7 +263,7 @@ def test_a_spur_is_cut_and_a_dead_end_is_not() -> None:
     assert min(ends(cut, 9.55)) < 1.2
 
 
-def test_a_line_is_simplified_as_far_as_the_tolerance_and_the_obstacles_let() -> None:
+def test_lines_are_simplified_within_tolerance_and_free_space() -> None:
     steps = np.full((80, 200), OCCUPIED)
     for x in range(2, 198):
         y = 30 + round(8 * math.sin(x / 15))
@@ -282,7 +282,7 @@ def test_a_line_is_simplified_as_far_as_the_tolerance_and_the_obstacles_let() ->
     )
 
 
-def test_most_ids_stay_where_the_map_stays() -> None:
+def test_most_ids_stay_when_map_is_unchanged() -> None:
     cells = rooms(4, 240)
     before = derived(grid(cells))
     cells = cells.copy()
@@ -312,7 +312,7 @@ def test_roadmaps_are_seeded() -> None:
     assert longest < 4.0
 
 
-def test_a_narrow_passage_is_found_by_a_roadmap_with_few_samples() -> None:
+def test_roadmap_with_few_samples_finds_narrow_passage() -> None:
     cells = np.full((100, 200), FREE)
     cells[[0, -1]], cells[:, [0, -1]] = OCCUPIED, OCCUPIED
     cells[:, 95:105] = OCCUPIED
@@ -333,14 +333,14 @@ def mean_clearance(g: OccupancyGrid, f: Features) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_voronoi_ways_are_as_far_from_obstacles_as_can_be(seed: int) -> None:
+def test_voronoi_edges_maximise_distance_to_obstacles(seed: int) -> None:
     g = grid(rooms(seed))
     networks = {m: derived(g, method=m, spacing=0.0, robot_radius=0.2) for m in ("skeleton", "voronoi")}
     assert mean_clearance(g, networks["voronoi"]) >= mean_clearance(g, networks["skeleton"])
     assert mean_clearance(g, networks["voronoi"]) > mean_clearance(g, derived(g, robot_radius=0.2))
 
 
-def test_a_voronoi_diagram_by_hand() -> None:
+def test_voronoi_diagram_of_room_is_as_expected() -> None:
     """Two rooms of 4 × 4 m and a door of 0.9 m: through their middles and the door's, and nowhere into the corners."""
     cells = np.full((42, 85), OCCUPIED)
     cells[1:41, 1:41], cells[1:41, 44:84], cells[17:26, 41:44] = FREE, FREE, FREE
@@ -368,25 +368,25 @@ def bad(cells: Any, **values: Any) -> str:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_grids_without_ways_say_what_to_do(method: str) -> None:
-    assert "free all over" in bad(np.full((50, 60), FREE), method=method)
+def test_grids_without_paths_raise_cannot_convert(method: str) -> None:
+    assert "completely free" in bad(np.full((50, 60), FREE), method=method)
     assert "no free cell (3000 occupied)" in bad(np.full((50, 60), OCCUPIED), method=method)
     unknown = bad(np.full((50, 60), UNKNOWN), method=method)
     assert "no free cell (3000 unknown)" in unknown
     assert "unknown=true" in unknown
-    assert "free all over" in bad(np.full((50, 60), UNKNOWN), method=method, unknown=True)
-    assert "free all over" in bad([[FREE]], method=method)
+    assert "completely free" in bad(np.full((50, 60), UNKNOWN), method=method, unknown=True)
+    assert "completely free" in bad([[FREE]], method=method)
     assert "no free cell" in bad([[OCCUPIED]], method=method)
     assert "no free cell (1 other)" in bad([[50]], method=method)
     large = bad(rooms(), method=method, robot_radius=50.0)
     assert "radius 50 m" in large
-    assert "Give a robot_radius below" in large
+    assert "use a robot_radius below" in large
     spot = np.full((9, 9), OCCUPIED)
     spot[4, 4] = FREE
-    assert "too few for a way" in bad(spot, method=method, robot_radius=0.0)
+    assert "too few for a path" in bad(spot, method=method, robot_radius=0.0)
     assert "'map' of level 'ground'" in bad(spot, method=method, robot_radius=0.0)
     if method != "roadmap":
-        assert "give a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
+        assert "use a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
 
 
 def test_thresholds_in_between_are_not_free() -> None:
@@ -395,7 +395,7 @@ def test_thresholds_in_between_are_not_free() -> None:
     check(grid(cells), derived(grid(cells)), 0.3)
 
 
-def test_which_grid() -> None:
+def test_grid_selection() -> None:
     g = grid(rooms())
     parts = {PartKey("occupancy", "ground", n): g for n in ("keepout", "map")}
     parts[PartKey("occupancy", "L2", "only")] = g
@@ -409,7 +409,7 @@ def test_which_grid() -> None:
         occupancy_to_topology(Layers(dict(parts), levels=layers.levels), Parameters(), DerivationNotes())
 
 
-def test_masks_are_no_maps_unless_named() -> None:
+def test_masks_are_used_only_when_named() -> None:
     g = grid(rooms())
     mask = Layers({PartKey("occupancy", "ground", "keepout"): g})
     with pytest.raises(MissingLayer, match="masks alone"):
@@ -421,13 +421,13 @@ def test_masks_are_no_maps_unless_named() -> None:
     assert network.ids == derived(grid(rooms(1))).ids
 
 
-def test_parameters_are_checked() -> None:
-    with pytest.raises(Invalid, match="samples: belongs to method=roadmap, not to skeleton"):
+def test_network_parameters_are_validated() -> None:
+    with pytest.raises(Invalid, match="samples: applies only to method=roadmap, not to skeleton"):
         derived(grid(rooms()), samples=5)
     for method in ("roadmap", "voronoi"):
-        with pytest.raises(Invalid, match=f"detour: belongs to method=skeleton, not to {method}"):
+        with pytest.raises(Invalid, match=f"detour: applies only to method=skeleton, not to {method}"):
             derived(grid(rooms()), method=method, detour=2.0)
-    with pytest.raises(Invalid, match="spacing: belongs to method=skeleton or voronoi, not to roadmap"):
+    with pytest.raises(Invalid, match="spacing: applies only to method=skeleton or voronoi, not to roadmap"):
         derived(grid(rooms()), method="roadmap", spacing=2.0)
     with pytest.raises(Invalid, match="at least 0"):
         parameters.parse(Parameters, {"robot_radius": "-1"})
@@ -440,7 +440,7 @@ def test_parameters_are_checked() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("method", METHODS)
-def test_random_grids(method: str, seed: int) -> None:
+def test_random_grids_give_valid_network_or_error(method: str, seed: int) -> None:
     random = np.random.default_rng(seed)
     shape = random.integers(3, 90, 2)
     cells = np.where(random.random(shape) < random.choice([0.02, 0.2, 0.4]), OCCUPIED, FREE)
@@ -468,7 +468,7 @@ def strawberry() -> tuple[OccupancyGrid, Features]:
 
 
 @pytest.mark.parametrize(("method", "ways"), [("skeleton", 0.9), ("roadmap", 0.7)])
-def test_the_strawberry_map_gives_what_was_drawn_by_hand(
+def test_strawberry_map_network_matches_hand_drawn_one(
     strawberry: tuple[OccupancyGrid, Features], method: str, ways: float
 ) -> None:
     """90 % of the nodes within 0.8 m, 90 % of the edges with a path at most 1.3 times as long (random ways: 70 %)."""
@@ -522,7 +522,7 @@ def test_the_strawberry_map_gives_what_was_drawn_by_hand(
 
 
 def seen_in_part(free_thresh: float) -> dict[str, bytes]:
-    """A map as map_saver writes it: a seen room (254), its walls (0), and what nobody has seen (205) on the right."""
+    """A map as written by map_saver: a seen room (254), its walls (0), and unseen cells (205) on the right."""
     pixels = np.full((60, 120), 205, np.uint8)
     pixels[5:55, 5:55] = 254
     pixels[[4, 55], 4:56] = 0
@@ -532,20 +532,20 @@ def seen_in_part(free_thresh: float) -> dict[str, bytes]:
     return {"map.yaml": text.encode(), "map.pgm": b"P5\n120 60\n255\n" + pixels.tobytes()}
 
 
-def test_no_way_leads_where_the_grey_of_unknown_is_called_free() -> None:
+def test_grey_205_cells_have_no_edges_by_default() -> None:
     files = seen_in_part(0.25)
     ((key, grid),) = formats.read(formats.group(files)[0][0], ReadContext()).grids().items()
-    assert int((grid.cells == FREE).sum()) == 7200 - 154, "what Nav2 makes of the file stays"
+    assert int((grid.cells == FREE).sum()) == 7200 - 154, "the file is unchanged for Nav2"
     notes = DerivationNotes()
     derived_network = network(grid, Parameters(), notes, "the map")
     assert shapely.total_bounds(derived_network.geometry)[2] < 5.6
     (warning,) = [w.problem for w in notes.warnings if "grey 205" in w.problem]
     assert "4546 cells" in warning
-    assert "unknown_grey=free takes them as free" in warning
+    assert "unknown_grey=free keeps them free" in warning
     notes = DerivationNotes()
     derived_network = network(grid, Parameters(unknown_grey="free"), notes, "the map")
     assert shapely.total_bounds(derived_network.geometry)[2] > 8
-    assert "ways may lead where nobody has been" in notes.warnings[0].problem
+    assert "edges may lead through unexplored ground" in notes.warnings[0].problem
 
     written = formats.write(formats.get_format("occupancy_grid"), Layers({key: grid}), WriteContext())
     assert written["map.pgm"] == files["map.pgm"], "the picture keeps its greys"
@@ -555,7 +555,7 @@ def test_no_way_leads_where_the_grey_of_unknown_is_called_free() -> None:
     assert [g.properties for g in usual.values()] == [{}]
 
 
-def test_cells_that_people_draw_are_no_longer_doubtful() -> None:
+def test_hand_drawn_free_cells_are_trusted() -> None:
     ((_, grid),) = formats.read(formats.group(seen_in_part(0.25))[0][0], ReadContext()).grids().items()
     drawn = np.zeros(grid.cells.shape, bool)
     drawn[:, 60:] = True
@@ -566,7 +566,7 @@ def test_cells_that_people_draw_are_no_longer_doubtful() -> None:
     assert without_unknown_grey(grid).properties == {}
 
 
-def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
+def test_all_derivations_treat_grey_205_as_unknown() -> None:
     cells, grey = np.full((120, 120), FREE, np.uint8), np.ones((120, 120), bool)
     grey[30:90, 30:90] = False
     cells[30:90, [30, 89]] = cells[[30, 89], 30:90] = OCCUPIED
@@ -604,7 +604,7 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     assert (full_grid.cells[55:58, 55:58] != UNKNOWN).all()
     assert (full_grid.cells[5:15, 5:15] == UNKNOWN).all(), "nothing near it was seen"
     assert (full_grid.cells[grey & (cells == FREE)] == FREE).all()
-    assert "nothing is learned from them" in notes.warnings[-1].problem
+    assert "they are not learned from" in notes.warnings[-1].problem
 
     fmt = formats.get_format("occupancy_grid")
     for values in ({"resolution": 0.1}, {"resolution": 0.025}, {"normalize": True}):

@@ -52,7 +52,7 @@ cells = st.lists(st.lists(st.sampled_from([FREE, OCCUPIED, UNKNOWN]), min_size=9
 
 @settings(max_examples=80, deadline=None)
 @given(cells, st.integers(-9, 9), st.integers(-9, 9), st.integers(-3, 3), st.integers(1, 11), st.booleans())
-def test_columns_by_brute_force(rows: list[list[int]], x: int, y: int, floor: int, tall: int, free: bool) -> None:
+def test_columns_equal_brute_force(rows: list[list[int]], x: int, y: int, floor: int, tall: int, free: bool) -> None:
     grid = grid_of(rows, origin=(x * 0.5, y * 0.5, 0.0))
     want = {
         (x + i, y + j, floor + k): value == OCCUPIED
@@ -62,7 +62,7 @@ def test_columns_by_brute_force(rows: list[list[int]], x: int, y: int, floor: in
         for k in range(tall)
     }
     if not want:
-        with pytest.raises(MissingLayer, match="occupied and free cells"):
+        with pytest.raises(MissingLayer, match="occupied or free cells"):
             extrude(grid, height=tall * 0.5, free=free)
         return
     voxels = extrude(grid, elevation=floor * 0.5, height=tall * 0.5, free=free)
@@ -72,7 +72,7 @@ def test_columns_by_brute_force(rows: list[list[int]], x: int, y: int, floor: in
 
 @pytest.mark.parametrize("size", [0.5, 0.25, 0.1, 1.0, 1.3])
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (0.2, -0.3, 0.0), (1.0, 2.0, 0.4), (-3.0, 0.1, -2.0)])
-def test_turned_and_shifted_cells_occupy_what_they_reach_into(origin: tuple[float, float, float], size: float) -> None:
+def test_rotated_cells_occupy_all_touched_voxels(origin: tuple[float, float, float], size: float) -> None:
     dice = np.random.default_rng(4)
     rows = dice.choice([FREE, FREE, OCCUPIED, UNKNOWN], (7, 8)).tolist()
     grid = grid_of(rows, origin=origin)
@@ -99,7 +99,7 @@ def test_turned_and_shifted_cells_occupy_what_they_reach_into(origin: tuple[floa
 
 
 @pytest.mark.parametrize("name", ["occupancy_grid/nav2_tb3_sandbox", "occupancy_grid/nav2_map_circular"])
-def test_real_maps_there_and_back(shared: Path, name: str) -> None:
+def test_real_maps_survive_round_trip(shared: Path, name: str) -> None:
     files = {p.name: p.read_bytes() for p in (shared / "data" / name).iterdir()}
     main = next(n for n in sorted(files) if n.endswith(".yaml"))
     layers = formats.read(FileGroup(get_format("occupancy_grid"), main, files), ReadContext(grid="map"))
@@ -126,7 +126,7 @@ def test_grey_cells_follow_the_thresholds() -> None:
     assert {k[0]: v for k, v in voxels.items()} == {0: False, 1: False, 2: False, 5: True, 6: True}
 
 
-def test_which_grids_are_extruded() -> None:
+def test_map_grid_is_extruded_before_others() -> None:
     wall = grid_of([[OCCUPIED]])
     named = {PartKey("occupancy", level, name): wall for level, name in (
         ("ground", "map"), ("ground", "other"), ("ground", "keepout"), ("L2", "lab"), ("L2", "speed"),
@@ -139,7 +139,7 @@ def test_which_grids_are_extruded() -> None:
     assert part.bounds() == (0.0, 0.0, 4.0, 0.5, 0.5, 4.5)
 
 
-def test_grids_without_content_are_no_voxels() -> None:
+def test_empty_grids_raise_missing_layer() -> None:
     for layers in (Layers(), Layers({MAP: grid_of([[UNKNOWN, UNKNOWN]])}), Layers({PartKey("occupancy", name="keepout"): grid_of([[OCCUPIED]])})):  # fmt: skip  # noqa: E501
         with pytest.raises(MissingLayer, match="upload"):
             occupancy_to_voxels(layers, Parameters(), derive.DerivationNotes())
@@ -149,10 +149,10 @@ def test_grids_without_content_are_no_voxels() -> None:
     extrude(grid_of([[OCCUPIED]]))
 
 
-def test_octrees_that_would_be_too_large_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(CannotConvert, match="goes beyond"):
+def test_too_large_octrees_raise_cannot_convert(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CannotConvert, match="extends beyond"):
         extrude(grid_of([[OCCUPIED]], origin=(20000.0, 0.0, 0.0)))
-    with pytest.raises(CannotConvert, match="goes beyond"):
+    with pytest.raises(CannotConvert, match="extends beyond"):
         extrude(grid_of([[OCCUPIED]]), elevation=16383.9)
     with pytest.raises(CannotConvert, match="columns"):
         extrude(grid_of([[FREE] * 100] * 100), resolution=0.001)
@@ -162,7 +162,7 @@ def test_octrees_that_would_be_too_large_are_refused(monkeypatch: pytest.MonkeyP
         extrude(grid_of(dice.choice([FREE, OCCUPIED], (20, 20)).tolist()))
 
 
-def test_a_large_free_grid_is_few_leaves() -> None:
+def test_large_free_grid_has_few_leaves() -> None:
     """4096 × 4096 cells, 2 m high: five thousand leaves and not 670 million voxels."""
     big = np.zeros((4096, 4096), np.uint8)
     start = time.process_time()

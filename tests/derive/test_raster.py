@@ -39,7 +39,7 @@ def shape(**members: Any) -> Any:
 
 
 def clipped(triangle: Any, low: float, high: float) -> Any:
-    """A triangle between two heights seen from above, by an independent way: half planes on a finely known polygon."""
+    """A triangle between two heights seen from above, computed independently: half planes on a fine polygon."""
     out = [tuple(p) for p in triangle]
     for sign, bound in ((1.0, low - 1e-9), (-1.0, -high - 1e-9)):
         corners = []
@@ -56,21 +56,21 @@ def clipped(triangle: Any, low: float, high: float) -> Any:
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
 @settings(max_examples=30, deadline=None)
-def test_a_surface_touches_the_cells_that_it_meets(seed: int, slice_: bool) -> None:
+def test_surface_paints_touched_cells(seed: int, slice_: bool) -> None:
     random = np.random.default_rng(seed)
     triangles = random.uniform([-2, -3, 0], [5, 5, 2], (4, 3, 3))
     low = float(random.uniform(0, 2))
     high = low if slice_ else float(random.uniform(low, 2.2))
     mask = cells(raster.surfaces(triangles, FRAME, np.array([[low, high]])))[0]
     pieces = [clipped(t, low, high) for t in triangles]
-    # A micrometre against the normal moves the cut of a nearly level triangle by more: only what is grazed may differ.
+    # a micrometre along the normal moves the cut of a nearly level triangle by more: only grazed cells may differ
     near = np.logical_or.reduce([shapely.distance(boxes(), p) < 1e-3 for p in pieces])
     sure = np.logical_or.reduce([shapely.intersects(shapely.buffer(boxes(), -1e-3), p) for p in pieces])
     assert not (mask & ~near).any()
     assert not (sure & ~mask).any()
 
 
-def test_slabs_are_layers() -> None:
+def test_surface_slabs_become_layers() -> None:
     random = np.random.default_rng(4)
     triangles = random.uniform([-2, -3, 0], [5, 5, 2], (30, 3, 3))
     heights = np.arange(9) * 0.25
@@ -81,7 +81,7 @@ def test_slabs_are_layers() -> None:
         assert (together[k] == alone).all()
 
 
-def test_a_box_covers_its_cells_and_no_more() -> None:
+def test_box_covers_exactly_its_cells() -> None:
     box = shape(type="box", size=[1.0, 0.5, 1.0], pose=[0.5, 0.25, 0.5, 0, 0, 0])
     for low, high in ((0.2, 0.2), (0.0, 1.0), (-5.0, 5.0), (0.0, 0.0)):
         mask = cells(raster.surfaces(box, FRAME, np.array([[low, high]])))[0]
@@ -114,7 +114,7 @@ def test_inside_agrees_with_the_distance_to_spheres(seed: int) -> None:
     assert not mask[away > 1e-6].any()
 
 
-def test_an_open_surface_encloses_nothing() -> None:
+def test_open_surface_has_no_inside() -> None:
     box = shape(type="box", size=[2, 2, 2])
     walls = box[np.ptp(box[:, :, 2], axis=1) > 0]
     none = np.zeros(len(box), int)
@@ -144,7 +144,7 @@ def test_areas_with_holes_agree_with_rasterio() -> None:
         assert (touched == shapely.intersects(boxes(), area)).all()
 
 
-def test_lines_and_points_and_what_lies_outside() -> None:
+def test_lines_points_and_outside_geometry_are_rasterised() -> None:
     line = shapely.LineString([(-0.9, -1.9), (0.9, -1.9), (0.9, 100)])
     mask = cells(raster.areas([line], FRAME, touched=False))[0]
     assert np.flatnonzero(mask[0]).tolist() == list(range(8))
@@ -157,14 +157,14 @@ def test_lines_and_points_and_what_lies_outside() -> None:
     assert not list(raster.areas([], FRAME, touched=True))
 
 
-def test_collections_count_with_all_they_hold() -> None:
+def test_collections_are_rasterised_completely() -> None:
     several = shapely.MultiPolygon([shapely.box(0, 0, 0.25, 0.25), shapely.box(1, 1, 1.25, 1.25)])
     mixed = shapely.GeometryCollection([several, shapely.LineString([(2, 2.1), (2.4, 2.1)])])
     assert cells(raster.areas([mixed], FRAME, touched=True)).sum() == 4
     assert len(solids.extrude(mixed, 0.0, 1.0)) == 2 * 12
 
 
-def test_frames_lie_on_whole_cells() -> None:
+def test_frames_are_aligned_to_cells() -> None:
     frame = RasterFrame.from_box((0.3, -0.31, 0.9, 0.6), 0.1)
     assert (frame.origin, frame.width, frame.height) == ((0.3, -0.4), 6, 10)
     assert RasterFrame.from_box((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1

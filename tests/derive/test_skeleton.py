@@ -48,7 +48,7 @@ def same_topology(skeleton: Mask, mask: Mask) -> None:
 
 
 def one_cell_wide(skeleton: Mask) -> None:
-    """No cell but an end can go without changing pieces or holes: told cell by cell with the library."""
+    """No cell except ends can be deleted without changing pieces or holes: checked cell by cell with the library."""
     padded = np.pad(skeleton, 1)
     for y, x in np.argwhere(padded):
         assert needed(padded[y - 1 : y + 2, x - 1 : x + 2].tobytes()), (y, x)
@@ -62,7 +62,7 @@ def needed(window: bytes) -> bool:
         return True
     around[1, 1] = False
     cut = label(around, connectivity=2).max() > 1
-    # A cell whose four sides are all set encloses nothing when it stays and a hole when it goes.
+    # a cell whose four sides are all set encloses nothing when it stays, and a hole when it is deleted
     opened = label(~np.pad(around, 1), connectivity=1).max() > 1
     return bool(cut or opened)
 
@@ -114,7 +114,7 @@ def test_distances_to_the_nearest_obstacle_are_exact() -> None:
 
 
 @pytest.mark.parametrize("band", [1, 50, 700])
-def test_a_diagram_made_in_parts_is_the_same(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voronoi_thinning_in_parts_equals_whole(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
     mask_list = masks(60)
     diagrams = [ridges(mask) for mask in mask_list]
     monkeypatch.setattr(_skeleton, "BAND", band)
@@ -122,7 +122,7 @@ def test_a_diagram_made_in_parts_is_the_same(band: int, monkeypatch: pytest.Monk
         assert (ridges(mask) == diagram).all()
 
 
-def test_cells_come_by_rank_and_place_about_as_many_at_a_time_as_asked() -> None:
+def test_sorted_cells_come_in_bands_of_requested_size() -> None:
     random = np.random.default_rng(3)
     mask, rank = (random.random((40, 50)) < 0.6).astype(np.uint8), random.integers(0, 65536, (40, 50)).astype(np.uint16)
     rank[:20] = 7  # more than a part holds
@@ -133,7 +133,7 @@ def test_cells_come_by_rank_and_place_about_as_many_at_a_time_as_asked() -> None
     assert len(parts) > 5
 
 
-def test_random_masks_keep_their_topology_as_the_library_keeps_it() -> None:
+def test_thinning_keeps_topology_like_reference_library() -> None:
     for mask in masks(240):
         same_topology(thinned(mask), mask)
 
@@ -150,11 +150,11 @@ def test_lines_are_one_cell_wide() -> None:
         *(np.eye(9), np.indices((9, 9)).sum(0) % 2, np.kron(np.eye(9), np.ones((2, 2))), np.zeros((4, 4))),
     ],
 )
-def test_special_masks(mask: Any) -> None:
+def test_thinning_of_special_masks(mask: Any) -> None:
     same_topology(thinned(mask > 0), mask > 0)
 
 
-def test_before_the_last_step_it_is_zhang_and_suen_cell_for_cell() -> None:
+def test_thinning_equals_zhang_suen_before_last_step() -> None:
     """Against the rules of the paper, written down plainly."""
 
     around = ((1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1))
@@ -186,7 +186,7 @@ def test_before_the_last_step_it_is_zhang_and_suen_cell_for_cell() -> None:
         assert len(np.argwhere(extra)) == len(missing_blocks)
 
 
-def test_the_real_map(strawberry: Any) -> None:  # noqa: F811
+def test_thinning_of_real_map(strawberry: Any) -> None:  # noqa: F811
     free = strawberry[0].cells == FREE
     same_topology(thinned(free), free)
 
@@ -209,7 +209,7 @@ def test_distances_are_exact() -> None:
             assert count == out.sum()
 
 
-def test_lines_visit_every_cell_they_touch() -> None:
+def test_clear_lines_visit_every_touched_cell() -> None:
     """Against shapely: a line is clear where it touches no blocked cell, be it at a corner."""
     import shapely
 
@@ -226,8 +226,8 @@ def test_lines_visit_every_cell_they_touch() -> None:
     assert seen == {True, False}
 
 
-def test_the_narrowest_cell_of_a_line() -> None:
-    """Against all cells that the line touches, told by shapely, and scipy's distances."""
+def test_narrowest_cell_of_line_is_exact() -> None:
+    """Compared with all cells that the line touches, by shapely, and scipy's distances."""
     import shapely
 
     random = np.random.default_rng(6)
@@ -251,7 +251,7 @@ def network_of(graph: Any) -> nx.MultiGraph:
     return g
 
 
-def test_the_graph_is_the_skeleton() -> None:
+def test_graph_covers_skeleton() -> None:
     """As many pieces and loops as the skeleton has pieces and holes, and its paths are all of its cells."""
     for mask in masks(90):
         skeleton = thinned(mask)
@@ -277,7 +277,7 @@ def test_the_graph_is_the_skeleton() -> None:
             assert (np.abs(np.diff(path_cells, axis=0)).max(axis=1) == 1).all()
 
 
-def test_hostile_shapes_end_quickly() -> None:
+def test_hostile_shapes_are_thinned_quickly() -> None:
     board = np.indices((300, 300)).sum(0) % 2 * 100
     comb = np.full((300, 301), FREE)
     comb[:-1, ::2] = 100
@@ -293,7 +293,7 @@ def test_hostile_shapes_end_quickly() -> None:
                 assert radius > 0.04
 
 
-def test_compiled_code_is_read_from_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+def test_compiled_code_is_read_from_read_only_directory(tmp_path: Path) -> None:
     """In a confined process, as on the server: filled before, read there; absent, compiled in memory."""
     work = (
         "import sys, time\n"
@@ -323,7 +323,7 @@ def test_compiled_code_is_read_from_a_folder_that_cannot_be_written(tmp_path: Pa
     assert sorted(p.name for p in (tmp_path / "native").rglob("*")) == before
 
 
-def test_a_damaged_folder_is_no_obstacle(tmp_path: Path) -> None:
+def test_damaged_cache_directory_is_ignored(tmp_path: Path) -> None:
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     work = "from app.derive import _kernels_roadmap as k; k.compile_all(); print('made')"
     subprocess.run([sys.executable, "-c", work], env=env, check=True)

@@ -47,7 +47,7 @@ def layers(*rows: Any, objects: Any = (), fence: Any = None) -> Layers:
     return Layers(parts)
 
 
-def test_free_as_wide_as_the_edges_are() -> None:
+def test_free_space_is_as_wide_as_edges() -> None:
     notes = DerivationNotes()
     network = layers(edge("wide", [(0, 0), (10, 0)], width=4), edge("thin", [(10, 0), (10, 9)]))
     g = grid(network, notes, resolution=0.1)
@@ -58,12 +58,12 @@ def test_free_as_wide_as_the_edges_are() -> None:
     assert g.counts()["free"] * 0.01 == pytest.approx(shapely.union_all([
         shapely.LineString([(0, 0), (10, 0)]).buffer(2), shapely.LineString([(10, 0), (10, 9)]).buffer(0.5)
     ]).area, rel=0.02)  # fmt: skip
-    assert notes.template[0].why.startswith("1 edges do not say")
+    assert notes.template[0].why.startswith("1 edges state no width")
     assert at(grid(network, edge_width=3.0), 11.4, 6) == FREE
-    assert at(grid(network, edge_width=3.0), 5, 2.2) == UNKNOWN, "what an edge says is its own"
+    assert at(grid(network, edge_width=3.0), 5, 2.2) == UNKNOWN, "an edge keeps its own width"
 
 
-def test_an_edge_narrower_than_a_cell_has_no_gaps() -> None:
+def test_edge_narrower_than_cell_has_no_gaps() -> None:
     g = grid(layers(edge("e", [(0, 0), (37, 23)], width=0.1)), resolution=1.0)
     import cv2
 
@@ -71,7 +71,7 @@ def test_an_edge_narrower_than_a_cell_has_no_gaps() -> None:
     assert count == 2, "the background and one piece"
 
 
-def test_objects_stand_in_the_way_but_not_in_passages() -> None:
+def test_objects_occupy_edges_except_in_passages() -> None:
     house = ("house", shapely.box(4, -3, 6, 3), {"kind": "building"})
     passage = {"osm": {"tags": {"tunnel": "building_passage"}}}
     blocked = grid(layers(edge("e", [(0, 0), (10, 0)], width=2), objects=[house]), resolution=0.1)
@@ -85,7 +85,7 @@ def test_objects_stand_in_the_way_but_not_in_passages() -> None:
     assert at(without, 5, 0) == FREE
 
 
-def test_stairs_and_fences() -> None:
+def test_stairs_and_fences_limit_free_space() -> None:
     notes = DerivationNotes()
     both = layers(
         edge("way", [(0, 0), (10, 0)]), edge("steps", [(10, 0), (10, 10)], stairs=True), fence=shapely.box(-1, -5, 5, 5)
@@ -101,7 +101,7 @@ def test_stairs_and_fences() -> None:
     assert at(grid(only, stairs=True), 5, 5) == FREE
 
 
-def test_what_cannot_be_drawn() -> None:
+def test_undrawable_networks_raise_missing_layer() -> None:
     with pytest.raises(MissingLayer, match="edges"):
         grid(layers(("a", shapely.Point(0, 0), {"kind": "node"})))
     earth = Layers({TOPOLOGY: features([edge("e", [(10, 52), (10.001, 52)])], "wgs84")})
@@ -116,7 +116,7 @@ def test_what_cannot_be_drawn() -> None:
     assert at(odd, 4, 0.4) == FREE
 
 
-def test_the_planner_takes_it_for_a_bare_network() -> None:
+def test_planner_derives_grid_from_bare_network() -> None:
     plan = derive.plan(frozenset({"topology"}), frozenset({"occupancy"}))
     assert plan is not None
     assert [s.name for s in plan.steps] == ["topology_to_occupancy"]

@@ -74,7 +74,9 @@ def by_hand(voxels: VoxelMap, low: float, high: float) -> dict[tuple[int, int], 
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_full_height_of_real_trees(shared: Path, facts: ModuleType, facts_json: dict[str, Any], name: str) -> None:
+def test_real_trees_are_projected_at_full_height(
+    shared: Path, facts: ModuleType, facts_json: dict[str, Any], name: str
+) -> None:
     path = shared / "data" / "octomap" / name
     expected = facts_json[f"octomap/{name}"]["facts"]["projection_xy_full_height"]
     grid, _ = project(tree(path))
@@ -93,7 +95,7 @@ codes = st.tuples(st.integers(12, 16), st.integers(0, 2**15), st.sampled_from([-
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(codes, min_size=1, max_size=12), st.integers(-5, 9), st.integers(1, 12))
-def test_bands_of_small_trees_by_brute_force(rows: list[tuple[int, int, float]], start: int, tall: int) -> None:
+def test_bands_of_small_trees_equal_brute_force(rows: list[tuple[int, int, float]], start: int, tall: int) -> None:
     middle = sum(7 << 3 * k for k in range(15))  # the octant 0 of the root is all below the origin: shift to its middle
     leaf_rows: list[tuple[int, int, float]] = []
     taken: list[tuple[int, int]] = []
@@ -109,7 +111,7 @@ def test_bands_of_small_trees_by_brute_force(rows: list[tuple[int, int, float]],
     low, high = (z + start) * 0.5, (z + start + tall) * 0.5
     want = by_hand(voxels, low, high)
     if not want:
-        with pytest.raises(MissingLayer, match="no voxel lies in the band"):
+        with pytest.raises(MissingLayer, match="no voxel is in the band"):
             project(voxels, band=(low, high))
         return
     grid, _ = project(voxels, band=(low, high))
@@ -119,7 +121,7 @@ def test_bands_of_small_trees_by_brute_force(rows: list[tuple[int, int, float]],
     assert grid.origin[:2] == (voxels.axis(0)[0].min() * 0.5, voxels.axis(1)[0].min() * 0.5), "whatever the band"
 
 
-def test_a_band_stands_above_the_levels_floor() -> None:
+def test_band_is_above_level_floor() -> None:
     """One voxel from 1.0 to 1.5 m above the local origin; a touching face does not count."""
     code = sum(1 << 3 * k + b for b, v in enumerate((HALF, HALF, HALF + 2)) for k in range(16) if v >> k & 1)
     voxels = leaves((16, code, 1.0))
@@ -134,12 +136,12 @@ def test_a_band_stands_above_the_levels_floor() -> None:
             with pytest.raises(MissingLayer, match=r"map from 1 to 1\.5 m"):
                 project(voxels, elevation=elevation, band=band)
     for band in ((1.0, 1.0), (2.0, 1.0)):
-        with pytest.raises(CannotConvert, match="lower to its higher"):
+        with pytest.raises(CannotConvert, match="low,high with low < high"):
             project(voxels, band=band)
 
 
 @pytest.mark.parametrize("size", [0.08, 0.16, 0.24, 0.1, 0.05, 0.04, 0.33, 5.0, 100.0])
-def test_other_sizes_lose_no_obstacle(shared: Path, size: float) -> None:
+def test_resampling_loses_no_obstacle(shared: Path, size: float) -> None:
     voxels = tree(shared / "data/octomap/geb079/geb079.bt")
     fine, _ = project(voxels, band=(0.3, 1.2))
     grid, _ = project(voxels, band=(0.3, 1.2), resolution=size)
@@ -169,30 +171,30 @@ def test_other_sizes_lose_no_obstacle(shared: Path, size: float) -> None:
             assert grid.cells[row, column] == fine.cells[min(y, fine.height - 1), min(x, fine.width - 1)]
 
 
-def test_what_is_doubtful_is_told(shared: Path) -> None:
+def test_doubtful_projections_are_warned_of(shared: Path) -> None:
     _, notes = project(tree(shared / "data/octomap/rotors_power_plant/power_plant.bt"))
-    assert any("the floor too" in w.problem for w in notes.warnings)
+    assert any("probably by the floor" in w.problem for w in notes.warnings)
     _, notes = project(leaves((16, 5, 1.0)))
     assert any("no free space" in w.problem for w in notes.warnings)
     _, notes = project(tree(shared / "data/octomap/joctomap_ecmrv4/ecmrv4_withfree.ot"))
     assert not notes.warnings
 
 
-def test_grids_that_no_robot_loads_are_refused() -> None:
+def test_too_large_grids_raise_cannot_convert() -> None:
     wide = leaves((16, 0, 1.0), (16, 8**16 - 1, 1.0))
     with pytest.raises(CannotConvert, match="65536 × 65536"):
         project(wide)
     one = leaves((1, 0, 1.0))
-    with pytest.raises(CannotConvert, match="more than a grid may have"):
+    with pytest.raises(CannotConvert, match="above the maximum of"):
         project(one)
-    with pytest.raises(CannotConvert, match="more than a grid may have"):
+    with pytest.raises(CannotConvert, match="above the maximum of"):
         project(leaves((16, 0, 1.0), (16, 8**7, 1.0)), resolution=0.001)
 
 
-def test_no_voxels_no_grid() -> None:
+def test_empty_voxel_maps_raise_missing_layer() -> None:
     none = VoxelMap(0.1, np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32))
     for layers in (Layers(), Layers({PartKey("voxels"): none})):
-        with pytest.raises(MissingLayer, match="hold no voxels"):
+        with pytest.raises(MissingLayer, match="the voxel maps are empty"):
             voxels_to_occupancy(layers, Parameters(), derive.DerivationNotes())
 
 
@@ -212,7 +214,7 @@ def test_large_leaves_cost_no_more_than_small_ones() -> None:
     assert counts["free"] > 2048**2
 
 
-def test_through_http_with_a_band(api: Api, shared: Path) -> None:  # noqa: F811
+def test_band_parameter_works_over_http(api: Api, shared: Path) -> None:  # noqa: F811
     api.post("environments", {"name": "tree"})
     api.upload("tree", {"map.bt": (shared / "data/octomap/geb079/geb079.bt").read_bytes()})
     coverage = {t["format"]: t for t in api.get("environments/tree/versions/1/maps").json()}
@@ -231,7 +233,7 @@ def test_through_http_with_a_band(api: Api, shared: Path) -> None:  # noqa: F811
     api.problem("GET", "/maps/tree/occupancy_grid?band=high", 422)
 
 
-def test_a_cloud_as_a_grid(shared: Path) -> None:
+def test_point_cloud_gives_grid(shared: Path) -> None:
     data = (shared / "data/pointcloud/pcl_data/room_scan1.pcd").read_bytes()
     converted = offline({"room.pcd": data}, "occupancy_grid", options={"band": "-0.5,0.5"})
     assert set(converted.files) == {"room.yaml", "room.pgm"} or set(converted.files) == {"map.yaml", "map.pgm"}

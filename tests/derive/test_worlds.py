@@ -37,7 +37,7 @@ PAIRS = {
         (-0.10, -0.15),
         0.95,
     ),
-    # Its map was recorded in an older house: 0.73 is what an independent slice reaches.
+    # its map was recorded in an older house: an independent slice reaches 0.73
     "turtlebot3_house": ("turtlebot3_house", "turtlebot3_house.world", "maps", (0.0, 0.0), 0.70),
 }
 
@@ -79,7 +79,7 @@ def middles(grid: OccupancyGrid) -> Any:
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_a_slice_covers_the_map_that_a_robot_made_there(shared: Path, pair: str) -> None:
+def test_world_slice_covers_robot_map(shared: Path, pair: str) -> None:
     from scipy.spatial import cKDTree
 
     data = shared / "data"
@@ -118,7 +118,7 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
             length += float(shapely.length(lines).sum())
             steps = np.linspace(0.01, 0.99, 50)[None, :, None]
             at = (cut[:, None, 0] * (1 - steps) + cut[:, None, 1] * steps).reshape(-1, 2)
-            # What runs exactly along the border of two cells may be in either.
+            # lines exactly along the border of two cells may be in either
             occupied = np.zeros(len(at), bool)
             for aside in ((1e-5, 1e-5), (-1e-5, 1e-5), (1e-5, -1e-5), (-1e-5, -1e-5)):
                 column, row = np.floor((at + aside - grid.origin[:2]) / grid.resolution).astype(int).T
@@ -129,7 +129,7 @@ def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
     assert length == pytest.approx(facts["slice_total_length_m"], rel=0.01)
 
 
-def test_the_warehouse_as_voxels(shared: Path) -> None:
+def test_warehouse_world_gives_voxels(shared: Path) -> None:
     content = world(shared / "data", "aws_small_warehouse")
     voxels = objects_to_voxels(content, VoxelParameters(), DerivationNotes()).parts[PartKey("voxels", "ground", MAP)]
     assert isinstance(voxels, VoxelMap)
@@ -150,7 +150,7 @@ def test_the_warehouse_as_voxels(shared: Path) -> None:
     assert differ.sum() < 0.01 * (grid.cells == 100).sum(), "a layer of the octree is a band of the world"
 
 
-def test_of_several_worlds_one_is_cut(shared: Path) -> None:
+def test_one_of_several_worlds_is_cut(shared: Path) -> None:
     root = shared / "data/gazebo_sdf/aws_small_warehouse"
     files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
     content = read({p.relative_to(root).as_posix(): p.read_bytes() for p in files})
@@ -179,14 +179,14 @@ def of_the_robot(folder: Path) -> OccupancyGrid:
     [
         ("turtlebot3_world", "gazebo_sdf/turtlebot3_world/maps", (0.05, 0.0), 0.2),
         ("aws_small_warehouse", "gazebo_sdf/aws_small_warehouse/maps/005", (-0.10, -0.15), 0.2),
-        # Recorded by a robot: what fits best is turned by 0.8 degrees, whichever turn it is found from.
+        # recorded by a robot: the best fit is turned by 0.8 degrees, whichever turn the search starts from
         ("turtlebot3_world", "occupancy_grid/nav2_tb3_sandbox", (0.05, 0.0), 1.0),
     ],
 )
-def test_a_robots_map_is_laid_onto_its_world(
+def test_robot_map_is_aligned_to_its_world(
     shared: Path, pair: str, maps: str, shift: tuple[float, float], degrees: float
 ) -> None:
-    """The known shifts (a map's places less the world's) are found again to a cell, and from any turn."""
+    """The known shifts (a map's positions less the world's) are found again to a cell, from any turn."""
     data = shared / "data"
     onto = sliced(world(data, pair), height=pair_facts(data, pair)["slice_z_m"])
     grid = of_the_robot(data / maps)

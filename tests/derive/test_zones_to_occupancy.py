@@ -1,4 +1,4 @@
-"""Zones -> costmap filter masks: which cells, what they mean, and how a robot gets them over HTTP."""
+"""Zones -> costmap filter masks: their cells, the meaning of these, and delivery over HTTP."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def the_map(width: int = 12, height: int = 8, origin: tuple[float, float, float]
     return OccupancyGrid(np.zeros((height, width), np.uint8), 0.5, origin)
 
 
-def test_a_keepout_takes_every_cell_that_it_touches_in_the_maps_frame() -> None:
+def test_keepout_covers_every_touched_cell_in_map_frame() -> None:
     box, sliver = shapely.box(0.0, 0.0, 1.0, 0.5), shapely.box(3.1, 1.1, 3.2, 1.2)
     layers = zones((box, {"kind": "keepout"}), (sliver, {"kind": "Keepout"}), parts={MAP: the_map()})
     out, notes = derive_masks(layers)
@@ -79,7 +79,7 @@ def test_a_keepout_takes_every_cell_that_it_touches_in_the_maps_frame() -> None:
     assert notes.dropped == notes.warnings == notes.template == []
 
 
-def test_holes_levels_and_other_cells() -> None:
+def test_masks_have_holes_levels_and_other_resolutions() -> None:
     ring = shapely.box(0, 0, 3, 3).difference(shapely.box(1, 1, 2, 2))
     layers = zones((ring, {"kind": "keepout"}))
     upper = features([("u", shapely.box(10, 10, 11, 11), {"kind": "keepout"})], "local")
@@ -98,7 +98,7 @@ def test_holes_levels_and_other_cells() -> None:
     assert grid(turned, KEEPOUT).origin[2] == 0.0
 
 
-def test_speed_in_metres_per_second_lowest_wins_and_is_never_raised() -> None:
+def test_lowest_speed_limit_wins_and_is_rounded_down() -> None:
     layers = zones(
         (shapely.box(0, 0, 4, 4), {"kind": "speed", "value": 1.5}),
         (shapely.box(0, 0, 2, 4), {"kind": "speed", "value": 0.333}),
@@ -139,7 +139,7 @@ def test_speed_in_percent() -> None:
     assert (speed_at(mask, 1, 1), speed_at(mask, 5.5, 0.5)) == (50.0, 25.0)
 
 
-def test_preferred_lanes_are_free_and_what_lies_beside_them_costs() -> None:
+def test_preferred_lanes_are_free_and_cells_beside_them_cost() -> None:
     layers = zones(
         (shapely.box(0, 0, 4, 1), {"kind": "preferred lane"}),
         (shapely.box(1, 0, 2, 1), {"kind": "keepout"}),
@@ -152,7 +152,7 @@ def test_preferred_lanes_are_free_and_what_lies_beside_them_costs() -> None:
     assert [t.value for t in notes.template] == [70]
 
 
-def test_what_is_left_out_is_told() -> None:
+def test_dropped_zones_are_noted() -> None:
     layers = zones(
         (shapely.box(0, 0, 1, 1), {"kind": "keepout", "expires": "2031-01-01T00:00:00Z"}),
         (shapely.box(90, 90, 91, 91), {"kind": "keepout"}),
@@ -168,10 +168,10 @@ def test_what_is_left_out_is_told() -> None:
         "zones outside of the map": 1,
         "parts of zones outside of the map": 1,
     }
-    assert "until they are made anew" in notes.warnings[0].problem
+    assert "until they are derived again" in notes.warnings[0].problem
 
 
-def test_it_says_what_is_missing() -> None:
+def test_missing_zones_raise_missing_layer() -> None:
     with pytest.raises(MissingLayer, match="kind keepout"):
         derive_masks(zones((shapely.box(0, 0, 1, 1), {"kind": "priority"})))
     with pytest.raises(MissingDatum):
@@ -183,7 +183,7 @@ def test_it_says_what_is_missing() -> None:
     assert width == pytest.approx((11.13 + 2) / 0.05, abs=3)
 
 
-def test_it_is_no_way_to_a_map() -> None:
+def test_masks_do_not_serve_as_map() -> None:
     assert derive.plan(frozenset({"zones"}), frozenset({"occupancy"})) is None
 
 
@@ -208,7 +208,7 @@ def drawn(*names: str) -> bytes:
     return KML.format("".join(squares)).encode()
 
 
-def test_offline_from_a_drawing() -> None:
+def test_drawing_gives_masks_offline() -> None:
     hints = UploadHints(layer="zones")
     files = offline({"zones.kml": drawn("pond")}, "occupancy_grid", hints=hints, options={"grid": "keepout"}).files
     assert list(files) == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
@@ -232,7 +232,7 @@ def mask_of(files: dict[str, bytes], name: str) -> tuple[dict[str, Any], np.ndar
     return map_yaml, np.frombuffer(body, np.uint8).reshape(height, width)
 
 
-def test_a_drawn_keepout_is_served_as_a_mask(api: Api, tmp_path: Path) -> None:
+def test_drawn_keepout_is_served_as_mask(api: Api, tmp_path: Path) -> None:
     datum = {"latitude": 0.0, "longitude": 0.0}
     api.post("environments", {"name": "pasture", "datum": datum})
     api.upload("pasture", {"zones.kml": drawn("pond")}, layer="zones")

@@ -1,8 +1,8 @@
-"""Tiny models that speak as the Segment-Anything family's do, and see by colour alone.
+"""Tiny models with the interface of the Segment-Anything family, which segment by colour alone.
 
-The encoder's embedding is its picture in squares of 4 pixels; the decoder's mask at a point is where the embedding has
-the point's colour. What the interface promises is part of the answer: with another label than 1 the mask is upside
-down, without the point that is none (-1), or with a mask given, the predicted IoU is low.
+The encoder's embedding is its image in squares of 4 pixels; the decoder's mask at a point are the squares of the
+point's colour. Violations of the interface change the output: with a label other than 1 the mask is upside down;
+without the padding point (-1), or with a mask input, the predicted IoU is low.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ def _model(nodes: list[Any], inputs: list[Any], outputs: list[Any], constants: l
 
 
 def encoder(side: int, *, upright: bool = False, second: bool = False, free: bool = False) -> bytes:
-    """[1, 3, side, side] -> image_embeddings.
+    """Build an encoder [1, 3, side, side] -> image_embeddings.
 
-    upright: [h, w, 3], which it normalises and pads itself; second: as SAM 2; free: its sizes are not said.
+    upright: [h, w, 3], which it normalises and pads itself; second: as SAM 2; free: its sizes are not stated.
     """
     import numpy as np
 

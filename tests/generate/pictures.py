@@ -1,4 +1,4 @@
-"""The picture of all sites in docs: ``python -m tests.generate.pictures`` draws it anew."""
+"""Image of all sites in docs: ``python -m tests.generate.pictures`` draws it again."""
 
 from __future__ import annotations
 

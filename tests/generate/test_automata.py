@@ -21,7 +21,7 @@ from app.model.frame import Datum
 from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 Bool = NDArray[np.bool_]
 GRID = PartKey("occupancy")
@@ -53,7 +53,7 @@ def pieces(free: Bool) -> int:
     return int(cv2.connectedComponents(free.astype(np.uint8), connectivity=4)[0]) - 1
 
 
-def test_conways_glider_flies() -> None:
+def test_conway_glider_moves() -> None:
     glider = picture(".#......", "..#.....", "###.....", "........", "........", "........")
     later = picture("........", "..#.....", "...#....", ".###....", "........", "........")
     assert (_automata.run_automaton(glider, *LIFE, 4, outside=False) == later).all()
@@ -64,21 +64,21 @@ def test_conways_glider_flies() -> None:
 
 @pytest.mark.parametrize("outside", [False, True])
 @pytest.mark.parametrize(("born", "stays"), [("5678", "45678"), ("", "012345678"), ("012345678", ""), ("08", "08")])
-def test_rules_are_kept_as_by_hand(outside: bool, born: str, stays: str) -> None:
+def test_rules_give_hand_computed_cells(outside: bool, born: str, stays: str) -> None:
     alive = np.random.default_rng(3).random((23, 31)) < 0.45
     b, s = ({int(c) for c in digits} for digits in (born, stays))
     expected = by_hand(by_hand(alive, b, s, outside), b, s, outside)
     assert (_automata.run_automaton(alive, b, s, 2, outside=outside) == expected).all()
 
 
-def test_many_rows_are_worked_on_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_rows_are_processed_in_strips(monkeypatch: pytest.MonkeyPatch) -> None:
     alive = np.random.default_rng(4).random((50, 40)) < 0.45
     expected = _automata.run_automaton(alive, *LIFE, 3, outside=True)
     monkeypatch.setattr(_automata, "STRIP", 40 * 7)
     assert (_automata.run_automaton(alive, *LIFE, 3, outside=True) == expected).all()
 
 
-def test_a_step_costs_no_more_than_twice_what_numpy_needs_for_the_sums_alone() -> None:
+def test_step_takes_at_most_twice_the_numpy_sums() -> None:
     alive = np.random.default_rng(5).random((2000, 2000)) < 0.5
     padded = np.pad(alive.astype(np.uint8), 1)
 
@@ -105,7 +105,7 @@ def shortest_time(work: Any) -> float:
     return min(times)
 
 
-def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
+def test_rooms_are_joined_and_holes_are_filled() -> None:
     rock = np.ones((40, 60), bool)
     for y, x, h, w in ((3, 3, 12, 12), (20, 4, 14, 10), (5, 40, 10, 15), (25, 40, 9, 9)):
         rock[y : y + h, x : x + w] = False
@@ -128,19 +128,19 @@ def test_rooms_are_joined_for_a_robot_and_holes_are_filled() -> None:
 
 
 @pytest.mark.parametrize("name", list(SMALL))
-def test_a_whole_site(name: str, tmp_path: Path) -> None:
-    site, _ = looks.make(name, **SMALL[name])
-    looks.agrees_with_itself(site, 0.3)
-    looks.serves(site)
-    looks.sound_sdf(site, tmp_path)
+def test_automaton_site_is_consistent(name: str, tmp_path: Path) -> None:
+    site, _ = site_checks.make(name, **SMALL[name])
+    site_checks.agrees_with_itself(site, 0.3)
+    site_checks.serves(site)
+    site_checks.sound_sdf(site, tmp_path)
     assert "topology" in site.layers
-    assert looks.digest(site) == looks.digest(looks.make(name, **SMALL[name])[0])
-    assert looks.digest(site) != looks.digest(looks.make(name, seed=8, **SMALL[name])[0])
+    assert site_checks.digest(site) == site_checks.digest(site_checks.make(name, **SMALL[name])[0])
+    assert site_checks.digest(site) != site_checks.digest(site_checks.make(name, seed=8, **SMALL[name])[0])
     assert hashlib.sha256(site.grids()[GRID].cells.tobytes()).hexdigest()[:16] == HASHES[name]
 
 
-def test_trees_have_trunks_to_run_into_and_crowns_to_see() -> None:
-    site, _ = looks.make("forest", **SMALL["forest"])
+def test_forest_trees_have_solid_trunks_and_visual_crowns() -> None:
+    site, _ = site_checks.make("forest", **SMALL["forest"])
     (trees,) = site.vector("objects").values()
     assert len(trees) > 20
     for properties in trees.properties:
@@ -153,18 +153,18 @@ def test_trees_have_trunks_to_run_into_and_crowns_to_see() -> None:
     at = shapely.get_coordinates(trees.geometry)
     apart = np.sqrt(((at[:, None] - at[None]) ** 2).sum(axis=2)) + 1e9 * np.eye(len(at))
     assert apart.min() >= 2.5 * 0.4 - 0.01
-    dense, _ = looks.make("forest", density=1.0, **SMALL["forest"])
+    dense, _ = site_checks.make("forest", density=1.0, **SMALL["forest"])
     assert len(next(iter(dense.vector("objects").values()))) == 12 * 10
 
 
-def test_inside_a_fence() -> None:
+def test_automaton_site_stays_inside_fence() -> None:
     fence = shapely.Polygon([(-7, -3), (9, -5), (12, 8), (-2, 11)])
     given = Layers(
         {PartKey("location", name="site"): features([("fence", fence, {"kind": "fence"})], "local")}, Datum(52.0, 5.0)
     )
     for name in SMALL:
-        site, _ = looks.make(name, given=given)
-        looks.agrees_with_itself(Layers({**given.parts, **site.parts}, given.datum), 0.3)
+        site, _ = site_checks.make(name, given=given)
+        site_checks.agrees_with_itself(Layers({**given.parts, **site.parts}, given.datum), 0.3)
         grid = site.grids()[GRID]
         row, column = np.nonzero(grid.cells == FREE)
         x, y = (column + 0.5) * grid.resolution + grid.origin[0], (row + 0.5) * grid.resolution + grid.origin[1]
@@ -178,39 +178,39 @@ def test_inside_a_fence() -> None:
         ("cave", {"width": 0}, "at least 1"),
         ("cave", {"width": 1e9}, "at most 5000"),
         ("cave", {"width": 5000, "depth": 5000, "resolution": 0.05}, "more than 67108864 cells"),
-        ("cave", {"width": 1000, "depth": 1000, "iterations": 1000}, "give fewer"),
+        ("cave", {"width": 1000, "depth": 1000, "iterations": 1000}, "use fewer"),
         ("cave", {"rule": "B9/S1"}, "neighbours from 0 to 8"),
         ("cave", {"rule": "nonsense"}, "neighbours from 0 to 8"),
-        ("cave", {"rule": "B012345678/S012345678"}, "nothing is left free"),
+        ("cave", {"rule": "B012345678/S012345678"}, "no free space is left"),
         ("cave", {"density": 1.5}, "at most 1"),
         ("cave", {"iterations": 10**9}, "at most 1000"),
         ("cave", {"cell": 0.07, "resolution": 0.05}, "whole number of cells"),
         ("cave", {"cell": 10}, "at least 5 × 5"),
-        ("cluttered_hall", {"density": 1.0, "rule": "B/S012345678"}, "nothing is left free"),
+        ("cluttered_hall", {"density": 1.0, "rule": "B/S012345678"}, "no free space is left"),
         ("forest", {"spacing": 0.5, "trunk": (0.1, 1)}, "would touch"),
         ("forest", {"spacing": 0.5, "jitter": 0, "trunk": (0.1, 0.2), "width": 5000, "depth": 5000}, "larger spacing"),
-        ("forest", {"trunk": (0.3, 0.2)}, "smaller one comes first"),
+        ("forest", {"trunk": (0.3, 0.2)}, "smaller value must come first"),
         ("forest", {"density": 0.0}, "no tree is left"),
     ],
 )
-def test_what_cannot_grow_is_told(name: str, values: dict[str, Any], why: str) -> None:
+def test_invalid_automaton_parameters_raise(name: str, values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make(name, **values)
+        site_checks.make(name, **values)
     assert time.process_time() - started < 3.0
 
 
-def test_over_http(api: Api) -> None:
+def test_automaton_site_is_generated_over_http(api: Api) -> None:
     for name, values in SMALL.items():
-        looks.make(name, **values)  # so that native code is there, which takes a minute on a busy machine
-        version = looks.over_http(api, name, ("occupancy_grid", "tmap2", "gazebo"), **values)
+        site_checks.make(name, **values)  # so that native code is there, which takes a minute on a busy machine
+        version = site_checks.over_http(api, name, ("occupancy_grid", "tmap2", "gazebo"), **values)
         assert version["information"]["objects"] == "generated"
     env = "environments/made-cave/generations"
     problem = api.problem("POST", env, 422, json={"generator": "cave", "seed": 1, "parameters": {"rule": "x"}})
     assert "B5678/S45678" in problem["detail"]
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_automaton_site_is_generated_on_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, values in SMALL.items():
         out = tmp_path / f"{name}.zip"
         options = [word for key, value in values.items() for word in ("-O", f"{key}={value}")]

@@ -1,4 +1,4 @@
-"""Holes of 2 m × 2 m cut into real grids: what complete_grid calls free is free, and straight walls go on.
+"""Holes of 2 m × 2 m cut into real grids: cells that complete_grid frees are free, and straight walls continue.
 
 ``python -m tests.generate.test_completion`` measures all grids, for the figures in docs/how-to/generate-sites.md.
 """
@@ -49,7 +49,7 @@ def grid_of(path: Path) -> OccupancyGrid:
 
 
 def holes(valid: Bool, side: int, centres: Sequence[int]) -> Bool:
-    """Squares around known cells that do not touch, most of whose cells are known."""
+    """Yield squares around known cells that do not touch, with mostly known cells."""
     out = np.zeros(valid.shape, bool)
     count = 0
     for middle in centres:
@@ -125,7 +125,7 @@ def measured(grid: OccupancyGrid, seed: int = 3) -> Measure:
 
 
 @pytest.mark.parametrize("name", FAST)
-def test_holes_in_real_grids_get_no_false_free_cells_and_straight_walls_back(shared: Path, name: str) -> None:
+def test_holes_in_real_grids_get_walls_back_and_no_false_free_cells(shared: Path, name: str) -> None:
     measure = measured(grid_of(shared / "data" / name))
     assert measure.free_right >= 0.98 * measure.free
     assert measure.free >= 0.15 * measure.cells, "better unknown than wrong, but not nothing"
@@ -134,7 +134,7 @@ def test_holes_in_real_grids_get_no_false_free_cells_and_straight_walls_back(sha
 
 
 def room() -> NDArray[np.uint8]:
-    """A room of 6 m × 4 m with a wall in the middle, and nothing known beyond its walls."""
+    """A room of 6 m × 4 m with a wall in the middle, and unknown cells beyond its walls."""
     cells = np.full((100, 140), UNKNOWN, np.uint8)
     cells[10:90, 10:130] = FREE
     cells[10:90, [10, 11, 69, 70, 128, 129]] = OCCUPIED
@@ -147,7 +147,7 @@ def complete(cells: NDArray[np.uint8], notes: DerivationNotes | None = None, **v
     return generate.run("complete_grid", 7, values, given, notes or DerivationNotes()).grids()[KEY].cells
 
 
-def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
+def test_wall_is_continued_and_cells_beyond_stay_unknown() -> None:
     cells = room()
     hole = np.s_[30:70, 50:90]
     cells[hole] = UNKNOWN
@@ -163,7 +163,7 @@ def test_a_wall_goes_on_and_nothing_beyond_the_walls_becomes_free() -> None:
     assert "confidence of 0.98" in left.why
 
 
-def test_more_confidence_fills_less() -> None:
+def test_higher_confidence_fills_fewer_cells() -> None:
     cells = room()
     cells[30:70, 20:60] = UNKNOWN
     filled = [int((complete(cells, confidence=c) != UNKNOWN).sum()) for c in (0.0, 0.5, 0.98)]

@@ -24,7 +24,7 @@ from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
 from app.model.meshes import load_mesh
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 NETWORK = PartKey("topology", GROUND, "network")
 OBJECTS = PartKey("objects", GROUND, "generated")
@@ -66,25 +66,25 @@ def network(layers: Layers) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
-def test_a_site_agrees_with_itself_and_every_format_serves_from_it(name: str, tmp_path: Path) -> None:
-    layers, notes = looks.make(name, **SMALL[name])
+def test_field_is_consistent_in_every_format(name: str, tmp_path: Path) -> None:
+    layers, notes = site_checks.make(name, **SMALL[name])
     assert not notes.dropped
     assert [t.subject for t in notes.template] == ["datum"]
-    looks.agrees_with_itself(layers, 0.3)
-    looks.sound_sdf(layers, tmp_path)
-    looks.serves(layers)
-    assert looks.digest(layers) == DIGESTS[name]
-    other, _ = looks.make(name, 8, **SMALL[name])
-    assert looks.digest(other) != DIGESTS[name]
+    site_checks.agrees_with_itself(layers, 0.3)
+    site_checks.sound_sdf(layers, tmp_path)
+    site_checks.serves(layers)
+    assert site_checks.digest(layers) == DIGESTS[name]
+    other, _ = site_checks.make(name, 8, **SMALL[name])
+    assert site_checks.digest(other) != DIGESTS[name]
     assert network(other)[1].keys() == network(layers)[1].keys(), "chance moves plants, not ways"
 
 
 @pytest.mark.parametrize(("name", "fence"), list(zip(sorted(SMALL), itertools.cycle(FENCES), strict=False)))
 def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str) -> None:
     given = fenced(fence)
-    layers, _ = looks.make(name, given=given)
+    layers, _ = site_checks.make(name, given=given)
     assert layers.datum == HERE
-    looks.agrees_with_itself(Layers({**given.parts, **layers.parts}, layers.datum, layers.levels), 0.3)
+    site_checks.agrees_with_itself(Layers({**given.parts, **layers.parts}, layers.datum, layers.levels), 0.3)
     polygon = shapely.Polygon(FENCES[fence]).buffer(0.002)
     for part in (
         *layers.vector("objects").values(),
@@ -104,8 +104,8 @@ def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str
             assert math.sin(math.atan2(q.y - p.y, q.x - p.x) - along) == pytest.approx(0, abs=0.01)
 
 
-def test_the_network_is_called_as_in_real_polytunnels() -> None:
-    layers, _ = looks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
+def test_network_names_match_real_polytunnels() -> None:
+    layers, _ = site_checks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
     nodes, edges = network(layers)
     aisles = {n.rpartition("-")[0] for n in nodes if n.startswith("r")}
     between = ["r0.7", "r1.5", "r2.5", "r3.5", "r4.5", "r5.3", "r5.7", "r6.5", "r7.5", "r8.5", "r9.5", "r10.3"]
@@ -135,9 +135,9 @@ def test_the_network_is_called_as_in_real_polytunnels() -> None:
     assert {i for i in zones.ids if i.startswith("row")} == {f"row{k}" for k in range(1, 11)}
 
 
-def test_trees_stand_where_they_were_asked_for() -> None:
+def test_orchard_trees_follow_parameters() -> None:
     parameters = {"rows": 3, "row_length": 18, "row_spacing": 5.0, "tree_spacing": 3.0, "jitter": 0.2}
-    layers, _ = looks.make("orchard", **parameters)
+    layers, _ = site_checks.make("orchard", **parameters)
     part = layers.parts[OBJECTS]
     assert isinstance(part, Features)
     trees = [f for f in part if f.properties["kind"] == "tree"]
@@ -153,14 +153,14 @@ def test_trees_stand_where_they_were_asked_for() -> None:
     for tree in trees:
         x, y = tree.properties["pose"][:2]
         assert grid.cells[int((y - grid.origin[1]) / 0.05), int((x - grid.origin[0]) / 0.05)] == OCCUPIED
-    still, _ = looks.make("orchard", **{**parameters, "jitter": 0})
+    still, _ = site_checks.make("orchard", **{**parameters, "jitter": 0})
     rows = still.parts[OBJECTS]
     assert isinstance(rows, Features)
     x = [f.geometry.x for f in rows if f.id.startswith("tree1-")]
     assert np.diff(x) == pytest.approx(3.0)
 
 
-def test_the_crown_is_a_closed_ball() -> None:
+def test_crown_mesh_is_closed_ball() -> None:
     vertices, faces = load_mesh(_trees.crown_mesh(), "crown.stl")
     corners = vertices[faces]
     assert len(faces) == 80
@@ -169,11 +169,11 @@ def test_the_crown_is_a_closed_ball() -> None:
     assert 3.6 < volume < 4 / 3 * math.pi, "its sides look outwards"
 
 
-def test_one_way_aisles_go_there_and_back() -> None:
+def test_one_way_aisles_alternate_directions() -> None:
     values = {**SMALL["warehouse"], "racks": 4}
-    plain, _ = looks.make("warehouse", **values)
-    layers, _ = looks.make("warehouse", one_way=True, **values)
-    looks.agrees_with_itself(layers, 0.3)
+    plain, _ = site_checks.make("warehouse", **values)
+    layers, _ = site_checks.make("warehouse", one_way=True, **values)
+    site_checks.agrees_with_itself(layers, 0.3)
     edges = network(layers)[1]
     assert {f"A{k}-ca_A{k}-cb" in edges for k in (1, 3)} == {True}
     assert "A1-cb_A1-ca" not in edges
@@ -199,9 +199,9 @@ def test_one_way_aisles_go_there_and_back() -> None:
         ("orchard", {"colour": "red"}, "no such parameter of orchard"),
         ("orchard", {"robot_radius": 1.7}, r"row_spacing: 3.60 m .* at least 3.91 m are needed"),
         ("orchard", {"headland": 1.5, "robot_radius": 0.8}, "headland: 1.5 m are too few to turn"),
-        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "no thinner than its trunk"),
+        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "must be at least trunk_diameter"),
         ("orchard", {"rows": 500, "row_length": 1000, "tree_spacing": 0.5, "resolution": 1}, "row_spacing|trees"),
-        ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* ask for a coarser"),
+        ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* use a coarser"),
         ("orchard", {"docks": 20, "row_length": 10}, "docks: the lane of 15"),
         ("orchard", {"datum": "95,0"}, "datum latitude must be between"),
         ("crop_rows", {"aisle": 0.5}, "aisle: 1.30 m from row to row"),
@@ -218,13 +218,13 @@ def test_one_way_aisles_go_there_and_back() -> None:
         ("warehouse", {"robot_radius": 1.5}, "aisle: 4.80 m from row to row"),
     ],
 )
-def test_what_cannot_be_made_is_told_before_any_work(name: str, values: dict[str, Any], why: str) -> None:
+def test_invalid_field_parameters_raise_before_work(name: str, values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make(name, **values)
+        site_checks.make(name, **values)
 
 
 @pytest.mark.parametrize("name", sorted(SMALL))
-def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
+def test_random_fences_give_site_or_error(name: str) -> None:
     chance = random.Random(f"fences for {name}")
     key = PartKey("location", GROUND, "site")
     site_count = 0
@@ -242,7 +242,7 @@ def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
         part = features([("f", fence, {"kind": "fence"})], "local")
         values = {"robot_radius": chance.choice((0.2, 0.25)), "headland": chance.choice((3, 5))}
         try:
-            layers, _ = looks.make(name, number, Layers({key: part}, HERE), resolution=0.1, **values)
+            layers, _ = site_checks.make(name, number, Layers({key: part}, HERE), resolution=0.1, **values)
         except CannotGenerate as error:
             assert error.problems[0].where in {"yard", "docks", "headland", "rows_per_tunnel"}, error.detail
             continue
@@ -252,18 +252,21 @@ def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
     assert site_count >= 3
 
 
-def test_a_fence_that_holds_nothing_is_told() -> None:
+def test_too_small_fence_raises_cannot_generate() -> None:
     key = PartKey("location", GROUND, "site")
-    for size, why in (((9, 9), "yard: the fence has no lane"), ((4, 60), "holds no field|no lane")):
+    for size, why in (
+        ((9, 9), "yard: the fence has no room for a lane"),
+        ((4, 60), "too small for a field|no room for a lane"),
+    ):
         small = features([("f", shapely.box(0, 0, *size), {"kind": "fence"})], "local")
         for name in SMALL:
-            with pytest.raises(CannotGenerate, match=f"{why}|the fence holds no row"):
-                generate.run(name, 1, {}, Layers({key: small}, HERE), looks.DerivationNotes())
+            with pytest.raises(CannotGenerate, match=f"{why}|the fence has no room for a row"):
+                generate.run(name, 1, {}, Layers({key: small}, HERE), site_checks.DerivationNotes())
 
 
-def test_large_fields_take_cells_that_still_show_the_ways() -> None:
+def test_large_fields_use_cells_that_show_the_paths() -> None:
     big = features([("f", shapely.box(0, 0, 120, 100), {"kind": "fence"})], "local")
-    layers, notes = looks.make(
+    layers, notes = site_checks.make(
         "vineyard", given=Layers({PartKey("location", GROUND, "site"): big}, HERE), vine_spacing=6
     )
     (grid,) = layers.grids().values()
@@ -271,9 +274,9 @@ def test_large_fields_take_cells_that_still_show_the_ways() -> None:
     assert [t.subject for t in notes.template] == ["resolution"]
 
 
-def test_over_http_and_edits(api: Api) -> None:
+def test_field_is_generated_over_http_and_edited(api: Api) -> None:
     format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "satellite", "openrmf")
-    version = looks.over_http(api, "polytunnels", format_names, **SMALL["polytunnels"])
+    version = site_checks.over_http(api, "polytunnels", format_names, **SMALL["polytunnels"])
     assert set(version["information"].values()) >= {"generated"}
     env = "environments/made-polytunnels"
     before = api.get(f"{env}/versions/latest/layers/location").json()

@@ -1,4 +1,4 @@
-"""What all generators share: declared parameters, seeded chance, what may be replaced, and what history says."""
+"""Rules of all generators: declared parameters, seeded randomness, replaced layers, and provenance."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def order(name: str = "some_posts", seed: int = 7, replace: bool = False, **valu
     return GenerationRequest(name, seed, values, replace)
 
 
-def test_streams_are_the_same_everywhere_and_independent() -> None:
+def test_random_streams_are_portable_and_independent() -> None:
     first = RandomSource(7, "orchard").stream("trees").random(3)
     assert first.tolist() == RandomSource(7, "orchard").stream("trees").random(3).tolist()
     assert RandomSource(7, "orchard").stream("trees").integers(0, 2**32, 2).tolist() == NUMBERS
@@ -93,7 +93,7 @@ def test_streams_are_the_same_everywhere_and_independent() -> None:
         assert other.random(3).tolist() != first.tolist()
 
 
-def test_what_is_made_is_a_version_that_says_how(ingest: Ingest, store: Store) -> None:
+def test_generation_commits_version_with_provenance(ingest: Ingest, store: Store) -> None:
     result = ingest.generate("here", order(count=5), COMMIT)
     assert result.status == "created"
     assert result.version is not None
@@ -120,7 +120,7 @@ def test_what_is_made_is_a_version_that_says_how(ingest: Ingest, store: Store) -
     assert other.version.root != result.version.root
 
 
-def test_a_new_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(ingest: Ingest, store: Store) -> None:
+def test_new_site_replaces_only_an_earlier_site(ingest: Ingest, store: Store) -> None:
     ingest.generate("here", order(), COMMIT)
     version = ingest.generate("here", order(fence=False), COMMIT).version
     assert version is not None
@@ -134,7 +134,7 @@ def test_a_new_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(ingest
     assert ingest.generate("here", order(replace=True), COMMIT).status == "created"
 
 
-def test_whose_the_datum_is(ingest: Ingest, store: Store) -> None:
+def test_generated_datum_is_kept_unless_environment_has_one(ingest: Ingest, store: Store) -> None:
     ingest.generate("here", order(fence=False), COMMIT)
     assert store.versions.get("here").information["location"] == "generated"
     ingest.set_datum("here", Datum(53.0, 6.0), COMMIT)
@@ -145,8 +145,8 @@ def test_whose_the_datum_is(ingest: Ingest, store: Store) -> None:
     assert version.information["location"] == "raw"
 
 
-def test_one_that_works_on_a_layer_replaces_it(ingest: Ingest, store: Store) -> None:
-    with pytest.raises(MissingLayer, match="fewer works on objects"):
+def test_generator_that_needs_a_layer_replaces_it(ingest: Ingest, store: Store) -> None:
+    with pytest.raises(MissingLayer, match="fewer needs objects"):
         ingest.generate("here", order("fewer", count=1), COMMIT)
     ingest.generate("here", order(), COMMIT)
     version = ingest.generate("here", order("fewer", count=1), COMMIT).version
@@ -156,8 +156,8 @@ def test_one_that_works_on_a_layer_replaces_it(ingest: Ingest, store: Store) -> 
     assert step["given"][0]["layer"] == "objects"
 
 
-def test_wrong_orders_are_told_before_any_work(ingest: Ingest) -> None:
-    with pytest.raises(NotFound, match=r"known ones: .*some_posts"):
+def test_invalid_requests_raise_before_work(ingest: Ingest) -> None:
+    with pytest.raises(NotFound, match=r"available: .*some_posts"):
         ingest.generate("here", order("no_such"), COMMIT)
     with pytest.raises(Invalid, match="count"):
         ingest.generate("here", order(count=101), COMMIT)
@@ -165,5 +165,5 @@ def test_wrong_orders_are_told_before_any_work(ingest: Ingest) -> None:
         ingest.generate("here", order(size=1), COMMIT)
     with pytest.raises(Invalid, match="seed"):
         ingest.generate("here", order(seed=-1), COMMIT)
-    with pytest.raises(CannotGenerate, match="made nothing"):
+    with pytest.raises(CannotGenerate, match="generated nothing"):
         ingest.generate("here", order(count=0, fence=False), COMMIT)

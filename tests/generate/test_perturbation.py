@@ -1,4 +1,4 @@
-"""Perturbation: what moves, goes and comes, and that objects, grids and networks still agree."""
+"""Perturbation: objects moved, removed and added; objects, grids and networks still agree."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from app.model.features import Features, features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, pack_cells, unknown_grey
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate.looks import digest, make, world
+from tests.generate.site_checks import digest, make, world
 
 STILL = {"speckle": 0.0, "erode": 0.0, "dilate": 0.0, "dropped": 0}
 """No noise."""
@@ -34,7 +34,7 @@ ALONE = {**STILL, "shift": 0.0, "turn": 0.0, "row_shift": 0.0, "missing": 0.0, "
 
 
 def disturbed(given: Layers, seed: int = 7, **values: Any) -> tuple[Layers, Layers, DerivationNotes]:
-    """(the environment after it, what was made, what was said)"""
+    """(the environment after it, the changed parts, the notes)"""
     notes = DerivationNotes()
     new_layers = generate.run("perturbation", seed, values, given, notes)
     return Layers({**given.parts, **new_layers.parts}, new_layers.datum, new_layers.levels), new_layers, notes
@@ -89,13 +89,13 @@ def edges_are_free(layers: Layers, radius: float = 0.3) -> None:
         assert _reach.passable(grid, lines, radius).all()
 
 
-def test_the_grid_follows_the_objects_and_the_network_both() -> None:
+def test_grid_and_network_follow_moved_objects() -> None:
     before = orchard()
     after, new_layers, notes = disturbed(before, **STILL, missing=0.2, obstacles=6)
     then, now = places(objects(before)), places(objects(after))
     assert 0 < len(then) - len(now) < 20
     assert set(now) < set(then)
-    assert (now["shed"] == then["shed"]).all(), "what is built stays"
+    assert (now["shed"] == then["shed"]).all(), "built objects stay"
     away = [float(np.hypot(*(now[i] - then[i])[:2])) for i in now if i != "shed"]
     assert 0 < max(away) <= 0.1 + 0.15 + 1e-3
     new = objects(after, "perturbation")
@@ -110,7 +110,7 @@ def test_the_grid_follows_the_objects_and_the_network_both() -> None:
 
 
 @pytest.mark.parametrize("site", ["hospital", "warehouse", "cluttered_hall"])
-def test_made_up_sites_still_agree(site: str) -> None:
+def test_perturbed_sites_stay_consistent(site: str) -> None:
     before, _ = make(site)
     after, _, _ = disturbed(before, **STILL, obstacles=12)
     world(after, 0.2)
@@ -119,14 +119,14 @@ def test_made_up_sites_still_agree(site: str) -> None:
     edges_are_free(noisy)  # there is no noise where robots drive
 
 
-def test_the_same_seed_gives_the_same_and_another_one_not() -> None:
+def test_perturbation_is_repeatable_and_seeded() -> None:
     before = orchard()
     a, b, c = (digest(disturbed(before, seed)[1]) for seed in (7, 7, 8))
     assert a == b != c
     assert a == "58a976ef664b428f950c07b955da2b4b221b8b067aede79d9bec9e4767b554ba"
 
 
-def test_rows_move_as_rows() -> None:
+def test_rows_move_as_a_whole() -> None:
     before = orchard()
     after, _, notes = disturbed(before, **{**ALONE, "row_shift": 0.3})
     then, now = places(objects(before)), places(objects(after))
@@ -134,10 +134,10 @@ def test_rows_move_as_rows() -> None:
     rows = [{by[f"tree/{row}/{k}"] for k in range(9)} for row in range(4)]
     assert all(len(row) == 1 for row in rows)
     assert len(set().union(*rows)) == 4, "each in its own way"
-    assert any("36 things moved (4 rows)" in w.problem for w in notes.warnings)
+    assert any("36 objects moved (4 rows)" in w.problem for w in notes.warnings)
 
 
-def test_turned_things_keep_their_shape_and_do_not_run_into_each_other() -> None:
+def test_turned_objects_keep_shape_and_do_not_collide() -> None:
     pieces = []
     for k in range(6):
         size = {"type": "box", "size": [1.0, 0.4, 1.0], "pose": [0, 0, 0.5, 0, 0, 0]}
@@ -152,14 +152,14 @@ def test_turned_things_keep_their_shape_and_do_not_run_into_each_other() -> None
         c, s = math.cos(p["pose"][5]), math.sin(p["pose"][5])
         turn = np.array([[c, -s], [s, c]])
         seen = shapely.transform(ring, lambda at, t=turn, p=p: at @ t.T + p["pose"][:2])
-        assert shapely.hausdorff_distance(seen, g) < 0.01, "pose and outline tell the same"
+        assert shapely.hausdorff_distance(seen, g) < 0.01, "pose and outline agree"
     for k, a in enumerate(part.geometry):
         assert not any(a.intersects(b) for b in part.geometry[k + 1 :])
     assert any(d.subject == "shifts" for d in notes.dropped)
 
 
 def room(cells: Any = None, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyGrid:
-    """Twelve by eight metres with walls, three boxes and a corner nobody has seen."""
+    """Twelve by eight metres with walls, three boxes and an unseen corner."""
     if cells is None:
         cells = np.zeros((160, 240), np.uint8)
         cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = OCCUPIED
@@ -179,7 +179,7 @@ def lane(*ys: float) -> Features:
     return features(rows, "local")
 
 
-def test_a_grid_alone_has_its_pieces_moved() -> None:
+def test_grid_without_objects_has_its_pieces_moved() -> None:
     before = Layers({PartKey("occupancy"): room()})
     after, new_layers, notes = disturbed(before, **{**ALONE, "shift": 0.6})
     assert {k.layer for k in new_layers.parts} == {"occupancy"}
@@ -187,7 +187,7 @@ def test_a_grid_alone_has_its_pieces_moved() -> None:
     assert (cells == OCCUPIED).sum() == (old == OCCUPIED).sum()
     assert (cells[:2] == OCCUPIED).all(), "walls are too long to be things"
     assert ((cells == UNKNOWN) == (old == UNKNOWN)).all()
-    assert any("3 things moved" in w.problem for w in notes.warnings)
+    assert any("3 objects moved" in w.problem for w in notes.warnings)
     empty_site, _, _ = disturbed(before, **{**ALONE, "missing": 1.0})
     assert (grid(empty_site).cells == OCCUPIED).sum() == (old == OCCUPIED).sum() - 3 * 160
     more, _, _ = disturbed(before, **{**ALONE, "obstacles": 5})
@@ -195,7 +195,7 @@ def test_a_grid_alone_has_its_pieces_moved() -> None:
 
 
 @pytest.mark.parametrize("edges", ["remove", "block"])
-def test_edges_that_an_obstacle_crosses(edges: str) -> None:
+def test_edges_crossed_by_obstacle_are_removed_or_blocked(edges: str) -> None:
     lanes = lane(*(0.5 + 0.5 * k for k in range(1, 14)))
     before = Layers({PartKey("occupancy"): room(), PartKey("topology", "ground", "network"): lanes})
     after, _, notes = disturbed(before, **{**ALONE, "obstacles": 4}, edges=edges)
@@ -216,12 +216,12 @@ def test_edges_that_an_obstacle_crosses(edges: str) -> None:
         assert part.ids == lanes.ids
     else:
         assert all(p["source"] in node_ids and p["target"] in node_ids for p in part.properties if p["kind"] == "edge")
-    warnings = [w for w in notes.warnings if "an obstacle now stands there" in w.problem]
+    warnings = [w for w in notes.warnings if "because of new obstacles" in w.problem]
     assert warnings
     assert warnings[0].where == "ground/network"
 
 
-def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
+def test_noise_grows_with_distance_and_spares_paths() -> None:
     cells = np.zeros((400, 400), np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, -2, -1]] = OCCUPIED
     line = shapely.LineString([(1, 10), (19, 10)])
@@ -251,7 +251,7 @@ def test_noise_grows_with_the_distance_and_spares_the_ways() -> None:
     assert ((grid(strong).cells == OCCUPIED) & (cells != OCCUPIED)).sum() == pytest.approx(wrong.sum() / 2, rel=0.1)
 
 
-def test_a_grid_that_lies_askew_follows_too() -> None:
+def test_rotated_grid_follows_objects() -> None:
     """Turned by 30 degrees and coarser: the cells of the objects' places change, no others."""
     post = {"type": "cylinder", "radius": 0.4, "length": 1.0, "pose": [0, 0, 0.5, 0, 0, 0]}
     properties = {"kind": "post", "pose": [5.0, 3.0, 0.0, 0, 0, 0], "shapes": [post]}
@@ -277,46 +277,46 @@ def test_a_grid_that_lies_askew_follows_too() -> None:
     assert occupied.sum() == pytest.approx((cells == OCCUPIED).sum(), rel=0.4)
 
 
-def test_what_cannot_be_disturbed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_perturbations_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MissingLayer, match="objects or occupancy or topology"):
         disturbed(Layers())
     before = Layers({PartKey("occupancy"): room()})
-    with pytest.raises(CannotGenerate, match="there are: ground"):
+    with pytest.raises(CannotGenerate, match="available: ground"):
         disturbed(before, level="attic")
-    with pytest.raises(CannotGenerate, match="there are: map"):
+    with pytest.raises(CannotGenerate, match="available: map"):
         disturbed(before, grid="attic")
-    with pytest.raises(CannotGenerate, match="ground: it has neither objects that stand in the way nor a grid"):
+    with pytest.raises(CannotGenerate, match="ground: it has neither obstacles nor a grid"):
         disturbed(Layers({PartKey("topology", "ground", "network"): lane(1.0)}))
     with pytest.raises(CannotGenerate, match="severity"):
         disturbed(before, severity=0.0)
-    with pytest.raises(CannotGenerate, match="nothing is disturbed"):
+    with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(before, **ALONE)
-    with pytest.raises(Invalid, match="least comes first"):
+    with pytest.raises(Invalid, match="the smaller value must come first"):
         disturbed(before, obstacle_size=(2.0, 1.0))
     for wrong in ({"missing": 2.0}, {"shift": -1.0}, {"obstacles": 10**9}, {"edges": "bend"}, {"largest": "nan"}):
         with pytest.raises(Invalid):
             disturbed(before, **wrong)
     full = Layers({PartKey("occupancy"): room(np.full((9, 9), OCCUPIED, np.uint8))})
-    with pytest.raises(CannotGenerate, match="nothing is disturbed"):
+    with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(full, **{**ALONE, "obstacles": 3})
     monkeypatch.setattr("app.generate.perturbation.MAX_CELLS", 1000)
-    with pytest.raises(CannotGenerate, match="at most 1000"):
+    with pytest.raises(CannotGenerate, match="the maximum is 1000"):
         disturbed(before)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (7, 3)])
 @pytest.mark.parametrize("value", [FREE, OCCUPIED, UNKNOWN])
-def test_small_and_blank_grids_are_no_trouble(shape: tuple[int, int], value: int) -> None:
+def test_small_and_empty_grids_are_accepted(shape: tuple[int, int], value: int) -> None:
     before = Layers({PartKey("occupancy"): room(np.full(shape, value, np.uint8))})
     try:
         after, _, _ = disturbed(before, severity=10.0)
     except CannotGenerate as error:
-        assert "nothing is disturbed" in error.detail
+        assert "these parameters disturb nothing" in error.detail
     else:
         assert grid(after).cells.shape == shape
 
 
-def test_masks_are_left_alone_unless_named() -> None:
+def test_masks_are_unchanged_unless_named() -> None:
     mask = OccupancyGrid(room().cells.copy(), 0.05)
     before = Layers({PartKey("occupancy"): room(), PartKey("occupancy", "ground", "keepout"): mask})
     _, new_layers, _ = disturbed(before)
@@ -325,8 +325,8 @@ def test_masks_are_left_alone_unless_named() -> None:
     assert [k.name for k in new_layers.parts] == ["keepout"]
 
 
-def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
-    """Nothing new stands on ground that nobody has seen, and no noise frees its edge."""
+def test_grey_205_cells_are_unchanged() -> None:
+    """No new obstacle is on unseen ground, and no noise frees its edge."""
     cells = room().cells.copy()
     grey = np.zeros(cells.shape, bool)
     grey[:, 121:] = cells[:, 121:] == FREE
@@ -341,8 +341,8 @@ def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
     assert (grid(after).cells[[0, -1], 130:-2] == OCCUPIED).all()
 
 
-def test_again_and_again() -> None:
-    """A second perturbation works on what the first has made, and keeps its obstacles."""
+def test_repeated_perturbation_stays_consistent() -> None:
+    """A second perturbation works on the result of the first, and keeps its obstacles."""
     one, _, _ = disturbed(orchard(), **STILL)
     two, _, _ = disturbed(one, 8, **STILL, missing=0.0)
     assert set(objects(one, "perturbation").ids) < set(objects(two, "perturbation").ids)
@@ -361,7 +361,7 @@ def counts(api: Api, env: str, version: int | str) -> dict[str, int]:
     return cell_counts
 
 
-def test_the_strawberry_farm_disturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
+def test_strawberry_farm_is_perturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
     root = shared / "data" / STRAWBERRY
     env = fresh()
     api.post("environments", {"name": env})
@@ -393,7 +393,7 @@ def test_the_strawberry_farm_disturbed(api: Api, fresh: Callable[[], str], share
     assert step["steps"][-1]["parameters"]["obstacles"] == 5
 
 
-def test_a_building_disturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
+def test_building_is_perturbed(api: Api, fresh: Callable[[], str], shared: Path) -> None:
     """It has no grid: the derived one shows the new obstacles, and no lane leads through them."""
     env = fresh()
     api.post("environments", {"name": env})

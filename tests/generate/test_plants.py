@@ -1,4 +1,4 @@
-"""A stand of plants: what it agrees in, what is served from it, and rules that people bring along."""
+"""Stands of plants: consistency, exported formats, and custom rules."""
 
 from __future__ import annotations
 
@@ -14,49 +14,49 @@ from app.model.features import features
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 DIGEST = "87eeff483ded9d36ca488e3f8bf9f2aadc1dce9c523b322939c9189a799e715d"
 
 
-def test_a_stand_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
-    layers, _ = looks.make("plants", variants=2, columns=4)
-    looks.agrees_with_itself(layers, 0.3)
-    looks.sound_sdf(layers, tmp_path)
-    looks.serves(layers)
-    assert looks.digest(layers) == DIGEST
-    assert looks.digest(looks.make("plants", 8, variants=2, columns=4)[0]) != DIGEST
+def test_plant_stand_is_consistent_in_every_format(tmp_path: Path) -> None:
+    layers, _ = site_checks.make("plants", variants=2, columns=4)
+    site_checks.agrees_with_itself(layers, 0.3)
+    site_checks.sound_sdf(layers, tmp_path)
+    site_checks.serves(layers)
+    assert site_checks.digest(layers) == DIGEST
+    assert site_checks.digest(site_checks.make("plants", 8, variants=2, columns=4)[0]) != DIGEST
 
 
 @pytest.mark.parametrize("species", ["vine", "bush", "pine"])
-def test_each_species(species: str) -> None:
-    layers, _ = looks.make("plants", species=species, rows=2, columns=2, variants=1)
-    looks.agrees_with_itself(layers, 0.3)
+def test_each_species_gives_a_stand(species: str) -> None:
+    layers, _ = site_checks.make("plants", species=species, rows=2, columns=2, variants=1)
+    site_checks.agrees_with_itself(layers, 0.3)
     objects = layers.vector("objects")[PartKey("objects", GROUND, "generated")]
     assert len(objects) == 4
-    files = write_layers(layers, "gazebo", {}, looks.CAME).files
+    files = write_layers(layers, "gazebo", {}, site_checks.CAME).files
     assert {f for f in files if f.endswith(".obj")} == set(layers.resources()), "the meshes go along"
 
 
-def test_rules_of_ones_own() -> None:
+def test_custom_rules_give_a_stand() -> None:
     rules = "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.3 -> F(l) [ +(30) A(l * 0.7) ] [ -(30) A(l * 0.7) ] L(0.2)"
-    layers, _ = looks.make("plants", rules=rules, rows=1, columns=2, variants=1, body="crown", jitter=0)
-    looks.agrees_with_itself(layers, 0.3)
+    layers, _ = site_checks.make("plants", rules=rules, rows=1, columns=2, variants=1, body="crown", jitter=0)
+    site_checks.agrees_with_itself(layers, 0.3)
     assert set(layers.resources()) == {"models/own_1/meshes/wood.obj", "models/own_1/meshes/leaves.obj"}
     (first, _) = layers.vector("objects")[PartKey("objects", GROUND, "generated")].properties
     assert first["shapes"][0]["type"] == "cylinder"
     assert first["shapes"][0]["radius"] > 0.3, "a crown, not the trunk of 0.05 m"
 
 
-def test_inside_a_fence() -> None:
+def test_plant_stand_stays_inside_fence() -> None:
     fence = features([("f", shapely.Polygon([(0, 0), (60, 60), (40, 80), (-20, 20)]), {"kind": "fence"})], "local")
     given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
-    layers, _ = looks.make("plants", given=given, rows=3, columns=4, variants=1)
+    layers, _ = site_checks.make("plants", given=given, rows=3, columns=4, variants=1)
     assert layers.datum == given.datum
     for part in (*layers.vector("objects").values(), *layers.vector("topology").values()):
         assert shapely.contains(fence.geometry[0], part.geometry).all()
     with pytest.raises(CannotGenerate, match="the fence has no room for the site, which needs"):
-        looks.make("plants", given=given, rows=50)
+        site_checks.make("plants", given=given, rows=50)
 
 
 @pytest.mark.parametrize(
@@ -64,8 +64,8 @@ def test_inside_a_fence() -> None:
     [
         ({"rules": "axiom: F; F -> FFFFFFFFFFFFFFFFFFFF", "iterations": 40}, "more than 100000 symbols after 3 of 40"),
         ({"rules": "axiom: A; A -> B; B -> A"}, "draws no branch"),
-        ({"rules": "axiom: Q"}, "no rule says what becomes of Q"),
-        ({"rules": " "}, "there are none"),
+        ({"rules": "axiom: Q"}, "no rule for Q"),
+        ({"rules": " "}, "missing"),
         ({"species": "oak"}, "must be one of apple, vine, bush, pine"),
         ({"rows": 0}, "at least 1"),
         ({"columns": 10**9}, "at most 200"),
@@ -74,14 +74,14 @@ def test_inside_a_fence() -> None:
         ({"rows": 200, "columns": 200, "spacing": 100, "row_spacing": 100, "resolution": 0.01}, "coarser resolution"),
     ],
 )
-def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+def test_invalid_plant_parameters_raise(values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make("plants", **values)
+        site_checks.make("plants", **values)
 
 
-def test_over_http(api: Api) -> None:
+def test_plant_stand_is_generated_over_http(api: Api) -> None:
     format_names = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "geojson", "octomap")
-    version = looks.over_http(api, "plants", format_names, rows=2, columns=3, variants=1)
+    version = site_checks.over_http(api, "plants", format_names, rows=2, columns=3, variants=1)
     assert version["information"]["objects"] == "generated"
     detail = api.problem(
         "POST", "environments/made-plants/generations", 422,

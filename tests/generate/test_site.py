@@ -1,4 +1,4 @@
-"""What all sites share: one world, of which the grid, the network, the zones and the picture are told."""
+"""Rules of all sites: grid, network, zones and image agree with one world."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def at(grid: OccupancyGrid, x: float, y: float) -> int:
     return int(grid.cells[row, column])
 
 
-def test_the_grid_is_the_slice_of_the_written_world() -> None:
+def test_grid_is_slice_of_written_world() -> None:
     site = yard()
     site.post("mast", "pole", (3, 3), 0.2, 4.0)
     site.box("bridge", "building", (17, 5), (1, 8, 0.5), base=2.0)
@@ -68,7 +68,7 @@ def test_the_grid_is_the_slice_of_the_written_world() -> None:
     assert (grid_of(again).cells == grid.cells).mean() >= 0.99
 
 
-def test_solids_that_do_not_reach_the_slice_are_not_looked_at() -> None:
+def test_solids_outside_the_slice_are_skipped() -> None:
     upright = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     cylinder = {"type": "cylinder", "radius": 0.3, "length": 1.0, "pose": upright}
     for shape, low, high in (
@@ -83,10 +83,10 @@ def test_solids_that_do_not_reach_the_slice_are_not_looked_at() -> None:
         assert all(_site._reaches(shape, z, reader, {}) for z in np.linspace(low, high, 9))
         assert not _site._reaches(shape, -1.0, reader, {})
         assert not _site._reaches(shape, 3.0, reader, {})
-    assert _site._reaches({"type": "sphere", "radius": 1.0}, 99.0, solids.Solids({}), {}), "others are always looked at"
+    assert _site._reaches({"type": "sphere", "radius": 1.0}, 99.0, solids.Solids({}), {}), "others are always read"
 
 
-def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
+def test_free_space_is_one_piece_and_the_rest_is_noted() -> None:
     notes = DerivationNotes()
     site = yard(notes)
     for k, (x, y, w, h) in enumerate(((3, 2, 2, 0.2), (3, 4, 2, 0.2), (2, 3, 0.2, 2.2), (4, 3, 0.2, 2.2))):
@@ -101,7 +101,7 @@ def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
     assert (closed, cells.tolist()) == (0, [[0] * 3] * 3)
 
 
-def test_edges_know_their_width_and_none_leads_through_an_obstacle() -> None:
+def test_edges_have_width_and_avoid_obstacles() -> None:
     site = yard()
     for name, place in (("a", (3, 2)), ("b", (17, 2)), ("c", (17, 7))):
         site.node(name, place)
@@ -137,28 +137,28 @@ def test_passable_is_the_grid_inflated_by_the_radius() -> None:
     assert _reach.clearance(grid, []).tolist() == []
 
 
-def test_what_cannot_be_driven_is_a_mistake_of_the_generator() -> None:
+def test_undrivable_edges_raise_runtime_error() -> None:
     site = yard()
     for name, place in (("a", (1, 2)), ("b", (5, 2)), ("c", (9, 2))):
         site.node(name, place)
     site.add_edges("a", "b")
-    with pytest.raises(RuntimeError, match="no way leads to 1 of the nodes, as c"):
+    with pytest.raises(RuntimeError, match="no path to 1 of the nodes, such as c"):
         site.finish()
     site.add_edges("b", "c", both=False)
-    with pytest.raises(RuntimeError, match="no way leads from 1 of the nodes, as c"):
+    with pytest.raises(RuntimeError, match="no path from 1 of the nodes, such as c"):
         site.finish()
     site.add_edges("c", "b", both=False)
     site.finish()
     site.zone("wet", "keepout", shapely.box(6, 1, 7, 3))
     with pytest.raises(RuntimeError, match="through a keep-out zone"):
         site.finish()
-    with pytest.raises(ValueError, match="two nodes"):
+    with pytest.raises(ValueError, match="duplicate node name"):
         site.node("a", (1, 1))
-    with pytest.raises(ValueError, match="two edges"):
+    with pytest.raises(ValueError, match="duplicate edge id"):
         site.add_edges("a", "b")
 
 
-def test_the_fence_and_the_datum_of_the_environment_count() -> None:
+def test_site_uses_fence_and_datum_of_environment() -> None:
     ring = local_frame(HERE).geometries_to_wgs84(
         np.array([shapely.box(-30, -30, -28, -29), shapely.box(0, 0, 30, 12)], object)
     )
@@ -175,7 +175,7 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     assert at(grid_of(layers), 29, 11) == FREE
     assert [d.subject for d in notes.dropped] == ["polygons of the fence"]
     assert notes.template == []
-    with pytest.raises(Invalid, match="has a datum already"):
+    with pytest.raises(Invalid, match="already has a datum"):
         yard(given=given, datum=(52.0, 5.0))
     notes = DerivationNotes()
     assert yard(notes).finish().datum == _site.DATUM
@@ -186,7 +186,7 @@ def test_the_fence_and_the_datum_of_the_environment_count() -> None:
     assert default_fence.properties[0] == {"kind": "fence"}
 
 
-def test_sizes_are_told_before_work_starts() -> None:
+def test_site_sizes_are_checked_before_work() -> None:
     site = Site(Layers(), SiteOptions(resolution=0.01), DerivationNotes())
     with pytest.raises(CannotGenerate, match="resolution: 100 × 100 m on 1 levels would be more than"):
         site.set_fence(shapely.box(0, 0, 100, 100))
@@ -202,11 +202,11 @@ def test_sizes_are_told_before_work_starts() -> None:
     site = Site(Layers(), SiteOptions(height=2.9), DerivationNotes())
     site.set_fence(shapely.box(0, 0, 20, 10))
     site.box("kerb", "wall", (10, 7), (4, 2, 1))
-    with pytest.raises(CannotGenerate, match="no stored object stands in a robot's way at 2"):
+    with pytest.raises(CannotGenerate, match="no stored object is an obstacle at 2"):
         site.finish()
 
 
-def test_the_picture_shows_what_stands_where() -> None:
+def test_image_shows_objects_at_their_positions() -> None:
     site = yard()
     site.draw(shapely.box(0, 0, 20, 3), "path")
     site.post("tree", "tree", (4, 6), 0.2, 4.0, colour="crown", seen=_shapes.disc(4, 6, 1.5))
@@ -221,7 +221,7 @@ def test_the_picture_shows_what_stands_where() -> None:
     assert at(grid, 4, 7.3) == FREE, "below the crown"
 
 
-def test_levels_have_grids_and_pictures_of_their_own() -> None:
+def test_each_level_has_its_own_grid_and_image() -> None:
     levels = (Level(), Level("L2", 4.0))
     site = Site(Layers(), SiteOptions(), DerivationNotes(), levels=levels)
     site.set_fence(shapely.box(0, 0, 20, 10))

@@ -1,4 +1,4 @@
-"""Gradient noise against its definitions, and natural ground whose height map, trees, grid and costs agree."""
+"""Gradient noise against its definitions, and terrain whose height map, trees, grid and costs agree."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from app.model.frame import Datum
 from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 Array = NDArray[np.float64]
 GRID = PartKey("occupancy")
@@ -94,7 +94,7 @@ def simplex(p: tuple[float, ...], t: NDArray[np.uint8]) -> float:
 
 
 @pytest.mark.parametrize(("kernel", "reference"), [("perlin", perlin), ("simplex", simplex)])
-def test_noise_is_what_its_definition_says(kernel: str, reference: Any) -> None:
+def test_noise_matches_its_definition(kernel: str, reference: Any) -> None:
     t = table()
     x, y, z = (np.random.default_rng(k).random(9) * 40 - 20 for k in range(3))
     flat, deep = np.zeros((9, 9)), np.full((9, 9, 9), 0.25)
@@ -122,7 +122,7 @@ def test_octaves_stay_in_range_and_are_smooth(kind: Any) -> None:
     assert np.abs(deep[0] - deep[2]).max() > 0.1
 
 
-def test_the_same_seed_gives_the_same_noise_everywhere() -> None:
+def test_noise_of_same_seed_is_equal() -> None:
     out = hashlib.sha256()
     x = np.linspace(-9.0, 11.0, 64)
     for kind in ("perlin", "simplex"):
@@ -147,7 +147,7 @@ def numpys(x: Array, y: Array, t: NDArray[np.uint8]) -> Array:
     return np.asarray(math.sqrt(2) * (low + w * (high - low)))
 
 
-def test_noise_takes_no_longer_than_numpys_own_passes() -> None:
+def test_noise_is_no_slower_than_numpy_passes() -> None:
     x, y, t = np.linspace(0, 37.3, 1000), np.linspace(0, 31.1, 1000), table()
     out = np.zeros((1000, 1000))
     _kernels_noise.perlin2(x, y, t, 1.0, out)
@@ -170,23 +170,23 @@ def without_costs(site: Layers) -> Layers:
     return Layers({k: p for k, p in site.parts.items() if k.name not in ("costs", "speed")}, site.datum, site.levels)
 
 
-def test_whole_ground(tmp_path: Path) -> None:
-    site, notes = looks.make("terrain", **SMALL)
-    looks.agrees_with_itself(without_costs(site), 0.3)
-    looks.serves(site)
-    looks.sound_sdf(site, tmp_path)
+def test_terrain_site_is_consistent(tmp_path: Path) -> None:
+    site, notes = site_checks.make("terrain", **SMALL)
+    site_checks.agrees_with_itself(without_costs(site), 0.3)
+    site_checks.serves(site)
+    site_checks.sound_sdf(site, tmp_path)
     assert not notes.warnings
-    assert looks.digest(site) == looks.digest(looks.make("terrain", **SMALL)[0])
-    assert looks.digest(site) != looks.digest(looks.make("terrain", seed=8, **SMALL)[0])
-    assert looks.digest(site)[:16] == GROUND
-    world = write_layers(site, "gazebo", {}, looks.CAME).files
-    assert b"ground_plane" not in world["world.sdf"], "nothing lies over the hills"
+    assert site_checks.digest(site) == site_checks.digest(site_checks.make("terrain", **SMALL)[0])
+    assert site_checks.digest(site) != site_checks.digest(site_checks.make("terrain", seed=8, **SMALL)[0])
+    assert site_checks.digest(site)[:16] == GROUND
+    world = write_layers(site, "gazebo", {}, site_checks.CAME).files
+    assert b"ground_plane" not in world["world.sdf"], "nothing is above the hills"
     assert b"walls_" not in world["world.sdf"], "costs are no walls"
     assert any(name.endswith("heightmaps/terrain.png") for name in world)
 
 
-def test_the_height_map_lies_below_the_floor_and_trees_stand_on_it() -> None:
-    site, _ = looks.make("terrain", relief=2.0, **SMALL)
+def test_height_map_is_below_floor_with_trees_on_it() -> None:
+    site, _ = site_checks.make("terrain", relief=2.0, **SMALL)
     (objects,) = site.vector("objects").values()
     files = site.resources()
     with Image.open(io.BytesIO(files["heightmaps/terrain.png"])) as picture:
@@ -208,8 +208,8 @@ def test_the_height_map_lies_below_the_floor_and_trees_stand_on_it() -> None:
         assert z + trunk["length"] > 2.9, "it is met above the floor"
 
 
-def test_slopes_cost_and_steep_ground_is_no_way() -> None:
-    site, _ = looks.make("terrain", relief=3.0, climb=20, **SMALL)
+def test_slopes_cost_and_steep_ground_is_blocked() -> None:
+    site, _ = site_checks.make("terrain", relief=3.0, climb=20, **SMALL)
     grid, costs = site.grids()[GRID], site.grids()[COSTS]
     assert costs.mode == "raw"
     assert len(np.unique(costs.cells)) > 50
@@ -232,20 +232,20 @@ def test_slopes_cost_and_steep_ground_is_no_way() -> None:
     assert np.abs(costs.cells[cell] - np.minimum(share[r, c], 1.0) * 99)[free].max() < 12
 
 
-def test_a_speed_mask_instead() -> None:
-    site, _ = looks.make("terrain", rough="speed", **SMALL)
+def test_terrain_speed_mask_replaces_costs() -> None:
+    site, _ = site_checks.make("terrain", rough="speed", **SMALL)
     mask = site.grids()[PartKey("occupancy", name="speed")]
     assert mask.cells.min() >= 10
     assert mask.cells.max() <= 100
-    files = write_layers(site, "occupancy_grid", {"grid": "speed"}, looks.CAME).files
+    files = write_layers(site, "occupancy_grid", {"grid": "speed"}, site_checks.CAME).files
     assert any(name.endswith("_filter_info.yaml") for name in files)
-    plain, _ = looks.make("terrain", rough="none", **SMALL)
+    plain, _ = site_checks.make("terrain", rough="none", **SMALL)
     assert set(plain.grids()) == {GRID}
 
 
-def test_time_changes_the_ground_a_little() -> None:
+def test_time_changes_terrain_slightly() -> None:
     def ground(epoch: float) -> Array:
-        site, _ = looks.make("terrain", epoch=epoch, vegetation=0, **SMALL)
+        site, _ = site_checks.make("terrain", epoch=epoch, vegetation=0, **SMALL)
         with Image.open(io.BytesIO(site.resources()["heightmaps/terrain.png"])) as picture:
             return np.asarray(picture, float)
 
@@ -253,7 +253,7 @@ def test_time_changes_the_ground_a_little() -> None:
     assert 0 < np.abs(now - soon).mean() < 0.25 * np.abs(now - later).mean()
 
     def woods(epoch: float) -> set[tuple[float, float]]:
-        site, _ = looks.make("terrain", epoch=epoch, **SMALL)
+        site, _ = site_checks.make("terrain", epoch=epoch, **SMALL)
         (objects,) = site.vector("objects").values()
         return {tuple(p["pose"][:2]) for p in objects.properties if p["kind"] == "tree"}
 
@@ -261,20 +261,20 @@ def test_time_changes_the_ground_a_little() -> None:
 
 
 def test_bare_ground_has_posts_at_its_corners() -> None:
-    site, notes = looks.make("terrain", vegetation=0, **SMALL)
-    looks.agrees_with_itself(without_costs(site), 0.3)
+    site, notes = site_checks.make("terrain", vegetation=0, **SMALL)
+    site_checks.agrees_with_itself(without_costs(site), 0.3)
     (objects,) = site.vector("objects").values()
     assert [p["kind"] for p in objects.properties].count("post") == 4
     assert any(t.subject == "posts" for t in notes.template)
 
 
-def test_inside_a_fence() -> None:
+def test_terrain_stays_inside_fence() -> None:
     fence = shapely.Polygon([(-7, -3), (9, -5), (12, 8), (-2, 11)])
     given = Layers(
         {PartKey("location", name="site"): features([("fence", fence, {"kind": "fence"})], "local")}, Datum(52.0, 5.0)
     )
-    site, _ = looks.make("terrain", given=given, vegetation=0.6, detail="65")
-    looks.agrees_with_itself(without_costs(Layers({**given.parts, **site.parts}, given.datum)), 0.3)
+    site, _ = site_checks.make("terrain", given=given, vegetation=0.6, detail="65")
+    site_checks.agrees_with_itself(without_costs(Layers({**given.parts, **site.parts}, given.datum)), 0.3)
 
 
 @pytest.mark.parametrize(
@@ -287,27 +287,27 @@ def test_inside_a_fence() -> None:
         ({"octaves": 10**9}, "at most 16"),
         ({"detail": "100"}, "one of 65, 129"),
         ({"noise": "white"}, "one of simplex, perlin"),
-        ({"spacing": 0.5, "width": 5000, "depth": 5000}, "too many: give a larger spacing"),
+        ({"spacing": 0.5, "width": 5000, "depth": 5000}, "too many: use a larger spacing"),
         ({"feature": 10_000, "octaves": 1, "persistence": 0, "width": 2, "depth": 2, "relief": -1}, "at least 0.01"),
     ],
 )
-def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+def test_invalid_terrain_parameters_raise(values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make("terrain", **values)
+        site_checks.make("terrain", **values)
     assert time.process_time() - started < 5.0
 
 
-def test_over_http(api: Api) -> None:
-    looks.make("terrain", **SMALL)  # so that native code is there, which takes a minute on a busy machine
-    version = looks.over_http(api, "terrain", ("occupancy_grid", "gazebo", "tmap2"), **SMALL)
+def test_terrain_is_generated_over_http(api: Api) -> None:
+    site_checks.make("terrain", **SMALL)  # so that native code is there, which takes a minute on a busy machine
+    version = site_checks.over_http(api, "terrain", ("occupancy_grid", "gazebo", "tmap2"), **SMALL)
     assert version["information"]["occupancy"] == "generated"
     env = "environments/made-terrain/generations"
     problem = api.problem("POST", env, 422, json={"generator": "terrain", "seed": 1, "parameters": {"octaves": 99}})
     assert "octaves" in problem["detail"]
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_terrain_is_generated_on_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "world.zip"
     options = [word for key, value in SMALL.items() for word in ("-O", f"{key}={value}")]
     status = run(["generate", "terrain", "--seed", "7", "--to", "gazebo", "-o", str(out), *options])

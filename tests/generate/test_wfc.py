@@ -1,4 +1,4 @@
-"""Wave-function collapse: every window stands in the sample, in its shares, whatever is fixed; grids are completed."""
+"""Wave-function collapse: windows and shares as in the sample, fixed cells kept; grids completed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from app.generate.wave_function_collapse import SAMPLES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
-from tests.generate import looks
+from tests.generate import site_checks
 
 NAME = "wave_function_collapse"
 GRID = PartKey("occupancy")
@@ -42,7 +42,7 @@ def windows(cells: U8, n: int) -> set[bytes]:
 
 
 def collapse(sample: U8, size: int, pattern: int, draw: Any = DRAW, symmetry: Any = "none", **more: Any) -> U8:
-    """A grid of so many cells a side from a sample."""
+    """Generate a square grid from a sample."""
     model = _wfc.learn(sample, tile=1, pattern=pattern, symmetry=symmetry, wrap=more.pop("wrap", False))
     fixed = more.pop("fixed", np.full((size, size), -1))
     return _wfc.render(model, _wfc.collapse_model(model, (size, size), fixed, draw, **more))
@@ -60,7 +60,7 @@ def board() -> U8:
 
 
 def rooms() -> U8:
-    """A room with two doors: what is made of it falls apart here and there unless that is forbidden."""
+    """A room with two doors: without a connectivity rule its results are sometimes in several pieces."""
     out = np.zeros((16, 16), np.uint8)
     out[3:12, 3:12] = OCCUPIED
     out[4:11, 4:11] = FREE
@@ -68,17 +68,17 @@ def rooms() -> U8:
     return out
 
 
-def test_a_board_of_two_colours_has_two_patterns() -> None:
+def test_board_of_two_colours_has_two_patterns() -> None:
     model = _wfc.learn(board(), tile=1, pattern=2, symmetry="all", wrap=True)
     assert model.patterns.tolist() == [[[0, 1], [1, 0]], [[1, 0], [0, 1]]]
     assert model.weights[0] == model.weights[1]
-    assert model.allowed[:, :, 0].tolist() == [[2, 1]] * 4  # beside the one stands the other, in each direction
+    assert model.allowed[:, :, 0].tolist() == [[2, 1]] * 4  # the tiles alternate in each direction
     for border in (False, True):
         out = collapse(board(), 10, 2, wrap=True, periodic=border)
         assert windows(out, 2) == windows(board(), 2)
 
 
-def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
+def test_adjacent_tiles_occur_in_sample() -> None:
     sample = SAMPLES["warehouse"].cells(0.05)
     model = _wfc.learn(sample, tile=4, pattern=1, symmetry="none")
     tiles = _wfc.collapse_model(model, (30, 40), np.full((30, 40), -1), DRAW)
@@ -98,7 +98,7 @@ def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
 
 @pytest.mark.parametrize("scan", [True, False])
 @pytest.mark.parametrize("symmetry", ["none", "mirror", "rotate", "all"])
-def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
+def test_every_window_occurs_in_sample(scan: bool, symmetry: Any) -> None:
     sample = SAMPLES["office"].cells(0.1)
     sample[5:9, 40] = OCCUPIED
     sample_windows = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.symmetries(sample, symmetry)))
@@ -108,9 +108,9 @@ def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
     assert windows(np.pad(wide, ((0, 2), (0, 2)), mode="wrap"), 3) <= sample_windows
 
 
-def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
+def test_ten_metre_site_keeps_sample_shares_and_time_limit() -> None:
     sample = SAMPLES["warehouse"].cells(0.05)
-    looks.make(NAME, width=3, depth=3)  # compiled, or loaded
+    site_checks.make(NAME, width=3, depth=3)  # compiled, or loaded
     expected, sample_windows = pairs(sample), windows(sample, 5)
     for seed in range(4):
         started = time.process_time()
@@ -121,13 +121,13 @@ def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
         assert windows(out, 5) <= sample_windows
 
 
-def test_pillars_stand_within_walls() -> None:
-    layers, _ = looks.make(NAME, sample="pillars", width=6, depth=6)
+def test_pillars_are_within_walls() -> None:
+    layers, _ = site_checks.make(NAME, sample="pillars", width=6, depth=6)
     kinds = {i.split("/")[0] for part in layers.vector("objects").values() for i in part.ids}
     assert kinds == {"pillar", "wall"}
 
 
-def test_what_is_fixed_stays() -> None:
+def test_fixed_cells_stay() -> None:
     sample = SAMPLES["pillars"].cells(0.1)
     fixed = np.full((50, 50), -1)
     fixed[10, 10:14] = 1
@@ -137,11 +137,11 @@ def test_what_is_fixed_stays() -> None:
     assert (out[30:40, 30:40] == FREE).all()
     assert windows(out, 3) <= windows(sample, 3)
     fixed[20, 22:25] = 1, 0, 1
-    with pytest.raises(CannotGenerate, match=r"contradicts the sample at row (18|19|20), column 2[0-4]:"):
+    with pytest.raises(CannotGenerate, match=r"contradict the sample at row (18|19|20), column 2[0-4],"):
         collapse(sample, 50, 3, fixed=fixed)
 
 
-def test_free_space_is_joined_where_that_is_asked() -> None:
+def test_free_space_is_joined_when_requested() -> None:
     def free_pieces(out: U8) -> int:
         return int(cv2.connectedComponents((out == FREE).astype(np.uint8), connectivity=4)[0]) - 1
 
@@ -156,10 +156,10 @@ def test_free_space_is_joined_where_that_is_asked() -> None:
     assert max(counts) > 1
 
 
-def test_a_sample_that_contradicts_itself_is_told() -> None:
+def test_contradictory_sample_raises_cannot_generate() -> None:
     collapse(board(), 4, 2)  # compiled, or loaded
     started = time.process_time()
-    with pytest.raises(CannotGenerate, match="contradicts the sample"):
+    with pytest.raises(CannotGenerate, match="contradict the sample"):
         collapse(np.array([[0, 100], [100, 100]], np.uint8), 20, 2)
     hard = (np.random.default_rng(2).integers(0, 2, (6, 6)) * OCCUPIED).astype(np.uint8)
     with pytest.raises(CannotGenerate, match="11 contradictions could not be repaired in 4 attempts"):
@@ -167,7 +167,7 @@ def test_a_sample_that_contradicts_itself_is_told() -> None:
     assert time.process_time() - started < 5.0
 
 
-def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
+def test_wfc_of_same_seed_gives_same_cells() -> None:
     out = collapse(SAMPLES["warehouse"].cells(0.1), 60, 4, RandomSource(7, "hash").stream, joined=True)
     free = collapse(rooms(), 40, 3, RandomSource(7, "hash").stream, scan=False)
     assert hashlib.sha256(out.tobytes() + free.tobytes()).hexdigest()[:16] == CELLS
@@ -180,28 +180,28 @@ def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
         ({"width": 1e9}, "at most 10000"),
         ({"width": 10_000, "depth": 10_000}, "more than 67108864 cells"),
         ({"width": 400, "depth": 400}, "tiles are more than 4194304"),
-        ({"sample": "nave"}, "give one of warehouse, office, pillars, or a grid"),
-        ({"model": "tiled", "pattern": 3}, "pattern: belongs to model=overlapping"),
-        ({"tile": 64, "width": 50, "depth": 50, "border": "open"}, "does not hold"),
+        ({"sample": "nave"}, "use one of warehouse, office, pillars, or a grid"),
+        ({"model": "tiled", "pattern": 3}, "pattern: applies only to model=overlapping"),
+        ({"tile": 64, "width": 50, "depth": 50, "border": "open"}, "does not contain"),
         ({"resolution": 0.0333}, "whole millimetres"),
         ({"wrap": True}, "has no walls"),
         ({"free": (1.0, 2.0, 3.0)}, "even number"),
         ({"free": (99.0, 2.0)}, "outside"),
-        ({"free": (0.01, 2.0)}, "lies on a wall"),
+        ({"free": (0.01, 2.0)}, "is on a wall"),
         ({"width": 0.5, "depth": 0.5, "tile": 4}, "too few"),
         ({"pattern": 9}, "at most 8"),
     ],
 )
-def test_what_cannot_be_made_is_told_before_work(values: dict[str, Any], why: str) -> None:
+def test_invalid_wfc_parameters_raise_before_work(values: dict[str, Any], why: str) -> None:
     started = time.process_time()
     with pytest.raises((CannotGenerate, Invalid), match=why):
-        looks.make(NAME, **values)
+        site_checks.make(NAME, **values)
     assert time.process_time() - started < 3.0
 
 
-def test_a_whole_site(tmp_path: Path) -> None:
-    site, notes = looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))
-    looks.agrees_with_itself(site, 0.3)
+def test_wfc_site_is_consistent(tmp_path: Path) -> None:
+    site, notes = site_checks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))
+    site_checks.agrees_with_itself(site, 0.3)
     grid = site.grids()[GRID]
     assert (grid.width, grid.height, grid.resolution, grid.origin) == (160, 120, 0.05, (0.0, 0.0, 0.0))
     assert grid.cells[60, 80] == FREE
@@ -211,28 +211,28 @@ def test_a_whole_site(tmp_path: Path) -> None:
     kinds = {p["kind"] for part in site.vector("objects").values() for p in part.properties}
     assert kinds == {"wall", "rack"}
     assert not notes.warnings
-    looks.serves(site)
-    looks.sound_sdf(site, tmp_path)
-    assert looks.digest(site) == looks.digest(
-        looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))[0]
+    site_checks.serves(site)
+    site_checks.sound_sdf(site, tmp_path)
+    assert site_checks.digest(site) == site_checks.digest(
+        site_checks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))[0]
     )
-    assert looks.digest(site) != looks.digest(looks.make(NAME, seed=8, width=8, depth=6)[0])
+    assert site_checks.digest(site) != site_checks.digest(site_checks.make(NAME, seed=8, width=8, depth=6)[0])
 
 
 @pytest.mark.parametrize("border", ["open", "periodic"])
-def test_other_borders_and_tiles(border: str) -> None:
-    site, _ = looks.make(NAME, border=border, width=6, depth=6, model="tiled", order="entropy", symmetry="mirror")
-    looks.agrees_with_itself(site, 0.3)
+def test_wfc_supports_other_borders_and_tiles(border: str) -> None:
+    site, _ = site_checks.make(NAME, border=border, width=6, depth=6, model="tiled", order="entropy", symmetry="mirror")
+    site_checks.agrees_with_itself(site, 0.3)
 
 
-def test_a_grid_of_the_environment_as_sample_inside_its_fence() -> None:
-    first, _ = looks.make(NAME, width=6, depth=6)
+def test_environment_grid_serves_as_sample_inside_its_fence() -> None:
+    first, _ = site_checks.make(NAME, width=6, depth=6)
     plan = {GRID: first.grids()[GRID], **{k: p for k, p in first.parts.items() if k.layer == "location"}}
-    site, _ = looks.make(NAME, given=Layers(plan, first.datum), sample="map", pattern=3, symmetry="all")
-    looks.agrees_with_itself(Layers({**plan, **site.parts}, site.datum), 0.3)
+    site, _ = site_checks.make(NAME, given=Layers(plan, first.datum), sample="map", pattern=3, symmetry="all")
+    site_checks.agrees_with_itself(Layers({**plan, **site.parts}, site.datum), 0.3)
     assert site.grids()[GRID].cells.shape == first.grids()[GRID].cells.shape
     with pytest.raises(CannotGenerate, match=r"is the sample's, 0\.05 m"):
-        looks.make(NAME, given=Layers(plan, first.datum), sample="map", resolution=0.1)
+        site_checks.make(NAME, given=Layers(plan, first.datum), sample="map", resolution=0.1)
 
 
 def holed() -> tuple[U8, U8]:
@@ -253,21 +253,21 @@ def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, DerivationNo
 
 
 @pytest.mark.parametrize("order", ["rows", "entropy"])
-def test_an_unknown_part_is_made_of_what_is_known(order: str) -> None:
+def test_unknown_part_is_completed_from_known_part(order: str) -> None:
     complete, cells = holed()
     out, notes = completed(cells, reach=0, confidence=0, order=order, symmetry="none")
     assert (out == cells)[cells != UNKNOWN].all()
     assert set(np.unique(out[cells == UNKNOWN])) <= {FREE, OCCUPIED}
     plain = np.where(out >= 65, OCCUPIED, FREE).astype(np.uint8)
     strange = windows(plain[37:73, 47:93], 3) - windows(complete, 3)
-    assert len(strange) <= sum("stand nowhere" in w.problem for w in notes.warnings) * 40
+    assert len(strange) <= sum("do not occur" in w.problem for w in notes.warnings) * 40
     near, _ = completed(cells, reach=0.25, confidence=0, order=order)
     filled = (near != UNKNOWN) & (cells == UNKNOWN)
     assert 0 < filled.sum() < (cells == UNKNOWN).sum()
-    assert not filled[46:64, 56:84].any(), "what is farther than the reach stays unknown"
+    assert not filled[46:64, 56:84].any(), "cells beyond the reach stay unknown"
 
 
-def test_completing_is_the_same_everywhere() -> None:
+def test_completion_is_repeatable() -> None:
     cells = np.full((20, 20), UNKNOWN, np.uint8)
     cells[:8] = board()[0, 0]
     cells[3:5, 4:16] = OCCUPIED
@@ -276,39 +276,39 @@ def test_completing_is_the_same_everywhere() -> None:
     assert out.tobytes() == completed(cells, reach=0.3, confidence=0)[0].tobytes()
 
 
-def test_known_cells_that_fit_no_pattern_are_gone_around(shared: Path) -> None:
+def test_known_cells_without_pattern_are_skipped(shared: Path) -> None:
     with Image.open(shared / "data" / "occupancy_grid" / "nav2_tb3_sandbox" / "tb3_sandbox.pgm") as picture:
         grey = np.asarray(picture.convert("L"))[::-1]
     cells = np.where(grey < 90, OCCUPIED, np.where(grey > 220, FREE, UNKNOWN)).astype(np.uint8)
     out, notes = completed(cells, reach=0.4, confidence=0)
     assert (out == cells)[cells != UNKNOWN].all()
     assert (out == UNKNOWN).sum() < (cells == UNKNOWN).sum()
-    assert all("stand nowhere in the known part" in w.problem for w in notes.warnings)
+    assert all("do not occur in the known part" in w.problem for w in notes.warnings)
 
 
 @pytest.mark.parametrize(
     ("cells", "values", "why"),
     [
         (np.zeros((9, 9), np.uint8), {}, "has no unknown cell"),
-        (np.full((9, 9), UNKNOWN, np.uint8), {}, "no window of 3 × 3 cells is known"),
+        (np.full((9, 9), UNKNOWN, np.uint8), {}, "no window of 3 × 3 cells is completely known"),
         (np.array([[0, 255], [255, 255]], np.uint8), {"pattern": 2}, "no window of 2 × 2"),
         (np.full((1100, 1100), UNKNOWN, np.uint8), {"reach": 0}, "1210000 cells would be filled in"),
-        (np.pad(np.zeros((5, 5), np.uint8), 9, constant_values=UNKNOWN), {"reach": 0.01}, "give a larger reach"),
+        (np.pad(np.zeros((5, 5), np.uint8), 9, constant_values=UNKNOWN), {"reach": 0.01}, "use a larger reach"),
         (np.zeros((9, 9), np.uint8), {"pattern": 4}, "at most 3"),
     ],
 )
-def test_what_cannot_be_completed_is_told(cells: U8, values: dict[str, Any], why: str) -> None:
+def test_invalid_completions_raise(cells: U8, values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         completed(cells, **values)
 
 
-def test_without_a_grid_there_is_nothing_to_complete() -> None:
-    with pytest.raises(MissingLayer, match="complete_grid works on occupancy"):
+def test_completion_without_grid_raises_missing_layer() -> None:
+    with pytest.raises(MissingLayer, match="complete_grid needs occupancy"):
         generate.run("complete_grid", 7, {}, Layers(), DerivationNotes())
 
 
-def test_over_http(api: Api) -> None:
-    version = looks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
+def test_wfc_site_is_generated_over_http(api: Api) -> None:
+    version = site_checks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
     assert version["information"] | {"occupancy": "generated", "topology": "generated"} == version["information"]
     env = f"environments/made-{NAME}/generations"
     problem = api.problem("POST", env, 422, json={"generator": NAME, "seed": 1, "parameters": {"width": 0}})
@@ -317,7 +317,7 @@ def test_over_http(api: Api) -> None:
     assert "no unknown cell" in problem["detail"]
 
 
-def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wfc_site_is_generated_on_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "map.zip"
     status = run(
         ["generate", NAME, "--seed", "7", "--to", "occupancy_grid", "-o", str(out), "-O", "width=4", "-O", "depth=4"]

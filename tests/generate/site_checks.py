@@ -1,4 +1,4 @@
-"""What every made-up site must hold to: one check each, for the tests of single sites."""
+"""Checks that every generated site must pass, one function each, for the tests of single sites."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CAME = Provenance("generated")
 
 
 def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -> tuple[Layers, DerivationNotes]:
-    """A site and what its generator said."""
+    """A site and its generator's notes."""
     notes = DerivationNotes()
     before = given or Layers()
     new_layers = generate.run(name, seed, values, before, notes)
@@ -40,7 +40,7 @@ def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -
 
 
 def digest(layers: Layers) -> str:
-    """A hash of all that was made but its picture, whose colours are a matter of taste."""
+    """Return a hash of everything generated except the image, whose colours may change."""
     out = hashlib.sha256()
     for key, part in sorted(layers.parts.items()):
         out.update(orjson.dumps([key.layer, key.level, key.name]))
@@ -117,7 +117,7 @@ def sound_sdf(layers: Layers, folder: Path) -> None:
 
 
 def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
-    """What each format leaves out; every one serves from the site, and nothing it writes would be refused."""
+    """Return what each format drops; every format exports the site, and reads its own output."""
     out = {}
     for name, fmt in formats.all_formats().items():
         if fmt.write is None:
@@ -133,8 +133,11 @@ def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
 
 
 def clear_of_obstacles(layers: Layers, fmt: formats.Format, files: dict[str, bytes]) -> None:
-    """No edge of what was written leads through an occupied cell: as its shape in formats that have some, else straight
-    from node to node. Cells are looked up along each line, so that the server's own check is not asked."""
+    """Check that no exported edge crosses an occupied cell.
+
+    Edges have their shape in formats with shapes, else they are straight from node to node. Cells are looked up along
+    each line, independent of the server's own check.
+    """
     shaped = fmt.traits.keeps_bends == "shape"
     grids = {k.level: g for k, g in layers.grids().items()}
     for group in formats.group(files, fmt.name)[0]:
@@ -157,7 +160,7 @@ def clear_of_obstacles(layers: Layers, fmt: formats.Format, files: dict[str, byt
 
 
 def over_http(api: Api, name: str, formats_: tuple[str, ...], **values: Any) -> dict[str, Any]:
-    """Generate through the API, serve some formats, and upload what was served to another environment."""
+    """Generate through the API, export some formats, and upload the results to another environment."""
     env = f"made-{name}"
     api.post("environments", {"name": env})
     body = {"generator": name, "seed": 7, "parameters": values}
