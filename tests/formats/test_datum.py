@@ -201,7 +201,7 @@ def test_the_fence_is_chosen_and_the_rest_declared() -> None:
     served, context = write(Layers({SITE: features(rows, "wgs84")}, Datum(1.0, 1.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == [[0, 0], [3, 0], [3, 3], [0, 3]]
     assert {d.subject: d.count for d in context.dropped} == {
-        "location items that are no polygons": 1,
+        "location items that are not polygons": 1,
         "further location polygons": 1,
         "holes of the fence": 1,
     }

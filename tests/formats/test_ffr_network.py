@@ -66,8 +66,8 @@ def test_facts_of_our_sample() -> None:
     assert part.geometry[1].z == 0.5
     assert [p.get("width") for p in part.properties if p["kind"] == "edge"] == [2.5, 2.5, None, None]
     warnings = "\n".join(w.problem for w in context.warnings)
-    assert "no point stands" in warnings
-    assert "have no lines: well" in warnings
+    assert "no point at" in warnings
+    assert "without lines: well" in warnings
 
 
 def test_everything_that_a_file_says_comes_back() -> None:
@@ -103,9 +103,9 @@ def test_a_network_from_elsewhere() -> None:
     assert seeds_tmap(back) == {("a", "b"), ("b", "c")}
     assert [e.get("oneway") for e in back["network_lines"]] == [None, True]
     assert back["network_lines"][0]["speed_limit"] == 2.0
-    assert any("one way" in w.problem for w in context.warnings)
+    assert any("one-way" in w.problem for w in context.warnings)
     assert {d.subject for d in context.dropped} == {
-        "attributes of the way back",
+        "attributes of the opposite direction",
         "names of nodes that are not their ids",
     }
 

@@ -108,7 +108,7 @@ def test_the_drawing_of_an_archive_can_be_had_as_kml(same):
     out = write(get_format("kml"), layers, context)
     original = archives.unpack((SAMPLES / "yard.kmz").read_bytes(), Limits())["site/yard.kml"]
     assert same("kml", {"a.kml": original}, out) == []
-    assert context.dropped == [Dropped("resources", 2, "images and further files of a drawing travel in KMZ only")]
+    assert context.dropped == [Dropped("resources", 2, "only KMZ contains images and further files of a drawing")]
 
 
 def grids() -> Layers:
@@ -280,7 +280,7 @@ def test_pictures_without_a_place_are_dropped_and_told(picture: GeoImage, datum:
     assert list(archives.unpack(data, Limits())) == ["doc.kml"]
     (line,) = context.dropped
     assert (line.subject, line.count) == ("imagery ground/p", 1)
-    assert line.why.startswith("it cannot be placed: ")
+    assert line.why.startswith("no position in KML: ")
     assert reason in line.why
 
 

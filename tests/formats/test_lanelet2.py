@@ -648,8 +648,8 @@ def test_without_a_datum_it_says_what_to_supply() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        (b"lat='0.00003' lon='0.0'", b"lat='91' lon='0.0'", "no place on earth"),
-        (b"<nd ref='1' />", b"<nd ref='x' />", "whole number"),
+        (b"lat='0.00003' lon='0.0'", b"lat='91' lon='0.0'", "invalid position"),
+        (b"<nd ref='1' />", b"<nd ref='x' />", "integer"),
         (b"<osm ", b"<!DOCTYPE osm><osm ", "DOCTYPE"),
         (b"lon='0.0002'", b"lon='170'", "too far|too much"),
     ],

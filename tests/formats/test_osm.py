@@ -261,10 +261,10 @@ def test_the_samples_network() -> None:
     assert properties["n3"]["osm"]["attributes"]["user"] == 'Zoë & "Co"'
     assert properties["w100:1-2"]["osm"] == {"way": 100, "tags": {"highway": "residential", "name": "Straße"}}
     texts = " ".join(f"{p.where} {p.problem}" for p in context.warnings)
-    for expected in ("way 103 the way goes from a node to itself", "way 106 the way is marked as deleted"):
+    for expected in ("way 103 the way repeats a node directly", "way 106 the way is marked as deleted"):
         assert expected in texts
-    assert "2 nodes that have no place" in texts
-    assert "node 7 the node has no place" in texts
+    assert "2 nodes that have no position" in texts
+    assert "node 7 the node has no position" in texts
     assert "way 105 the way has no nodes" in texts
 
 
@@ -577,9 +577,9 @@ def test_properties_that_anybody_edited_do_no_harm() -> None:
     [
         ('<node id="1" lat="NaN" lon="1"/>', "finite"),
         ('<node id="1" lat="inf" lon="1"/>', "finite"),
-        ('<node id="1" lat="1e999" lon="1"/>', "no place on earth"),
-        ('<node id="1" lat="90.1" lon="1"/>', "no place on earth"),
-        ('<node id="1" lat="1" lon="-180.5"/>', "no place on earth"),
+        ('<node id="1" lat="1e999" lon="1"/>', "invalid position"),
+        ('<node id="1" lat="90.1" lon="1"/>', "invalid position"),
+        ('<node id="1" lat="1" lon="-180.5"/>', "invalid position"),
         ('<node id="1" lat="1_0" lon="1"/>', "finite"),
         ('<node id="1" lat="١" lon="1"/>', "finite"),
         ('<node lat="1" lon="1"/>', "id"),
@@ -878,7 +878,7 @@ def test_a_node_twice_within_a_way_is_no_edge() -> None:
     twice = '<way id="4"><nd ref="2"/><nd ref="2"/><tag k="highway" v="path"/></way>'
     graph = network(read(xml(f'{nodes}<way id="3">{refs}<tag k="highway" v="path"/></way>{twice}'), context))
     assert sorted(graph.edges()) == [("n1", "n2"), ("n2", "n1")]
-    assert ["that segment is no edge" in p.problem for p in context.warnings] == [True, True]
+    assert ["that segment is skipped" in p.problem for p in context.warnings] == [True, True]
 
 
 def test_values_that_are_not_understood_are_named_with_their_number() -> None:

@@ -75,7 +75,7 @@ def test_facts_of_our_sample() -> None:
     assert edges(part) == {("0", "1"), ("1", "0"), ("0", "2"), ("2", "0"), ("1", "2"), ("2", "1")}
     warnings = "\n".join(w.problem for w in bundle.warnings)
     assert "'77'" in warnings
-    assert "no lines: 10" in warnings
+    assert "without lines: 10" in warnings
     assert {k.layer for k in bundle.parts} == {"topology", "occupancy"}
     assert bundle.files["map.pgm"].format == "occupancy_grid"
     assert bundle.origin[NETWORK] == (("prm.yaml",), "prm")
@@ -156,9 +156,9 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
         {"id": 1, "x": 20, "y": 59, "name": "gate"},
     ]
     assert roadmap["edges"] == [{"from": 1, "to": 0, "weight": round(math.hypot(20, 20), 9), "oneway": True}]
-    assert any("one way" in w.problem for w in context.warnings)
+    assert any("one-way" in w.problem for w in context.warnings)
     assert {d.subject: d.count for d in context.dropped} == {
-        "places of nodes within their pixels": 2,
+        "positions of nodes within their pixels": 2,
         "attributes of nodes": 1,
     }
     assert [t.subject for t in context.template] == ["edges: weight"]

@@ -91,4 +91,4 @@ def test_bad_values_are_refused_with_their_place(text: str, place: str) -> None:
 def test_repeated_names_are_warned_of() -> None:
     part, context = read("name,x,y\na,0,0\na,1,0\n")
     assert len(set(part.ids)) == 2
-    assert "1 names stand twice" in context.warnings[0].problem
+    assert "1 duplicate names" in context.warnings[0].problem
