@@ -100,7 +100,7 @@ def test_what_the_objects_are() -> None:
     assert not objects.geometry[6].has_z
     assert objects.geometry[3].is_valid, "an open ring is closed"
     assert objects.document["attribution"] == ["CC0-1.0"]
-    assert any("stand more than once" in p.problem for p in context.warnings)
+    assert any("duplicate ids" in p.problem for p in context.warnings)
     assert not objects.local.any()
 
 
@@ -347,12 +347,12 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
     [
         ("", "not JSON"),
         ("[]", "one object"),
-        ('{"type": "Topology"}', "no GeoJSON type"),
-        ('{"type": ["Feature"]}', "no GeoJSON type"),
+        ('{"type": "Topology"}', "unsupported type"),
+        ('{"type": ["Feature"]}', "unsupported type"),
         ('{"type": "FeatureCollection"}', "features"),
         ('{"type": "FeatureCollection", "features": [5]}', "type Feature"),
         ('{"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": 5}]}', "object or null"),
-        (collection(feature({"type": "Circle"})), "no geometry type"),
+        (collection(feature({"type": "Circle"})), "unsupported geometry type"),
         (collection(feature({"type": "Point"})), "array"),
         (collection(feature({"type": "Point", "coordinates": ["1", "2"]})), "numbers"),
         (collection(feature({"type": "Point", "coordinates": [True, 2]})), "numbers"),
@@ -363,7 +363,7 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
         (collection(feature({"type": "LineString", "coordinates": [[1, 2], [1, None]]})), "numbers"),
         (collection(feature({"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]})), "four positions"),
         (collection(feature({"type": "Polygon", "coordinates": [5]})), "arrays"),
-        (collection(feature({"type": "GeometryCollection", "geometries": [None]})), "no geometry type"),
+        (collection(feature({"type": "GeometryCollection", "geometries": [None]})), "unsupported geometry type"),
         (collection(feature(point(181, 0))), "longitude, latitude"),
         (collection(feature(point(0, 90.5))), "longitude, latitude"),
         (collection(feature(point(500_000, 5_000_000))), "EPSG:4326"),

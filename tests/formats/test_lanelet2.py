@@ -292,9 +292,7 @@ def test_metres_of_another_frame_are_not_ours() -> None:
     tags = elements(files[MAIN])["node", 2]["tags"]
     assert tags == {}, "metres that are no longer true are left out"
     assert elements(files[MAIN])["node", 1]["tags"] == {"local_x": "7", "local_y": "5"}
-    assert context.dropped == [
-        Dropped("local_x and local_y of moved points", 1, "a Lanelet2 map has no place for them")
-    ]
+    assert context.dropped == [Dropped("local_x and local_y of moved points", 1, "Lanelet2 maps cannot express them")]
 
 
 # --- what is detected ----------------------------------------------------------------------------------------------
@@ -406,7 +404,7 @@ def test_a_lanelet_without_edges_goes_and_its_bounds_stay() -> None:
     osm_elements = elements(files[MAIN])
     assert ("relation", 102) not in osm_elements
     assert {("way", 23), ("way", 24)} <= osm_elements.keys()
-    why = "a Lanelet2 map has no place for them"
+    why = "Lanelet2 maps cannot express them"
     assert context.dropped == [Dropped("lanelets whose edges are no longer in the network", 1, why)]
 
 

@@ -308,7 +308,7 @@ def test_a_network_of_another_format() -> None:
     }
     assert {t.option for t in context.template if t.option} == {"graph_name", "frame_id"}
     assert [(d.subject, d.count) for d in write_context.dropped] == [
-        ("items with attributes that Nav2 has no word for", 4)
+        ("items with attributes that Nav2 cannot express", 4)
     ]
     back, _ = read(served)
     assert {p["name"] for p in back.properties if p["kind"] == "node"} == {"A", "B", "C"}
@@ -362,7 +362,7 @@ def test_far_coordinates_are_warned_about() -> None:
         ("b", shapely.Point(0, 0), {"kind": "node"}),
         ("a_b", shapely.LineString([(1e5, 0), (0, 0)]), {"kind": "edge", "source": "a", "target": "b"}),
     ]
-    assert "32 bit floats" in warnings(write(features(rows, "local"))[1])
+    assert "32-bit floats" in warnings(write(features(rows, "local"))[1])
 
 
 # --- bad and doubtful files ------------------------------------------------------------------------------------------
@@ -392,16 +392,16 @@ def node(**properties: Any) -> dict[str, Any]:
         (graph(5), "features[3]", "feature"),  # type: ignore[arg-type]
         (graph({"type": "Feature", "properties": {}, "geometry": []}), "features[3]", "geometry"),
         (graph(node()), "features[3].properties.id", "missing"),
-        (graph(node(id="7")), "features[3].properties.id", "whole number"),
-        (graph(node(id=-1)), "features[3].properties.id", "whole number"),
-        (graph(node(id=1.5)), "features[3].properties.id", "whole number"),
-        (graph(node(id=2**32)), "features[3].properties.id", "whole number"),
-        (graph(node(id=True)), "features[3].properties.id", "whole number"),
+        (graph(node(id="7")), "features[3].properties.id", "an integer"),
+        (graph(node(id=-1)), "features[3].properties.id", "an integer"),
+        (graph(node(id=1.5)), "features[3].properties.id", "an integer"),
+        (graph(node(id=2**32)), "features[3].properties.id", "an integer"),
+        (graph(node(id=True)), "features[3].properties.id", "an integer"),
         (graph({**node(), "properties": None}), "features[3]", "properties"),
         (graph({**node(id=5), "geometry": {"type": "Point"}}), "features[3].geometry.coordinates", "two"),
         (graph({**node(id=5), "geometry": {"type": "Point", "coordinates": [1, "x"]}}),
          "features[3].geometry.coordinates", "not a number"),
-        (graph(startid="1"), "features[2].properties.startid", "whole number"),
+        (graph(startid="1"), "features[2].properties.startid", "an integer"),
         (graph(endid=None), "features[2].properties.endid", "missing"),
         ({"features": graph()["features"][:2]}, "features", "no line"),
         ({"features": graph()["features"][2:]}, "features", "no point"),
@@ -444,8 +444,8 @@ def test_limits() -> None:
         (graph(startid=9, endid=8), "is no node"),
         (graph(endid=1), "to itself"),
         (graph(node(id=4, frame="odom")), "frame is 'odom'"),
-        (graph(metadata={"a": None}), "numbers, texts, booleans"),
-        (graph(metadata={"a": {"b": [[1]]}}), "numbers, texts, booleans"),
+        (graph(metadata={"a": None}), "numbers, strings, booleans"),
+        (graph(metadata={"a": {"b": [[1]]}}), "numbers, strings, booleans"),
         (graph(metadata=5), "must be an object"),
         (graph(operations={"x": {"type": "stop", "trigger": "NEVER"}}), "trigger"),
         (graph(operations={"x": {"type": "a", "trigger": "NODE", "metadata": {"y": None}}}), "operation 'x'"),
@@ -453,7 +453,7 @@ def test_limits() -> None:
         (graph(cost="high"), "cost must be"),
         (graph(overridable=1), "overridable must be"),
         (graph(node(id=4, frame=7)), "frame must be"),
-        (graph(metadata={"speed_limit": 85}), "served as floats"),
+        (graph(metadata={"speed_limit": 85}), "exported as floats"),
     ],
 )  # fmt: skip
 def test_what_is_doubtful_is_taken_with_a_warning(data: dict[str, Any], warning: str) -> None:
@@ -480,7 +480,7 @@ def test_edges_to_nowhere_are_kept_but_not_served() -> None:
     assert part.document["nav2_route"]["dangling"] == [{"id": 12, "from": 98, "to": 99, "properties": {}}]
     served, context = write(part)
     assert set(RouteServer(served).edges) == {3}
-    assert [(d.subject, d.count) for d in context.dropped] == [("edges to nowhere", 2)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("edges without both end nodes", 2)]
 
 
 def test_words_of_other_types_stay_where_they_are() -> None:

@@ -274,7 +274,7 @@ def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
         "altitudes of nodes": 1,
         "ids of edges": 9,
         "edges with attributes (action, speed limit …)": 7,
-        "attributes of nodes that are no scalars": 1,
+        "attributes of nodes that are not scalars": 1,
     }
     assert {t.subject for t in context.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
     assert next(t.option for t in context.template if t.subject == "graph-name") == "graph_name"
@@ -425,15 +425,15 @@ def test_other_tags_are_refused_with_their_line(text: str) -> None:
     [
         (graph(connections="- [A, X]\n"), "no node 'X'"),
         (graph(connections="- [X, Y]\n"), "no node 'X'"),
-        (graph(connections="- [B, A]\n"), "stands twice"),
-        (graph(connections="- !dir [B, B]\n"), "with itself"),
-        (graph(connections="- !fast [A, B]\n"), "does not know the tag !fast"),
-        (graph("- name: A\n  pos: [5, 5]\n"), "stand twice"),
-        (graph("- !parked\n  name: C\n  pos: [5, 5]\n"), "does not know the tag !parked"),
+        (graph(connections="- [B, A]\n"), "duplicate connection"),
+        (graph(connections="- !dir [B, B]\n"), "to itself"),
+        (graph(connections="- !fast [A, B]\n"), "does not support the tag !fast"),
+        (graph("- name: A\n  pos: [5, 5]\n"), "duplicate node names"),
+        (graph("- !parked\n  name: C\n  pos: [5, 5]\n"), "does not support the tag !parked"),
         (graph("- name: C\n  pos: [5, 5]\n  properties: {a: 1}\n"), "must be a list"),
-        (graph("- name: C\n  pos: [5, 5]\n  properties: [a: 1, a: 2]\n"), "the last value counts"),
+        (graph("- name: C\n  pos: [5, 5]\n  properties: [a: 1, a: 2]\n"), "the last value is used"),
         (graph("- name: C\n  pos: [5, 5]\n  properties: [a: [1]]\n"), "no scalar"),
-        (graph(connections="- !dir [A, B]\n", head=""), "needs the line"),
+        (graph(connections="- !dir [A, B]\n", head=""), "without the line"),
         (f"{HEAD}nodes: []\n", "is missing"),
     ],
 )
@@ -451,7 +451,7 @@ def test_connections_to_nowhere_are_kept_but_not_served() -> None:
     assert part.document["navgraph"]["dangling"] == [{"ends": ["X", "Y"]}]
     served, context = write(part)
     assert len(Fawkes(served).edges) == 1
-    assert [(d.subject, d.count) for d in context.dropped] == [("connections to nowhere", 3)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("connections without both end nodes", 3)]
 
 
 def test_a_repeated_name_is_served_as_it_was() -> None:
@@ -460,7 +460,7 @@ def test_a_repeated_name_is_served_as_it_was() -> None:
     assert part.properties[2]["name"] == "A"
     served, context = write(part)
     assert served.count("name: A\n") == 2
-    assert "Fawkes refuses" in warnings(context)
+    assert "Fawkes rejects" in warnings(context)
 
 
 def test_nothing_is_read_that_nobody_wants() -> None:

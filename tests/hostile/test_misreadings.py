@@ -95,7 +95,7 @@ ROWS = [
     Row("occupancy_grid/room/room.yaml", r"resolution: [\d.]+", "resolution: 200", warned="is it in metres?"),
     Row("occupancy_grid/room/room.yaml", "note:", "mod:", warned="unknown keys, kept without effect: mod"),
     Row("occupancy_grid/turned/turned.yaml", r", [-\d.]+\]", ", 90.0]", warned="is it in radians?"),
-    Row("geojson/field.geojson", '"crs": ', '"crs": "EPSG:25832", "crs2": ', refused="GeoJSON means degrees"),
+    Row("geojson/field.geojson", '"crs": ', '"crs": "EPSG:25832", "crs2": ', refused="GeoJSON uses degrees"),
     Row("geojson/field.geojson", r'"bbox": \[[\d.]+', '"bbox": [1e9', warned="is no box", where="bbox"),
     Row("geojson/field.geojson", '"geometry": ', '"geometri": ', warned="have no member 'geometry'"),
     Row("kml/orchard.kml", r"<heading>[\d.]+", "<heading>1e6", warned="degrees", where="heading"),
