@@ -52,7 +52,7 @@ def select_part(
         )
     name = name or (default if default in names else names[0] if len(names) == 1 else None)
     if name is None:
-        raise Ambiguous(f"there are several {noun}s, select one with {option}=…: {', '.join(names)}")
+        raise Ambiguous(f"there are several {noun}s, name one with {option}=…: {', '.join(names)}")
     matches = [key for key in matches if key.name == name]
     if not matches:
         raise NotFound(f"there is no {noun} {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}")
@@ -60,6 +60,6 @@ def select_part(
         ground = [key for key in matches if key.level == GROUND]
         if not ground:
             levels = ", ".join(key.level for key in matches)
-            raise Ambiguous(f"{noun} {name!r} exists on several levels, select one with level=…: {levels}")
+            raise Ambiguous(f"{noun} {name!r} exists on several levels, name one with level=…: {levels}")
         matches = ground
     return matches

@@ -67,7 +67,7 @@ def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[st
     return yaml.dump({"nodes": node_rows, "edges": graph}, sort_keys=False).encode(), node_rows, graph
 
 
-def test_facts_of_our_sample() -> None:
+def test_sample_matches_expected_facts() -> None:
     fact = json.loads((SAMPLE / "facts.json").read_text())["meadow"]
     part, bundle = read(MEADOW)
     assert nodes(part) == fact["nodes"]
@@ -81,7 +81,7 @@ def test_facts_of_our_sample() -> None:
     assert bundle.origin[NETWORK] == (("prm.yaml",), "prm")
 
 
-def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
+def test_file_of_reference_writer_round_trips() -> None:
     data, node_rows, graph = seeds_own((200, 120), 300)
     assert formats.detect("prm_autogen.yaml", data) is FORMAT
     files = {
@@ -105,7 +105,7 @@ def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
     assert offline({"prm.yaml": served}, "prm").files["prm.yaml"] == served, "it stands for itself now"
 
 
-def test_everything_that_a_file_says_comes_back() -> None:
+def test_every_key_round_trips() -> None:
     data = b"""seed: 7
 nodes:
 - {id: b-1, x: 1, y: 2, name: Dock}
@@ -141,7 +141,7 @@ picture: {resolution: 0.1, origin: [0, 0, 0], height: 50}
     )
 
 
-def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
+def test_network_of_another_format_gets_pixels_of_stored_map() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("gate", shapely.Point(1.01, 2.0), {"kind": "node", "orientation": [0, 0, 0, 1]}),
         ("0", shapely.Point(3.0, 4.0), {"kind": "node", "name": "Barn"}),
@@ -173,7 +173,7 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
     assert np.allclose(nodes(again)["0"], [3.0, 4.0], atol=0.05)
 
 
-def test_without_its_map_it_says_what_to_supply() -> None:
+def test_roadmap_without_map_reports_what_to_supply() -> None:
     alone = {"prm.yaml": MEADOW["prm.yaml"]}
     with pytest.raises(UnreadableFile, match=r"add that map.*resolution, origin and height"):
         read(alone)
@@ -183,7 +183,7 @@ def test_without_its_map_it_says_what_to_supply() -> None:
         read(alone, resolution="0.5", height="0")
 
 
-def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
+def test_tmap2_takes_precedence_over_roadmap_in_template() -> None:
     tmap2 = (SAMPLE.parent / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     files = {"config/topological/network.tmap2.yaml": tmap2, "config/topological/prm_autogen.yaml": MEADOW["prm.yaml"]}
     bundle = read_bundle(files, UploadHints(), EnvironmentContext(), Limits())
@@ -207,7 +207,7 @@ def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
         ("nodes:\n- {id: 1, x: 1, y: 1}\nedges: []\npicture: {height: true, origin: [0, 0, 0]}", "picture.height"),
     ],
 )
-def test_what_is_wrong_is_named(text: str, where: str) -> None:
+def test_invalid_values_are_refused_with_location(text: str, where: str) -> None:
     with pytest.raises(BadUpload) as caught:
         formats.read(FileGroup(FORMAT, "prm.yaml", {**MEADOW, "prm.yaml": text.encode()}), ReadContext())
     assert [p.where for p in caught.value.problems] == [where]

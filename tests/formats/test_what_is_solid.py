@@ -123,14 +123,14 @@ def test_multipolygon_equals_the_area_that_osmium_assembles(tmp_path: Path) -> N
     assert area.is_valid
 
 
-def test_multipolygon_without_one_of_its_ways_is_warned_of() -> None:
+def test_multipolygon_with_missing_way_is_warned_about() -> None:
     bundle = read({"map.osm": courtyard(without=3)})
     assert any("1 multipolygons have no area" in w.problem and w.problem.endswith(": 7") for w in bundle.warnings)
     part = next(iter(bundle.layers(DATUM).vector("objects").values()))
     assert part.geometry[part.index()["r7"]].is_empty
 
 
-def test_rings_that_do_not_close_make_no_area() -> None:
+def test_open_rings_make_no_area() -> None:
     line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     assert osm_areas.assemble_area([line]) is None
     assert osm_areas.assemble_area([]) is None

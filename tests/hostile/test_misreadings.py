@@ -96,8 +96,8 @@ ROWS = [
     Row("occupancy_grid/room/room.yaml", "note:", "mod:", warned="unknown keys, kept without effect: mod"),
     Row("occupancy_grid/turned/turned.yaml", r", [-\d.]+\]", ", 90.0]", warned="is it in radians?"),
     Row("geojson/field.geojson", '"crs": ', '"crs": "EPSG:25832", "crs2": ', refused="GeoJSON uses degrees"),
-    Row("geojson/field.geojson", r'"bbox": \[[\d.]+', '"bbox": [1e9', warned="is no box", where="bbox"),
-    Row("geojson/field.geojson", '"geometry": ', '"geometri": ', warned="have no member 'geometry'"),
+    Row("geojson/field.geojson", r'"bbox": \[[\d.]+', '"bbox": [1e9', warned="not a box", where="bbox"),
+    Row("geojson/field.geojson", '"geometry": ', '"geometri": ', warned="lack the mandatory member 'geometry'"),
     Row("kml/orchard.kml", r"<heading>[\d.]+", "<heading>1e6", warned="degrees", where="heading"),
     Row("kml/orchard.kml", r"<heading>[\d.]+", "<heading>nan", warned="must be a number", where="heading"),
     Row("kml/orchard.kml", r"<rotation>[\d.]+", "<rotation>720", refused="degrees", where="rotation"),
@@ -113,8 +113,15 @@ ROWS = [
     Row("gazebo/cart/cart/model.sdf", r"<radius>[\d.]+", "<radius>0", warned="the shape has no extent"),
     Row("gazebo/yard/worlds/yard.world", r"<static>\w+", "<static>maybe", warned="taken for false"),
     Row("gazebo/cart/cart/model.sdf", r"<pose>(\S+ \S+ \S+) \S+", r"<pose>\1 90", warned="are its angles in radians?"),
-    Row("lanelet2/local/lanelet2_map.osm", r'k="speed_limit" v="[^"]*', 'k="speed_limit" v="nan', warned="no speed"),
-    Row("lanelet2/junction.osm", r"k='speed_limit' v='[^']*", "k='speed_limit' v='1000000", warned="no speed"),
+    Row(
+        "lanelet2/local/lanelet2_map.osm",
+        r'k="speed_limit" v="[^"]*',
+        'k="speed_limit" v="nan',
+        warned="invalid speed limit",
+    ),
+    Row(
+        "lanelet2/junction.osm", r"k='speed_limit' v='[^']*", "k='speed_limit' v='1000000", warned="invalid speed limit"
+    ),
 ]
 
 
