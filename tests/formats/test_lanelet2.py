@@ -210,7 +210,7 @@ def test_real_lanelets_connect_as_in_lanelet2(shared: Path) -> None:
     assert edges.keys() == starts.keys()
     follow = {(a, b) for a in edges for b in edges if ends[a] == starts[b]}
     ours = {(a, b) for a in edges for b in edges if edges[a]["target"] == edges[b]["source"]}
-    assert follow <= ours, "nobody who may go on is kept from it"
+    assert follow <= ours, "every allowed continuation is connected"
     # Beyond Lanelet2's own rule: where a lane for both ways ends, one may turn.
     turning = {p[w] for i, p in edges.items() if i.endswith(":back") for w in ("source", "target")}
     assert {edges[a]["target"] for a, _ in ours - follow} <= turning
@@ -644,7 +644,7 @@ def test_write_without_datum_reports_what_to_supply() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "reason"),
     [
         (b"lat='0.00003' lon='0.0'", b"lat='91' lon='0.0'", "invalid position"),
         (b"<nd ref='1' />", b"<nd ref='x' />", "integer"),
@@ -652,9 +652,9 @@ def test_write_without_datum_reports_what_to_supply() -> None:
         (b"lon='0.0002'", b"lon='170'", "too far|too large"),
     ],
 )
-def test_bad_files_are_refused_with_the_reason(old: bytes, new: bytes, said: str) -> None:
+def test_bad_files_are_refused_with_the_reason(old: bytes, new: bytes, reason: str) -> None:
     assert old in JUNCTION
-    with pytest.raises(BadUpload, match=said) as caught:
+    with pytest.raises(BadUpload, match=reason) as caught:
         read(JUNCTION.replace(old, new, 1))
     assert caught.value.problems[0].file == "map.osm"
 

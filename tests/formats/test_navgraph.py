@@ -352,13 +352,13 @@ def test_tmap2_and_drawing_are_exported(shared: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "said",
+    "scalar",
     ["no", "'yes'", "010", "1.50", "~", "0x1F", "12:30", "'a: b'", "'a, b'", "'[x]'", "'!dir'", "Größe", '"tab \\x41"',
      "null", "'#1'", "a.b", "'-'", "2022-01-01", "'{'"],
 )  # fmt: skip
-def test_any_name_round_trips_as_fawkes_reads_it(said: str) -> None:
-    text = f"{HEAD}graph-name: G\nnodes:\n- {{name: {said}, pos: [1, 2]}}\n- {{name: B, pos: [3, 4]}}\n"
-    text += f"connections:\n- [{said}, B]\n"
+def test_any_name_round_trips_as_fawkes_reads_it(scalar: str) -> None:
+    text = f"{HEAD}graph-name: G\nnodes:\n- {{name: {scalar}, pos: [1, 2]}}\n- {{name: B, pos: [3, 4]}}\n"
+    text += f"connections:\n- [{scalar}, B]\n"
     before = Fawkes(text)
     after = Fawkes(write(read(text)[0])[0])
     assert before.nodes == after.nodes

@@ -520,7 +520,7 @@ def test_items_of_other_formats_get_tags() -> None:
     assert {"name": "tree", "kind": "poi", "height": "3.5", "alive": "yes"} in tags
     assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in tags
     assert {"name": "up", "kind": "path", "level": "L2"} in tags
-    assert not any(t.get("name") == "drawn" for t in tags), "the network made from it stands there already"
+    assert not any(t.get("name") == "drawn" for t in tags), "the network derived from it is written already"
     lost = {d.subject for d in context.dropped}
     assert {"GNSS fence", "datum", "items without a geometry"} <= lost
     assert any("nested" in item for item in lost)
@@ -734,7 +734,7 @@ def test_tags_become_canonical_properties() -> None:
     assert properties["w5"] == {"kind": "water", "width": 2.0}
     assert properties["w6"] == {"kind": "barrier", "height": 1.5}
     assert properties["w7"] == {"kind": "waterway"}
-    assert properties["w1"] == {"kind": "highway"}, "what a road measures is said of its edges"
+    assert properties["w1"] == {"kind": "highway"}, "sizes of a highway belong to its edges"
     edges = {f.id: f.properties for f in part(layers, TOPOLOGY) if f.properties["kind"] == "edge"}
     road = {"width": 6.0, "surface": "asphalt"}
     for i, limit in (("w1:1-2", 13.4112), ("w1:2-1", 1.666666667)):
@@ -765,7 +765,7 @@ def test_edited_properties_change_tags() -> None:
     out = {k: v[2] for k, v in elements(served).items()}
     assert out["w4"] == {"building": "yes", "building:levels": "4", "min_height": "3 m", "height": "15", "name": "Mill"}
     assert out["n6"] == elements(write(read(xml(TOWN))))["n6"][2]
-    assert out["w6"] == {"barrier": "hedge", "height": "150 cm"}, "what is not said stays as the tags have it"
+    assert out["w6"] == {"barrier": "hedge", "height": "150 cm"}, "unspecified values keep their tags"
     first = {"maxspeed": "30 mph", "maxspeed:backward": "walk", "maxspeed:forward": "18", "surface": "gravel"}
     assert out["w1"] == {"highway": "residential", "lanes": "2", **first}
     assert out["w-1"] == {"highway": "residential", "lanes": "2", "maxspeed": "9", "surface": "gravel"}

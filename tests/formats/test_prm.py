@@ -135,7 +135,7 @@ picture: {resolution: 0.1, origin: [0, 0, 0], height: 50}
     }
     key = str
     assert sorted(now["nodes"], key=key) == sorted(once["nodes"], key=key)
-    once["edges"][2]["weight"] = 0.0  # the distance, where none was said
+    once["edges"][2]["weight"] = 0.0  # the distance, if the file has none
     assert sorted((sorted(e.items()) for e in now["edges"]), key=key) == sorted(
         (sorted(e.items()) for e in once["edges"]), key=key
     )

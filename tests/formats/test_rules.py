@@ -101,12 +101,12 @@ def test_assertion_error_in_check_is_raised() -> None:
 def test_findings_appear_once_in_report() -> None:
     def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.warn("ask for y=1", file="main", where="y")
-        context.warn("told by both", file="main")
+        context.warn("reported by both", file="main")
         return {"main": b"x"}
 
     def check(files: Files) -> Iterator[Problem]:
         yield Problem("y is not 1", "main", None, "y", "error")
-        yield Problem("told by both", "main", None, None, "warning")
+        yield Problem("reported by both", "main", None, None, "warning")
         yield Problem("new", "main", None, None, "warning")
 
     fmt = replace(with_check(check), write=write, needs=LayerRequirements((frozenset(),)))
@@ -114,7 +114,7 @@ def test_findings_appear_once_in_report() -> None:
     formats.write(fmt, Layers(), context)
     assert [(p.problem, p.level) for p in context.warnings] == [
         ("ask for y=1", "error"),
-        ("told by both", None),
+        ("reported by both", None),
         ("new", "warning"),
     ]
 
@@ -138,7 +138,7 @@ def grid(members: dict[str, str | None], picture: bytes = PGM, stem: str = "map"
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("keys", "expected"),
     [
         ({}, set()),
         ({"negate": "false", "mode": None}, set()),
@@ -163,8 +163,8 @@ def grid(members: dict[str, str | None], picture: bytes = PGM, stem: str = "map"
         ({"image": "./map.pgm"}, set()),
     ],
 )
-def test_map_server_rules(said: dict[str, str | None], expected: Found) -> None:
-    assert findings_of("occupancy_grid", grid(said)) == expected
+def test_map_server_rules(keys: dict[str, str | None], expected: Found) -> None:
+    assert findings_of("occupancy_grid", grid(keys)) == expected
 
 
 def test_map_server_image_path_is_relative_to_yaml() -> None:
@@ -195,15 +195,15 @@ def test_damaged_and_missing_images_are_errors() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("keys", "expected"),
     [
         ({"mode": "trinary"}, {(WARNING, "mode"), (WARNING, None)}),
         ({"mode": "scale"}, set()),
         ({"mode": "raw"}, {(WARNING, None)}),
     ],
 )
-def test_speed_mask_with_unknown_cells_is_warned_about(said: dict[str, str | None], expected: Found) -> None:
-    assert findings_of("occupancy_grid", grid(said, stem="speed_mask")) == expected
+def test_speed_mask_with_unknown_cells_is_warned_about(keys: dict[str, str | None], expected: Found) -> None:
+    assert findings_of("occupancy_grid", grid(keys, stem="speed_mask")) == expected
 
 
 def test_wide_grid_is_reported() -> None:

@@ -367,7 +367,7 @@ def test_geotiff_takes_precedence_over_world_file() -> None:
 
 
 @pytest.mark.parametrize(
-    ("world", "line", "said"),
+    ("world", "line", "reason"),
     [
         (b"1\n0\n0\nnan\n0\n0\n", 4, "finite"),
         (b"1\n0\n0\n-1\ninf\n0\n", 5, "finite"),
@@ -380,8 +380,8 @@ def test_geotiff_takes_precedence_over_world_file() -> None:
         (b"1\n0\n0\n-1\n1e12\n0\n", None, "beyond"),
     ],
 )
-def test_wrong_world_files_are_refused(world: bytes, line: int | None, said: str) -> None:
-    with pytest.raises(UnreadableFile, match=said) as caught:
+def test_wrong_world_files_are_refused(world: bytes, line: int | None, reason: str) -> None:
+    with pytest.raises(UnreadableFile, match=reason) as caught:
         read({"a.pgw": world, "a.png": image()})
     assert caught.value.problems[0].line == line
 

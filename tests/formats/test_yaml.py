@@ -36,7 +36,7 @@ def load(text: str | bytes) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("said", "value"),
+    ("text", "value"),
     [
         ("1", 1),
         ("-7", -7),
@@ -88,8 +88,8 @@ def load(text: str | bytes) -> Any:
         ("[1, [2, {a: b}], 'c']", [1, [2, {"a": "b"}], "c"]),
     ],
 )
-def test_scalar_text_gives_expected_value(said: str, value: Any) -> None:
-    read = load(f"key: {said}\n")
+def test_scalar_text_gives_expected_value(text: str, value: Any) -> None:
+    read = load(f"key: {text}\n")
     assert read == {"key": value}
     assert type(read["key"]) is type(value)
 
@@ -110,7 +110,7 @@ def test_windows_line_endings_are_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "line", "part"),
+    ("text", "line", "part"),
     [
         ("a: 1\nb: .nan\n", 2, "finite"),
         ("a: -.inf\n", 1, "finite"),
@@ -145,9 +145,9 @@ def test_windows_line_endings_are_read() -> None:
         ("a: 1\n  b: 2\n", 2, "not allowed"),
     ],
 )
-def test_invalid_yaml_is_refused_with_line(said: str, line: int, part: str) -> None:
+def test_invalid_yaml_is_refused_with_line(text: str, line: int, part: str) -> None:
     with pytest.raises(UnreadableFile, match=part) as caught:
-        load(said)
+        load(text)
     assert caught.value.problems[0].line == line
     assert part in caught.value.problems[0].problem
 
@@ -342,10 +342,10 @@ def test_limits_hold_for_collections_in_flow_style() -> None:
 
 @examples
 @given(st.text("ab1.-: \n'\"#[]{}&*!|>~é", max_size=60))
-def test_fast_and_full_parsers_agree_on_any_text(said: str) -> None:
-    value = quick(said)
+def test_fast_and_full_parsers_agree_on_any_text(text: str) -> None:
+    value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(load_events(said, LIMITS)), said
+        assert orjson.dumps(value) == orjson.dumps(load_events(text, LIMITS)), text
 
 
 @examples
