@@ -130,7 +130,7 @@ class Record:
     rules: tuple[tuple[str, Any], ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "known", frozenset(self.keys))
+        object.__setattr__(self, "names", frozenset(self.keys))
         object.__setattr__(self, "rules", tuple((k, s) for k, s in self.keys.items() if s is not ANY))
 
 
@@ -211,13 +211,13 @@ def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
                 return
             findings.add_doubt(path, f"{_shorten(value)} is not a mapping")
             return
-        if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.known:
-            findings.add_unknown(path, frozenset(value.keys() - shape.known))
+        if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.names:
+            findings.add_unknown(path, frozenset(value.keys() - shape.names))
         for key, rule in shape.rules:
             if (inner := value.get(key)) is not None:
                 _walk(inner, rule, (key, path), findings)
         if shape.each is not ANY:
-            for key in value.keys() - shape.known:
+            for key in value.keys() - shape.names:
                 _walk(value[key], shape.each, (key, path), findings)
     elif kind is list:
         if not isinstance(value, list):
