@@ -319,8 +319,7 @@ def check(fmt: Format, files: Files) -> list[Problem]:
 
     files: the map's files, main file first. This runs on each exported map, where it may take a few milliseconds
     (``_rules.is_brief``). A format's ``check`` yields problems from its loader's rules and may raise parse errors,
-    which
-    are reported as errors too.
+    which are reported as errors too.
     """
     if fmt.check is None or not files:
         return []
@@ -359,8 +358,9 @@ def _findings(fmt: Format, files: Files, main: str) -> Iterator[Problem]:
 
 
 def _merge_findings(warnings: Sequence[Problem], findings: Iterable[Problem]) -> list[Problem]:
-    """Merge a writer's warnings with a check's findings; of two about one location the writer's text wins, at its
-    level.
+    """Merge a writer's warnings with a check's findings.
+
+    Of two about one location the writer's text is kept, at its level.
     """
     places: dict[tuple[str | None, str | None], int] = {(p.file, p.where): k for k, p in enumerate(warnings) if p.where}
     texts = {p.problem for p in warnings}

@@ -31,8 +31,7 @@ class Number:
     """Rule for a finite number from ``low`` to ``high``, possibly in quotes; doubtful outside of ``usual``.
 
     above: the number must be larger than ``low``. hint: likely explanation of a doubtful number. or_other: values of
-    other
-    types are not checked. doubtful: report errors as doubts (for keys that users may have given another meaning).
+    other types are not checked. doubtful: report errors as doubts (for keys that users may have given another meaning).
     """
 
     low: float = -MAX_METRES
@@ -118,8 +117,7 @@ class Record:
     """Mapping with a shape for each key.
 
     each: shape of unlisted keys, if users may choose names; otherwise unlisted keys are unknown. open: unlisted keys
-    may
-    have any value. loose: values of other types are accepted instead of a mapping.
+    may have any value. loose: values of other types are accepted instead of a mapping.
     """
 
     keys: Mapping[str, Any]

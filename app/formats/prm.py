@@ -313,8 +313,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """Write ``prm.yaml``: all networks as one roadmap, nodes in natural order of ids, edges by their nodes.
 
     Nodes of other formats move to the centres of their pixels; ids that are not integers are replaced by numbers (the
-    id
-    becomes the ``name``). Raises MissingDatum for wgs84 items without a datum.
+    id becomes the ``name``). Raises MissingDatum for wgs84 items without a datum.
     """
     net = merge_networks(layers, context)
     report_3d_loss(net, context, "pixels have no altitude and no level")

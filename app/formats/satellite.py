@@ -454,8 +454,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """Select the named image; else ``satellite``, else the only one; on its level, else on the ground, else the only
-    one.
+    """Select the named image; else ``satellite``, else the only one.
+
+    On the given level, else on the ground, else on the only one.
     """
     supply = "upload one (a GeoTIFF, or a PNG with its world file)"
     return select_part(

@@ -7,10 +7,9 @@ points (a fourth coordinate, an open ring), ``kept`` (properties with a canonica
 ``added`` (names of properties that we added). ``document.geojson`` contains the root's type and further members.
 
 **Our own data.** Features of other layers and families have ``layer``, ``level`` and ``part`` in their properties
-(where
-an editor like QGIS preserves them) and are read back into their part; ``more`` contains properties of those names. A
-collection without them, whose features are nodes and edges (``kind``, ``source``, ``target``) as the API returns them,
-is a topology.
+(where an editor like QGIS preserves them) and are read back into their part; ``more`` contains properties of those
+names. A collection without them, whose features are nodes and edges (``kind``, ``source``, ``target``) as the API
+returns them, is a topology.
 
 **Metres and degrees are kept apart.** An item anchored in metres has them in ``place``, and the collection's
 ``coordRefSys`` names a local engineering frame (x east, y north, z up); ``geometry`` is its position on earth if the

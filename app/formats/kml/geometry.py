@@ -164,8 +164,7 @@ def parse_plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree
     """Return the shape and the coordinate elements of a geometry of regular structure.
 
     The shape is a code: ``P`` point, ``L`` line, ``A2`` area of two rings, ``M…`` several of them; the elements are
-    (role,
-    element) in the order of the geometry's own coordinates.
+    (role, element) in the order of the geometry's own coordinates.
     """
     name = local_name(g)
     if name == "Polygon":

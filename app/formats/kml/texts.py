@@ -21,8 +21,7 @@ GX = "http://www.google.com/kml/ext/2.2"
 
 SAME_PLACE = 1e-10
 """Largest difference in degrees between a geometry and its stored element that does not count as an edit (coordinates
-are
-printed to 1e-12).
+are printed to 1e-12).
 """
 
 
@@ -36,8 +35,7 @@ class CoordinateTexts:
     """Coordinate lists of n geometries as text.
 
     Those of geometry k are texts[start[k]:start[k + 1]], in the order of its parts and rings; shape[k] is the geometry
-    in
-    the codes of ``reading``.
+    in the codes of ``reading``.
     """
 
     texts: list[str]

@@ -73,8 +73,7 @@ def align_bounds(left: LineSet, right: LineSet, xy: Array) -> tuple[LineSet, Lin
     """Orient both bounds along the lane. xy: [points, 2] in metres.
 
     Source: Lanelet2's ``geometry::align``, which its reader applies to every lanelet: a bound is reversed if the middle
-    of
-    the other one is not on its proper side.
+    of the other one is not on its proper side.
     """
     turned = left.reverse(_side(left, _middle(right, xy), xy) >= 0)
     return turned, right.reverse(_side(right, _middle(turned, xy), xy) <= 0)
@@ -122,8 +121,7 @@ def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Ar
     """Return the line half-way between the bounds of n lanes: all its points [m, columns] and their lane [m].
 
     It bends wherever a bound bends, at the same fraction of the bounds' lengths in ``xy`` (metres); ``places`` are in
-    any
-    coordinates, and so is the result.
+    any coordinates, and so is the result.
     """
     ratio = [_ratios(side, xy) for side in (left, right)]
     owner = np.concatenate([left.owner, right.owner])

@@ -58,9 +58,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """Write ``graph.geojson``: all networks of the environment as one graph, nodes and then edges by their numbers.
 
     Items keep the numbers of their source; any other item gets one that follows from its id alone (unless that is
-    taken),
-    so that it does not depend on other items. Wgs84 items are converted to local metres. Raises MissingDatum without a
-    datum, CannotConvert if there is no node or no edge.
+    taken), so that it does not depend on other items. Wgs84 items are converted to local metres. Raises MissingDatum
+    without a datum, CannotConvert if there is no node or no edge.
     """
     return {"graph.geojson": _Writer(layers, context).data()}
 

@@ -57,10 +57,8 @@ class Data:
     """Content of an OSM file.
 
     ids: of the nodes, in the file's order. lonlat: float64 [n, 2] degrees, NaN for nodes without a position. tags: by
-    the
-    node's index in ``ids``, only for those that have any. attributes(k): further attributes of node k, one shared
-    mapping
-    for equal ones. root, bounds, elements: of the file as a whole.
+    the node's index in ``ids``, only for those that have any. attributes(k): further attributes of node k, one shared
+    mapping for equal ones. root, bounds, elements: of the file as a whole.
     """
 
     ids: list[int]

@@ -357,8 +357,9 @@ def _with_areas(part: Features, relations: range, context: ReadContext) -> Featu
 
 
 def _vertices(data: Data, refs: list[int], index: list[int], features: set[int]) -> Any:
-    """Return the attributes of a way's nodes that are not features: one mapping if all are equal, else a list like
-    refs.
+    """Return the attributes of a way's nodes that are not features.
+
+    One mapping if all are equal, else a list parallel to refs.
     """
     rows = [None if k < 0 or r in features else data.attributes(k) for r, k in zip(refs, index, strict=True)]
     entries = [row for row in rows if row is not None]

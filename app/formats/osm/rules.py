@@ -85,8 +85,9 @@ class _ElementScan:
     line: int | None = None
 
     def read_element(self, parent: etree._Element) -> None:
-        """Collect all elements below the root; a change file has blocks of them. Raises TypeError or ValueError for
-        non-numbers.
+        """Collect all elements below the root; a change file has blocks of them.
+
+        Raises TypeError or ValueError for values that are not numbers.
         """
         for element in parent:
             kind = element.tag

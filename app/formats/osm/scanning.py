@@ -127,8 +127,9 @@ def _count_elements(data: bytes, limits: Limits) -> dict[bytes, int] | None:
 
 @dataclass(slots=True)
 class _Nodes:
-    """Columns of nodes. lonlat: [k, 2] per piece of the file. texts: further attributes. tagged: indexes of nodes with
-    tags.
+    """Columns of nodes.
+
+    lonlat: [k, 2] per piece of the file. texts: further attributes. tagged: indexes of nodes with tags.
     """
 
     ids: list[int] = field(default_factory=list)
@@ -196,8 +197,9 @@ class _Texts(dict[bytes, str]):
 
 
 class _Children:
-    """Reads and counts the elements inside nodes, ways and relations; ``regular`` becomes False at the first irregular
-    one.
+    """Reader and counter of the elements inside nodes, ways and relations.
+
+    ``regular`` becomes False at the first irregular element.
     """
 
     __slots__ = ("alike", "members", "nds", "regular", "tagged", "texts")

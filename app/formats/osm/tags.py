@@ -76,8 +76,7 @@ def direction(tags: Mapping[str, Any]) -> Direction:
     """Return the directions in which a way may be used, relative to its nodes.
 
     ``oneway`` decides. Without it roundabouts and motorways are one-way, and so are their links: driving against a
-    link's
-    traffic is worse than not using it. A reversible way is one-way as drawn, never bidirectional.
+    link's traffic is worse than not using it. A reversible way is one-way as drawn, never bidirectional.
     """
     oneway = str(tags.get("oneway", "")).strip().lower()
     if oneway in FORWARD:
@@ -233,8 +232,9 @@ def object_tags(source_properties: Mapping[str, Any], p: Properties, i: str) -> 
 def way_tags(
     tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], headings: Set[str]
 ) -> Mapping[str, str]:
-    """Update a highway's tags to its edges' current properties. changes: by direction; headings: the existing
-    directions.
+    """Update a highway's tags to its edges' current properties.
+
+    changes: by direction; headings: the existing directions.
     """
     out = dict(tags)
     limits = {heading: new["speed_limit"] for heading, new in changes.items() if "speed_limit" in new}

@@ -236,8 +236,9 @@ class _Writer:
     def runs(
         self, level: _Level, number: int, refs: list[int], tags: Mapping[str, str], absent: set[int]
     ) -> list[tuple[int, int, Mapping[str, str]]]:
-        """Return the pieces of a highway way that are still in the network: (first, one past the last index of refs,
-        tags).
+        """Return the pieces of a highway way that are still in the network.
+
+        Each piece is (first, one past the last index of refs, tags).
         """
         expected = way_edges(number, refs, tags, absent)
         # For each segment: its existing directions among the way's, and its tags if they differ.
