@@ -1,4 +1,4 @@
-"""ZIP archives: what is safe comes out byte for byte, what is not is refused before a byte is written anywhere."""
+"""ZIP archives: safe ones are unpacked byte for byte, unsafe ones are refused before any file is written."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def zipped(*members: tuple[str | zipfile.ZipInfo, bytes]) -> bytes:
 
 
 class Pipe(io.RawIOBase):
-    """A target that cannot seek, so that sizes follow the data."""
+    """A target without seek, so that sizes follow the data."""
 
     def __init__(self) -> None:
         self.body = bytearray()
@@ -54,7 +54,7 @@ def with_mode(mode: int, name: str = "a") -> bytes:
 
 
 def patched(data: bytes, mark: bytes, offset: int, new: bytes, occurrence: int = 0) -> bytes:
-    """The archive with other bytes at this offset of the n-th header with this mark."""
+    """Patch bytes at this offset of the n-th header with this signature."""
     at = -1
     for _ in range(occurrence + 1):
         at = data.index(mark, at + 1)
@@ -65,7 +65,7 @@ LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"
 
 
 def renamed(name: bytes) -> bytes:
-    """An archive with one member of this raw name in both headers."""
+    """Build an archive with one member of this raw name in both headers."""
     return zipped(("x" * len(name), b"1")).replace(b"x" * len(name), name)
 
 
@@ -148,7 +148,7 @@ def test_duplicate_name_is_refused():
 
 
 def test_overlapping_members_are_refused():
-    """One member lies inside another one's data: the trick behind bombs that quote themselves."""
+    """One member inside another one's data, as in self-quoting bombs."""
     inner = zipped(("b", b"2" * 10))
     stored = zipfile.ZipInfo("a")
     out = io.BytesIO()
@@ -166,7 +166,7 @@ def test_overlapping_members_are_refused():
 
 
 def lying(declared: int) -> bytes:
-    """A member of a million zeros that declares another size in both headers."""
+    """Build a member of a million zeros that declares another size in both headers."""
     data = zipped(("a", bytes(1_000_000)))
     size = struct.pack("<L", declared)
     return patched(patched(data, LOCAL, 22, size), CENTRAL, 24, size)
@@ -240,7 +240,7 @@ def test_unusable_names_are_not_packed(name: str):
 
 
 def test_large_members_round_trip():
-    """More than one piece in and out, also where the packed data ends long before its output does."""
+    """More than one piece of input and output, also if the packed data ends long before its output."""
     files = {"zeros": bytes(5_000_000), "noise": bytes(range(256)) * 20_000, "ones": b"1" * (2**20)}
     assert archives.unpack(archives.pack(files), Limits()) == files
 

@@ -1,4 +1,4 @@
-"""datum.yaml: real files come back the same; the heading means what robot_localization means; bad ones are named."""
+"""datum.yaml: real files round-trip, the heading matches robot_localization, errors name their location."""
 
 from __future__ import annotations
 

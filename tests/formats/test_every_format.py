@@ -1,4 +1,4 @@
-"""What holds for every format, by its registration and its samples alone: a new format is tested here by itself."""
+"""Requirements on every format, tested with its registration and samples: new formats are included automatically."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIMITS = Limits()
 
 
 def cases() -> list[tuple[str, str, dict[str, bytes]]]:
-    """(format, case, files): each folder below samples/<format>, and each lone file there, is a map."""
+    """Yield (format, case, files): each folder below samples/<format>, and each file outside of one, is a map."""
     out = []
     for folder in sorted(SAMPLES.iterdir()) if SAMPLES.is_dir() else []:
         for item in sorted(folder.iterdir()):
@@ -81,7 +81,7 @@ def test_written_map_reads_back_equal_and_writes_same_bytes(name: str, files: di
 
 
 def mutations(data: bytes, seed: int) -> list[bytes]:
-    """Truncated, flipped, doubled, with other types and huge numbers."""
+    """Yield truncated and flipped files, repeated content, other types and huge numbers."""
     dice = random.Random(seed)
     out = [b"", data[:1], data[: len(data) // 2], data[:-1], data + data, data[::-1]]
     out += [data[: dice.randrange(len(data))] for _ in range(8)]
@@ -157,7 +157,7 @@ def test_equal_files_with_other_names_give_equal_layers(name: str, files: dict[s
 
 @pytest.mark.parametrize("name", NAMES)
 def test_format_with_title_declares_has_title(name: str) -> None:
-    """Else a map of one environment would be served for another one of equal content."""
+    """Otherwise a map of one environment would be returned for another one of equal content."""
     fmt = formats.get_format(name)
     rows: list[Any] = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(9, 0), {"kind": "node"})]
     rows.append(("e", shapely.LineString([(0, 0), (9, 0)]), {"kind": "edge", "source": "a", "target": "b"}))

@@ -1,4 +1,4 @@
-"""GeoJSON in and out: everything comes back, metres are never degrees, our layers survive, bad bytes are refused."""
+"""GeoJSON: round trips, metres are never degrees, all layers, hostile bytes."""
 
 from __future__ import annotations
 

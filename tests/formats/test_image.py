@@ -1,4 +1,4 @@
-"""Pictures: what comes out equals Pillow's own reading; damaged or lying ones are refused; PNG is written whole."""
+"""Images: decoding equals Pillow's, damaged files and false headers are refused, PNG is written correctly."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def png(width: int, height: int, packed: bytes, depth: int = 8, colour: int = 0,
 
 
 def pictures() -> dict[str, bytes]:
-    """One of each kind, all 53 × 37."""
+    """Return one image of each kind, all 53 × 37."""
     grey8, rgb = Image.fromarray(SHADES), Image.fromarray(COLOURS)
     rgba = rgb.convert("RGBA")
     rgba.putalpha(Image.fromarray(np.where(SHADES > 128, 255, SHADES).astype(np.uint8)))
@@ -344,7 +344,7 @@ def test_coloured_png_in_strips_matches_pillow(mode: str, shape: tuple[int, int]
 
 
 def test_png_filters_and_many_small_chunks_are_read() -> None:
-    """The filters of the PNG specification (RFC 2083, 6), worked out by hand: each row is what the one before gives."""
+    """Filters of the PNG specification (RFC 2083, 6), computed by hand: each row results from the one before."""
     width, bands = 2, 3
     rows = [
         bytes([0, 1, 2, 3, 4, 5, 6]),

@@ -1,4 +1,4 @@
-"""KML: every drawing comes back as it was, edits win, and maps of other origin travel whole."""
+"""KML: drawings round-trip, edits are written, and maps of other formats round-trip."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def placemark(inner: str, attributes: str = "") -> bytes:
 
 
 def changed(layers: Layers, place: int, geometry: Any = None, **properties: Any) -> Layers:
-    """The objects with another geometry or other properties at one place."""
+    """Replace the geometry or properties of one object."""
     part = objects(layers)
     shapes = part.geometry.copy()
     if geometry is not None:
@@ -64,7 +64,7 @@ def changed(layers: Layers, place: int, geometry: Any = None, **properties: Any)
 
 
 def equal(a: Layers, b: Layers) -> None:
-    """Same parts, ids, properties to the type, anchors, documents, and coordinates to a nanometre or 1e-12 degrees."""
+    """Compare parts, ids, typed properties, anchors, documents, and coordinates to a nanometre or 1e-12 degrees."""
     assert set(a.parts) == set(b.parts)
     assert a.datum == b.datum
     for key, p in a.parts.items():
@@ -88,7 +88,7 @@ def equal(a: Layers, b: Layers) -> None:
 
 REFUSED = {"kml/libkml/billion.kml"}
 UNCOUNTABLE = {"kml/libkml/all-unknown-input.kml"}
-"""Its LatLonBox holds words, which the independent comparison cannot take."""
+"""Files whose LatLonBox contains words, which the independent comparison cannot read."""
 
 
 @pytest.fixture(scope="session")
@@ -215,7 +215,7 @@ def test_drawing_becomes_objects(orchard):
 
 
 def _up(plan: Any) -> tuple[float, float]:
-    """East and north, in metres' proportion, of an overlay's left side."""
+    """Return east and north of an overlay's left side, scaled to metres."""
     corner = shapely.get_coordinates(plan)
     east, north = corner[3] - corner[0]
     return float(east) * math.cos(math.radians(50.0015)), float(north)
@@ -402,7 +402,7 @@ def test_deep_folders_are_read(depth, same):
 
 
 def network(n: int = 12) -> Features:
-    """Nodes on a circle of 50 m, edges both ways between neighbours, with everything a robot's map may say."""
+    """Build nodes on a circle of 50 m with edges in both directions between neighbours and all robot properties."""
     angle = np.arange(n) * 2 * np.pi / n
     xy = np.round(np.stack([50 * np.cos(angle), 50 * np.sin(angle)], axis=1), 9)
     rows: list[tuple[str, Any, dict[str, Any]]] = []
@@ -787,7 +787,7 @@ def test_tmap2_round_trips_through_kml(shared, same):
 
 
 def test_many_items_are_written_in_time():
-    """No quadratic step: ten times the items take about ten times the time (a generous bound)."""
+    """Ten times the items take about ten times the time (a generous limit): no quadratic step."""
     import time
 
     def seconds(n: int) -> float:

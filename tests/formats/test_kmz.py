@@ -1,4 +1,4 @@
-"""KMZ: the main document is the first .kml entry, everything else comes back byte for byte, grids travel whole."""
+"""KMZ: the main document is the first .kml entry, other entries round-trip byte for byte, and so do grids."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""lanelet2: real maps come back whole, lanelets are a network, and networks from elsewhere become lanelets."""
+"""lanelet2: real maps round-trip, lanelets become a network, and other networks become lanelets."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def write(layers: Layers, **context: Any) -> tuple[dict[str, bytes], WriteContex
 
 
 def edited(layers: Layers, key: PartKey, change: Callable[[str, dict[str, Any]], dict[str, Any] | None]) -> Layers:
-    """The layers with other properties of one part's items; None takes an item out."""
+    """Replace properties of one part's items; None deletes an item."""
     part = layers.parts[key]
     assert isinstance(part, Features)
     properties = [change(i, dict(p)) for i, p in zip(part.ids, part.properties, strict=True)]
@@ -82,7 +82,7 @@ def items(layers: Layers) -> dict[str, tuple[dict[str, Any], Any]]:
 
 
 def elements(data: bytes) -> dict[tuple[str, int], dict[str, Any]]:
-    """Each element by type and id: attributes as values, tags, nodes and members in order."""
+    """Return each element by type and id: attributes as values, tags, nodes and members in order."""
     out: dict[tuple[str, int], dict[str, Any]] = {}
     for e in etree.fromstring(data):
         if e.tag not in ("node", "way", "relation"):
@@ -169,7 +169,7 @@ def test_real_lanelets_follow_one_way_tags(shared: Path) -> None:
 
 
 def test_real_lanelets_connect_as_in_lanelet2(shared: Path) -> None:
-    """Worked out a second time, one lanelet after the other, from the XML alone."""
+    """Compute the connections independently, lanelet by lanelet, from the XML alone."""
     data = (shared / "data/lanelet2/fzi_mapping_example/mapping_example.osm").read_bytes()
     osm_elements = elements(data)
     rad = math.radians(49.0)
@@ -269,7 +269,7 @@ def test_local_map_matches_expected_facts() -> None:
 
 
 def test_metres_of_another_frame_are_not_mixed_with_local() -> None:
-    """An MGRS map stands on earth; its local_x and local_y go with it while its points stay where they are."""
+    """An MGRS map has positions on earth; its local_x and local_y are stored while its points are unchanged."""
     node = "<node id='{}' lat='{}' lon='{}'><tag k='local_x' v='{}'/><tag k='local_y' v='5'/></node>"
     at = [(1, 0.0001, 0.0, 7), (2, 0.0001, 0.0001, 8), (3, 0.0, 0.0, 9), (4, 0.0, 0.0001, 10)]
     body = "".join(node.format(*row) for row in at) + (
@@ -462,7 +462,7 @@ def net(edges: list[tuple[str, str]], places: dict[str, tuple[float, ...]], **ed
 
 
 def lanelets(data: bytes) -> dict[str, tuple[dict[str, str], dict[str, list[int]], dict[int, tuple[float, float]]]]:
-    """By edge: tags, refs by role, and the metres that each point says."""
+    """Return lanelets by edge: tags, refs by role, and the metres of each point."""
     osm_elements = elements(data)
     metres = {
         i: (float(e["tags"]["local_x"]), float(e["tags"]["local_y"]))
@@ -477,7 +477,7 @@ def lanelets(data: bytes) -> dict[str, tuple[dict[str, str], dict[str, list[int]
 
 
 def valid(data: bytes) -> None:
-    """Lanelet2's rules: bounds of two and more points, the left one on the left, neither crossing."""
+    """Check Lanelet2's rules: bounds of at least two points, the left one on the left, neither crossing."""
     for name, (tags, sides, at) in lanelets(data).items():
         left, right = ([at[r] for r in sides[w]] for w in ("left", "right"))
         assert min(len(left), len(right)) > 1
@@ -707,7 +707,7 @@ def test_invalid_stored_values_are_written_safely() -> None:
 
 
 def test_autoware_member_order_uses_fast_parser() -> None:
-    """type, role, ref: whichever order an editor has, the scan takes it and tells the same as the XML parser."""
+    """Members with type, role, ref in any order: the fast parser reads them as the strict parser does."""
     head = '<?xml version="1.0"?>\n<osm version="0.6">\n  <node id="1" lat="35.2" lon="138.8"/>\n'
     rows = [
         'type="way" role="left" ref="-5"',

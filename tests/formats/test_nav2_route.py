@@ -1,4 +1,4 @@
-"""nav2_route: real graphs come back the same, the loader's rules hold, numbers stay, bad files are named."""
+"""nav2_route: real graphs round-trip, the loader's rules hold, numbers are stable, errors name their location."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ def warnings(context: ReadContext | WriteContext) -> str:
 
 
 class Unsigned(int):
-    """An integer as nlohmann's JSON stores one without a sign: getValue<float> of it throws."""
+    """An integer as nlohmann's JSON stores one without a sign: getValue<float> throws."""
 
 
 class RouteServer:
-    """What geojson_graph_file_loader.cpp takes, and what it throws at."""
+    """Loader with the rules of geojson_graph_file_loader.cpp, including its exceptions."""
 
     def __init__(self, data: bytes) -> None:
         top = json.loads(data)
@@ -211,7 +211,7 @@ def test_geojson_export_is_not_detected_as_route_graph() -> None:
 
 
 def street(names: list[str], **more: Any) -> Features:
-    """A chain of nodes, both ways."""
+    """Build a chain of nodes, connected in both directions."""
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         (i, shapely.Point(k, 0), {"kind": "node", "name": i}) for k, i in enumerate(names)
     ]

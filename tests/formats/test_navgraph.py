@@ -1,4 +1,4 @@
-"""navgraph: real graphs come back the same, facts hold, Fawkes' rules are kept or warned about, bad files are named."""
+"""navgraph: real graphs round-trip, independently counted facts, Fawkes' rules, errors name their location."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def warnings(context: ReadContext | WriteContext) -> str:
 
 
 class Fawkes:
-    """What yaml_navgraph.cpp makes of a file: every scalar is a text; connections are added one after the other."""
+    """Loader with the rules of yaml_navgraph.cpp: every scalar is a text; connections are added in sequence."""
 
     def __init__(self, text: str) -> None:
         assert text.startswith(HEAD)
@@ -240,7 +240,7 @@ def test_edited_properties_are_exported() -> None:
 
 
 def cross(**more: Any) -> Features:
-    """Two streets that cross on a bridge, a one-way street, a parallel edge, a lone node."""
+    """Two streets that cross on a bridge, a one-way street, a parallel edge, an isolated node."""
     at = {"W": (-5.0, 0.0), "E": (5.0, 0.0), "S": (0.0, -5.0), "N": (0.0, 5.0), "alone": (9.0, 9.0)}
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         (i, shapely.Point(p), {"kind": "node", "name": i}) for i, p in at.items()

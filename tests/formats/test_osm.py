@@ -1,4 +1,4 @@
-"""OpenStreetMap in and out: facts counted by others, round trips, edits, oddities of real extracts, hostile bytes."""
+"""OpenStreetMap: independently counted facts, round trips, edits, irregular extracts, hostile bytes."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def xml(body: str, root: str = '<osm version="0.6">') -> bytes:
 
 
 def elements(data: bytes) -> dict[str, Any]:
-    """type + id -> (attributes, refs or members, tags)."""
+    """Return elements as type + id -> (attributes, refs or members, tags)."""
     root = etree.fromstring(data)
     out = {}
     for e in root.iterchildren("node", "way", "relation"):
@@ -180,7 +180,7 @@ def test_fast_and_strict_parsers_agree_and_skip_unrequested_content(name: str, s
 
 
 def contents(data: Data) -> Any:
-    """All that was read, to be compared."""
+    """Return all parsed content in comparable form."""
     nodes = [(i, at, data.tags.get(k), data.attributes(k)) for k, (i, at) in enumerate(zip(data.ids, data.lonlat.tolist(), strict=True))]  # fmt: skip  # noqa: E501
     return nodes, data.ways, data.relations, data.root, data.bounds
 

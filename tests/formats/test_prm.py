@@ -1,4 +1,4 @@
-"""prm: pixels of a map's picture are places in metres and back, edges of both directions, nothing lost."""
+"""prm: pixels of a map's image become metres and back, edges of both directions, lossless round trips."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def edges(part: Features) -> Edges:
 
 
 def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
-    """What metric_to_prm.generate_prm dumps: integer pixels, an undirected graph, PyYAML's block style."""
+    """Output of metric_to_prm.generate_prm: integer pixels, an undirected graph, PyYAML's block style."""
     dice = np.random.default_rng(3)
     at = [(int(dice.integers(picture[0])), int(dice.integers(picture[1]))) for _ in range(count)]
     node_rows = [{"id": k, "x": x, "y": y} for k, (x, y) in enumerate(at)]

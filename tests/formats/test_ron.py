@@ -1,4 +1,4 @@
-"""RON: JSON's values from RON, errors with their line, bounds, and what is written reads as the same."""
+"""RON: values equal JSON's, errors name their line, limits hold, and written values read back equal."""
 
 from __future__ import annotations
 

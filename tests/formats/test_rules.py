@@ -36,13 +36,13 @@ Found = set[tuple[str | None, str | None]]
 
 
 def findings_of(name: str, files: dict[str, bytes]) -> Found:
-    """(level, place) of each finding."""
+    """Return (level, location) of each finding."""
     return {(p.level, p.where) for p in formats.check(formats.get_format(name), files)}
 
 
 @pytest.mark.parametrize(("name", "files"), CASES)
 def test_exported_map_passes_checks_of_its_sample(name: str, files: dict[str, bytes]) -> None:
-    """Samples with dangling edges and the like come back with them, and with an error."""
+    """Samples with dangling edges and the like, which round-trip with an error."""
     served = offline(files, name, hints=UploadHints(name), datum=HERE)
     groups, _ = formats.group(files, name)
     if formats.get_format(name).traits.is_container:  # its parts are checked by their own formats' rules
@@ -173,7 +173,7 @@ def test_map_server_image_path_is_relative_to_yaml() -> None:
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG's first chunks: all that a look at the size reads."""
+    """Return a PNG's first chunks: everything that the size check reads."""
     head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     body = zlib.compress(b"\0")
     chunks = [(b"IHDR", head), (b"IDAT", body), (b"IEND", b"")]
@@ -218,7 +218,7 @@ def test_wide_grid_is_reported() -> None:
 
 # --- the route server ---------------------------------------------------------------------------------------------
 def graph(node: dict[str, Any] | None = None, edge: dict[str, Any] | None = None, **top: Any) -> dict[str, bytes]:
-    """Two nodes and an edge, with these further properties."""
+    """Build two nodes and an edge with these further properties."""
     rows: list[dict[str, Any]] = [
         {
             "type": "Feature",
@@ -287,7 +287,7 @@ def test_far_nodes_lose_millimetres() -> None:
 
 # --- topological_navigation ---------------------------------------------------------------------------------------
 def tmap2(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, Any]:
-    """A with an edge to B, after the schema, then changed."""
+    """Build a node A with an edge to B according to the schema, then changed."""
     pose = {"orientation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}, "position": {"x": 0.0, "y": 0.0, "z": 0.0}}
     edge = {"action": "move_base", "edge_id": "A_B", "node": "B"}
     nodes = [
@@ -331,7 +331,7 @@ TMAP2: list[Any] = [
 
 @pytest.mark.parametrize(("change", "expected"), TMAP2)
 def test_topological_navigation_rules(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
-    """The same for a file that is laid out as PyYAML does, which is counted, and for one that is parsed."""
+    """Equal results for a file in PyYAML's layout, which is counted, and for one that is parsed."""
     top = tmap2(change)
     assert findings_of("tmap2", {"a.tmap2.yaml": json.dumps(top).encode()}) == expected, "parsed"
     block = yaml.dump(json.loads(json.dumps(top)), default_flow_style=False).encode()
@@ -704,7 +704,7 @@ def test_datum_rules(old: str, new: str, expected: Found) -> None:
     ("name", "files"), [case for case in CASES if formats.get_format(str(case.values[0])).check is not None]
 )
 def test_check_of_damaged_files_returns_findings(name: str, files: dict[str, bytes]) -> None:
-    """Whatever the bytes are, there is no crash; what cannot be parsed is an error."""
+    """Arbitrary bytes cause no crash; unparsable content is an error."""
     fmt = formats.get_format(name)
     for victim, data in files.items():
         for damaged in mutations(data, seed=len(victim)):

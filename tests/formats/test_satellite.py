@@ -1,4 +1,4 @@
-"""Georeferenced pictures: samples against gdalinfo's words, real maps, world files, corners, floor plans, limits."""
+"""Georeferenced images: samples against gdalinfo, real maps, world files, corners, floor plans, limits."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ def test_tiff_without_crs_uses_option() -> None:
 
 
 def without_tag(data: bytes) -> bytes:
-    """Our own tag, which says local, under another name of the same length."""
+    """Rename our own tag, which marks local coordinates, to another name of the same length."""
     assert geotiff.OWN_TAG.encode() in data
     return data.replace(geotiff.OWN_TAG.encode(), b"X" * len(geotiff.OWN_TAG))
 
@@ -648,7 +648,7 @@ def test_limits_are_checked_before_anything_is_decoded() -> None:
 
 
 def test_reader_opens_only_given_bytes(tmp_path: Path) -> None:
-    """A VRT, and a TIFF whose first bytes lie, are refused whatever they point to."""
+    """A VRT, and a TIFF with false first bytes, are refused without opening the files that they refer to."""
     secret = tmp_path / "secret.tif"
     secret.write_bytes(tif(utm()))
     vrt = (
@@ -661,7 +661,7 @@ def test_reader_opens_only_given_bytes(tmp_path: Path) -> None:
 
 
 def bigger(data: bytes, tag: int, value: int) -> bytes:
-    """A little-endian classic TIFF with another value of a tag of its first page."""
+    """Replace the value of a tag of the first page of a little-endian classic TIFF."""
     (at,) = struct.unpack_from("<I", data, 4)
     (count,) = struct.unpack_from("<H", data, at)
     for k in range(count):

@@ -1,4 +1,4 @@
-"""Shell variables: the literals that a real shell would end with, nothing that needs one, and bounded effort."""
+"""Shell variables: literals with the values of a real shell, nothing that needs execution, and bounded effort."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ BASH = shutil.which("bash") or ""
 
 @pytest.mark.skipif(not BASH, reason="bash is absent")
 def test_values_match_real_shell(tmp_path: Path) -> None:
-    """What is read of random scripts is what bash ends with (these pieces make no command that could do harm)."""
+    """Values read from random scripts equal bash's (the script pieces form no harmful command)."""
     dice, checked = random.Random(3), 0
     scripts = ["".join(dice.choice(PIECES) for _ in range(dice.randrange(2, 14))) for _ in range(4000)]
     scripts = [s for s in scripts if values(s)]

@@ -1,4 +1,4 @@
-"""waypoints_csv: places, angles and further columns, by facts that were worked out by hand."""
+"""waypoints_csv: positions, angles and further columns, with hand-computed facts."""
 
 from __future__ import annotations
 

@@ -221,7 +221,7 @@ def test_limits_on_nodes_and_bytes() -> None:
 
 
 def quick(text: str) -> Any:
-    """What the quick way makes of it, or a mark that it leaves it to the reference."""
+    """Return the fast parser's result, or its mark that the reference parser is needed."""
     try:
         return load_lines(text, LIMITS)
     except NotSimpleError:

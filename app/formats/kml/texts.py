@@ -20,8 +20,9 @@ KML = "http://www.opengis.net/kml/2.2"
 GX = "http://www.google.com/kml/ext/2.2"
 
 SAME_PLACE = 1e-10
-"""Largest difference in degrees between a geometry and its stored element that does not count as an edit (coordinates
-are printed to 1e-12).
+"""Tolerance in degrees between a geometry and its stored element; a larger difference is an edit.
+
+Coordinates are printed to 1e-12.
 """
 
 

@@ -138,10 +138,9 @@ class StoredElements:
         relations: Sequence[tuple[int, Mapping[str, Any]]],
         networks: Mapping[PartKey, Features],
     ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
-        """Return each lanelet's tags and whether it is reversed, according to the network; None if its edges were
-        removed.
+        """Return each lanelet's tags and whether it is reversed, according to the network.
 
-        Without a network the result is empty.
+        None if its edges were removed. Without a network the result is empty.
         """
         if not networks:
             return {}

@@ -111,9 +111,7 @@ class _ParsedNode:
         display = properties.get("name")
         if isinstance(display, str) and display not in ("", self.name) and "name" not in self.words:
             out["name"] = display
-            source_properties["also if the item later has another id"] = (
-                self.name
-            )  # also where the item is found again under another id
+            source_properties["name"] = self.name  # also if the item later has another id
             del properties["name"]
         turned = properties.get("orientation")
         if isinstance(turned, (int, float)) and not isinstance(turned, bool):

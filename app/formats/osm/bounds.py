@@ -32,8 +32,9 @@ def read_box(attributes: Mapping[str, str]) -> tuple[float, float, float, float]
 def written_bounds(
     source_bounds: Sequence[Mapping[str, str]], boxes: Sequence[Sequence[float]]
 ) -> Sequence[Mapping[str, str]]:
-    """Return the attributes of ``<bounds>``: the stored ones if they still enclose these boxes exactly, else of that
-    box.
+    """Return the attributes of ``<bounds>``.
+
+    The stored ones if they still enclose these boxes exactly, else those of the box around them.
 
     Further stored attributes (their origin) are kept.
     """

@@ -36,8 +36,9 @@ from app.model.osm_areas import multipolygon_areas
 from app.syntax import xml
 
 PROLOG_BYTES = 2**14
-"""Number of bytes at the start of a file in which stylesheets are looked for; elements of other formats are rejected
-anywhere.
+"""Number of bytes at the start of a file that are searched for stylesheets.
+
+Elements of other formats are rejected anywhere.
 """
 
 
