@@ -165,7 +165,7 @@ def test_overlapping_members_are_refused():
         archives.unpack(outer[:start] + directory + end, Limits())
 
 
-def lying(declared: int) -> bytes:
+def with_declared_size(declared: int) -> bytes:
     """Build a member of a million zeros that declares another size in both headers."""
     data = zipped(("a", bytes(1_000_000)))
     size = struct.pack("<L", declared)
@@ -174,11 +174,11 @@ def lying(declared: int) -> bytes:
 
 def test_unpacked_bytes_are_counted_not_declared_ones():
     with pytest.raises(UnsafeArchive, match="more than the 1000 bytes"):
-        archives.unpack(lying(1000), Limits())
+        archives.unpack(with_declared_size(1000), Limits())
     with pytest.raises(UnsafeArchive, match="another size"):
-        archives.unpack(lying(2_000_000), Limits())
+        archives.unpack(with_declared_size(2_000_000), Limits())
     with pytest.raises(TooLarge):
-        archives.unpack(lying(0xFFFFFFFE), Limits())
+        archives.unpack(with_declared_size(0xFFFFFFFE), Limits())
     with pytest.raises(TooLarge):
         archives.unpack(zipped(("a", bytes(1001))), Limits(unpacked_bytes=1000))
     with pytest.raises(TooLarge, match="members"):

@@ -36,7 +36,7 @@ def write(part: Features) -> tuple[dict[str, Any], WriteContext]:
     return yaml.safe_load(files["network.ffr.yaml"]), context
 
 
-def seeds_tmap(data: dict[str, Any]) -> set[tuple[str, str]]:
+def reference_lines(data: dict[str, Any]) -> set[tuple[str, str]]:
     """Find lines as ffrnetwork_to_tmap.py does: points by their coordinates' text; KeyError where it would fail."""
     nodes = {f"x{n['x']}y{n['y']}": n["name"] for n in data["internal_points"]}
     return {
@@ -75,7 +75,7 @@ def test_every_key_round_trips() -> None:
     back, context = write(part)
     assert context.dropped == context.warnings == []
     assert plain(back) == plain(yaml.safe_load(YARD))
-    assert seeds_tmap({**back, "network_lines": back["network_lines"][:2]}) == {("gate", "barn"), ("12", "gate")}
+    assert reference_lines({**back, "network_lines": back["network_lines"][:2]}) == {("gate", "barn"), ("12", "gate")}
 
 
 def test_parallel_and_reverse_lines_stay_separate() -> None:
@@ -100,7 +100,7 @@ def test_network_of_another_format_is_written() -> None:
     ]
     rows[3][2]["speed_limit"] = 2.0
     back, context = write(features(rows, "local"))
-    assert seeds_tmap(back) == {("a", "b"), ("b", "c")}
+    assert reference_lines(back) == {("a", "b"), ("b", "c")}
     assert [e.get("oneway") for e in back["network_lines"]] == [None, True]
     assert back["network_lines"][0]["speed_limit"] == 2.0
     assert any("one-way" in w.problem for w in context.warnings)

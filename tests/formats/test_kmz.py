@@ -203,7 +203,7 @@ def test_written_kmz_is_read_by_ogr(tmp_path):
     assert "Yard" in done.stdout
 
 
-def a_picture(bands: int = 3, **more: Any) -> GeoImage:
+def make_image(bands: int = 3, **more: Any) -> GeoImage:
     pixels = np.random.default_rng(bands).integers(0, 255, (4, 6, bands), np.uint8)
     c, s = 0.5 * math.cos(0.3), 0.5 * math.sin(0.3)
     return GeoImage(pixels, **{"transform": (c, s, 10.0, s, -c, 20.0), **more})
@@ -216,7 +216,7 @@ EARTH = {"crs": "EPSG:32632", "transform": (0.5, 0.0, 356000.0, 0.0, -0.5, 55400
 @pytest.mark.parametrize("place", [{}, EARTH], ids=["local", "utm"])
 def test_images_round_trip_with_position(bands: int, place: dict[str, Any]) -> None:
     key = PartKey("imagery", "2", "plan")
-    picture = a_picture(bands, properties={"attribution": ["© Somebody"]}, **place)
+    picture = make_image(bands, properties={"attribution": ["© Somebody"]}, **place)
     context = WriteContext()
     data = write(get_format("kmz"), Layers({key: picture}, DATUM, (Level(), Level("2", 3.0))), context)["map.kmz"]
     assert context.dropped == []
@@ -229,7 +229,7 @@ def test_images_round_trip_with_position(bands: int, place: dict[str, Any]) -> N
 
 
 def test_image_overlay_corners_match_pyproj() -> None:
-    picture = a_picture(**EARTH)
+    picture = make_image(**EARTH)
     files = archives.unpack(save(Layers({PartKey("imagery", name="aerial"): picture})), Limits())
     root = etree.fromstring(files["doc.kml"])
     assert root.findtext(".//{*}Icon/{*}href") == "aerial.png"
@@ -249,7 +249,7 @@ def test_image_overlay_corners_match_pyproj() -> None:
 
 def test_images_beside_kml_require_option() -> None:
     fmt, key = get_format("kml"), PartKey("imagery", name="aerial")
-    layers = Layers({key: a_picture(**EARTH)}, DATUM)
+    layers = Layers({key: make_image(**EARTH)}, DATUM)
     bare = WriteContext()
     assert list(write(fmt, layers, bare)) == ["map.kml"]
     assert [(d.subject, d.count) for d in bare.dropped] == [("imagery", 1)]
@@ -266,11 +266,11 @@ def test_images_beside_kml_require_option() -> None:
 @pytest.mark.parametrize(
     ("picture", "datum", "reason"),
     [
-        (a_picture(), None, "there is no datum"),
-        (a_picture(crs="EPSG:4326", transform=(1.0, 0, 178.0, 0, -1.0, 5.0)), None, "not on earth"),
-        (a_picture(crs="EPSG:32601", transform=(9e4, 0, 1e5, 0, -9e4, 1e5)), None, "antimeridian"),
-        (a_picture(crs="EPSG:4326", transform=(0.1, 0, 1.0, 0, -0.1, 89.0)), None, "beyond ±85"),
-        (a_picture(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "not known"),
+        (make_image(), None, "there is no datum"),
+        (make_image(crs="EPSG:4326", transform=(1.0, 0, 178.0, 0, -1.0, 5.0)), None, "not on earth"),
+        (make_image(crs="EPSG:32601", transform=(9e4, 0, 1e5, 0, -9e4, 1e5)), None, "antimeridian"),
+        (make_image(crs="EPSG:4326", transform=(0.1, 0, 1.0, 0, -0.1, 89.0)), None, "beyond ±85"),
+        (make_image(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "not known"),
     ],
     ids=["no datum", "off earth", "antimeridian", "polar", "no such CRS"],
 )

@@ -53,7 +53,7 @@ def edges(part: Features) -> Edges:
     return {(p["source"], p["target"]) for p in part.properties if p["kind"] == "edge"}
 
 
-def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
+def reference_output(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
     """Output of metric_to_prm.generate_prm: integer pixels, an undirected graph, PyYAML's block style."""
     dice = np.random.default_rng(3)
     at = [(int(dice.integers(picture[0])), int(dice.integers(picture[1]))) for _ in range(count)]
@@ -82,7 +82,7 @@ def test_sample_matches_expected_facts() -> None:
 
 
 def test_file_of_reference_writer_round_trips() -> None:
-    data, node_rows, graph = seeds_own((200, 120), 300)
+    data, node_rows, graph = reference_output((200, 120), 300)
     assert formats.detect("prm_autogen.yaml", data) is FORMAT
     files = {
         "config/topological/prm_autogen.yaml": data,

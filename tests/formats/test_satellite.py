@@ -674,11 +674,11 @@ def bigger(data: bytes, tag: int, value: int) -> bytes:
 @pytest.mark.parametrize(("width", "height"), [(2**31 - 1, 2**31 - 1), (100_000, 100_000), (0, 3), (2**32 - 1, 1)])
 def test_false_tiff_sizes_are_refused(width: int, height: int) -> None:
     data = (SAMPLES / "orchard.tif").read_bytes()
-    lying = bigger(bigger(data, 256, width), 257, height)
+    false_size = bigger(bigger(data, 256, width), 257, height)
     tracemalloc.start()
     try:
         with pytest.raises((UnreadableFile, TooLarge)):
-            read({"a.tif": lying})
+            read({"a.tif": false_size})
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
