@@ -77,7 +77,7 @@ def test_broken_plug_ins_are_reported_and_skipped(tmp_path: Path) -> None:
     assert errors == [
         "plug-in p of x-absent 2 is not used: No module named 'no_such_module'",
         "plug-in p of x-ancient 2 is not used: it was written for interface 0; this server has interface 1",
-        "plug-in p of x-rival 2 is not used: there is a format kml already, and it stays",
+        "plug-in p of x-rival 2 is not used: format kml is already registered",
         "plug-in p of x-silent 2 is not used: it declares no FLEETMAP_INTERFACE; this server has interface 1",
         "plug-in p of x-steps 2 is not used: no such step",
     ]

@@ -1,8 +1,8 @@
-"""The registry of formats, the read boundary and its limits.
+"""Registry of formats, and the read boundary with its limits.
 
 A format is one module of this package that ends in ``register(Format(...))``; nothing else is edited. A large format
-is a package, and so is a family: it imports its formats' modules. Modules whose name starts with ``_`` are tools that
-readers share. A map is a bundle of named bytes in and out: no paths, no network.
+is a package, and so is a family: it imports its formats' modules. Modules whose name starts with ``_`` are helpers
+shared by readers. Formats convert between named bytes and layers: they use no paths and no network.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ __all__ = [  # the public interface; see docs/contributing/plug-ins.md
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
-    """The files of an upload that are one map: a main file and what belongs to it.
+    """Files of an upload that form one map: a main file and its companions.
 
-    shared_files: what belongs to other maps, and is looked into.
+    shared_files: files of other maps that the reader may read.
     """
 
     format: Format
@@ -81,18 +81,18 @@ _registry = plugins.Registry[Format](__name__, "format", "fleetmap.formats")
 
 
 def register(new: Format) -> Format:
-    """Make a format known. The last statement of its module."""
+    """Register a format. The last statement of its module."""
     _registry.add(new.name, new)
     return new
 
 
 def all_formats() -> dict[str, Format]:
-    """Every format by name, in alphabetical order."""
+    """Return every format by name, in alphabetical order."""
     return _registry.all()
 
 
 def get_format(name: str) -> Format:
-    """The format of this name; NotFound tells the known ones."""
+    """Return the format of this name. Raises NotFound, which lists the known formats."""
     formats = all_formats()
     if name not in formats:
         raise NotFound(f"there is no format {name!r}{did_you_mean(name, formats)}; known formats: {', '.join(formats)}")
@@ -100,20 +100,20 @@ def get_format(name: str) -> Format:
 
 
 def detect(name: str, data: bytes) -> Format | None:
-    """The format whose main file this is, judged by content; the highest rank wins."""
+    """Return the format whose main file this is, judged by content; the highest priority wins."""
     readable = sorted((f for f in all_formats().values() if f.read), key=lambda f: (-f.claims.priority, f.name))
     return next((f for f in readable if f.detect(name, data)), None)
 
 
 _APPLE_DOUBLE = b"\x00\x05\x16\x07"
-"""What macOS packs beside each file of an archive, under the file's name with ``._`` before it."""
+"""First bytes of AppleDouble files, which macOS adds to archives as ``._<file>``."""
 
 
 def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup], list[str]]:
-    """Sort an upload into maps: the groups, and the names that belong to none.
+    """Group an upload's files into maps; return the groups and the names that belong to none.
 
-    With a format name every file that the format accepts as main file is one; where none looks like it, the only file
-    is taken at its word, so that the reader can say what is wrong with it.
+    With a format name, every file that the format detects is a main file. If it detects none, a single file is read
+    anyway, so that the reader can report what is wrong with it.
     """
     groups, used = [], set()
     forced_format = get_format(format_name) if format_name else None
@@ -126,7 +126,7 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup]
             groups.append((fmt, name))
     if forced_format and not groups:
         if forced_format.read is None:
-            raise Invalid(f"{forced_format.name} can be served but not read")
+            raise Invalid(f"{forced_format.name} can be exported but not read")
         main = next((n for n in sorted(files) if n.lower().endswith(forced_format.extensions)), None)
         groups = [(forced_format, main or next(iter(sorted(files))))]
     groups, belong = _sort_files(files, groups)
@@ -157,7 +157,7 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup]
 def _sort_files(
     files: Files, groups: Sequence[tuple[Format, str]]
 ) -> tuple[list[tuple[Format, str]], dict[str, Iterable[str]]]:
-    """The main files that stay ones, and what belongs to those of formats that look into the files."""
+    """Select the main files that remain, with the companions of formats that inspect the files."""
     belong: dict[str, Iterable[str]] = {}
     for fmt in dict.fromkeys(fmt for fmt, _ in groups):
         if fmt.claims.sort is not None:
@@ -185,17 +185,17 @@ BAD_INPUT = (
     yaml.YAMLError,
     etree.LxmlError,
 )
-"""What readers raise on input they cannot use; anything else is a bug of ours and stays one."""
+"""Exceptions that readers raise on invalid input; any other exception is a bug and is not converted."""
 
 
 def read(item: FileGroup, context: ReadContext) -> Layers:
-    """One map's files -> layers. The read boundary: whatever is wrong with the bytes becomes a BadUpload.
+    """Read one map's files into layers; any error in the bytes becomes a BadUpload.
 
     Raises UnreadableFile (with file, line and reason), TooLarge or UnsafeArchive.
     """
     fmt = item.format
     if fmt.read is None:
-        raise Invalid(f"{fmt.name} can be served but not read")
+        raise Invalid(f"{fmt.name} can be exported but not read")
     context.main = item.main
     if context.options is None:
         context.options = fmt.read_options()
@@ -230,10 +230,10 @@ def read(item: FileGroup, context: ReadContext) -> Layers:
 
 
 def group_warnings(warnings: Sequence[Problem], limit: int) -> list[Problem]:
-    """Warnings of one file with those that repeat as one: the first of its kind, how many more, and where.
+    """Merge repeated warnings of one file: the first of its kind, the number of others, and examples.
 
-    Two are of one kind if they differ only in names and numbers. Of kinds with at most ``MAX_ALIKE_WARNINGS`` warnings
-    all stay.
+    Two warnings are of one kind if they differ only in names and numbers. Kinds with up to ``MAX_ALIKE_WARNINGS``
+    warnings are not merged.
     """
     kinds: dict[tuple[str | None, str], list[Problem]] = {}
     for one in dict.fromkeys(warnings):
@@ -253,15 +253,15 @@ def group_warnings(warnings: Sequence[Problem], limit: int) -> list[Problem]:
 
 
 MAX_ALIKE_WARNINGS = 3
-"""Warnings of one kind that a file reports one by one."""
+"""Maximum number of warnings of one kind that are reported one by one."""
 
 _VARIABLE = re.compile(r"""'[^']*'|"[^"]*"|\w+://\S+|\S*\d\S*|(?<=edge )\S+|^\S+(?= is not in the upload)""")
 
 
 def write(fmt: Format, layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """Layers -> one map's files, main file first."""
+    """Write layers as one map's files, main file first."""
     if fmt.write is None:
-        raise Invalid(f"{fmt.name} can be read but not served")
+        raise Invalid(f"{fmt.name} can be read but not exported")
     if context.options is None:
         context.options = fmt.write_options()
     layers = _straighten(fmt, layers, context)
@@ -276,7 +276,7 @@ def write(fmt: Format, layers: Layers, context: WriteContext) -> dict[str, bytes
 
 
 def _straighten(fmt: Format, layers: Layers, context: WriteContext) -> Layers:
-    """The layers with straight edges only, for formats whose consumers drive straight from node to node."""
+    """Straighten edges for formats whose consumers drive straight from node to node, and report the new nodes."""
     straight, split = straighten(fmt, layers)
     if split.nodes:
         edges = "1 edge bends" if split.edges == 1 else f"{split.edges} edges bend"
@@ -285,25 +285,27 @@ def _straighten(fmt: Format, layers: Layers, context: WriteContext) -> Layers:
 
 
 def straighten(fmt: Format, layers: Layers) -> tuple[Layers, bends.Split]:
-    """The layers as a format's consumers drive them: networks with straight edges only where shapes do not count."""
+    """Split edges at bends if the format's consumers ignore shapes; otherwise return the layers unchanged."""
     if fmt.traits.keeps_bends == "shape":
         return layers, bends.Split()
     return bends.split(layers, fmt.name if fmt.traits.keeps_bends == "foreign" else None)
 
 
 MAX_FINDINGS = 50
-"""Findings of each level that a check tells one by one; of further ones it tells the number."""
+"""Maximum number of findings per level that a check lists; further ones are counted."""
 
 JUST_WRITTEN: ContextVar[bool] = ContextVar("SERVED", default=False)
-"""Whether what is checked was just written here, so that of a large text a look at its head must do."""
+"""Whether the checked map was just written by this server; then only the start of a large text is checked."""
 
 
 def check(fmt: Format, files: Files) -> list[Problem]:
-    """What the consumers of a map would refuse (level ``error``) or may not like (``warning``), errors first.
+    """Check a map against its consumers' loader rules; return errors first, then warnings.
 
-    files: the map's, main file first. This runs on each map that is served, where it may cost a few milliseconds
-    (``_rules.is_brief``). A format's ``check`` yields problems from its loader's rules and raises what is natural where
-    the files do not parse at all, which is an error too.
+    An ``error`` means that a consumer rejects the map, a ``warning`` that it may misinterpret it.
+
+    files: the map's files, main file first. This runs on each exported map, where it may take a few milliseconds
+    (``_rules.is_brief``). A format's ``check`` yields problems from its loader's rules and may raise parse errors,
+    which are reported as errors too.
     """
     if fmt.check is None or not files:
         return []
@@ -338,11 +340,14 @@ def _findings(fmt: Format, files: Files, main: str) -> Iterator[Problem]:
         yield from [replace(p, level="error") for p in error.problems] or [Problem(error.detail, main, level="error")]
     except BAD_INPUT as error:
         line, reason = describe_parse_error(error)
-        yield Problem(f"it cannot be read as {fmt.title}: {reason}", main, line, level="error")
+        yield Problem(f"cannot be read as {fmt.title}: {reason}", main, line, level="error")
 
 
 def _merge_findings(warnings: Sequence[Problem], findings: Iterable[Problem]) -> list[Problem]:
-    """A writer's warnings and a check's findings; of two about one place the writer's own words stay, at its level."""
+    """Merge a writer's warnings with a check's findings.
+
+    Of two about one location the writer's text is kept, at its level.
+    """
     places: dict[tuple[str | None, str | None], int] = {(p.file, p.where): k for k, p in enumerate(warnings) if p.where}
     texts = {p.problem for p in warnings}
     out = list(warnings)
@@ -357,8 +362,10 @@ def _merge_findings(warnings: Sequence[Problem], findings: Iterable[Problem]) ->
 
 @contextlib.contextmanager
 def _gc_paused() -> Iterator[None]:
-    """No search for reference cycles meanwhile: readers build many values that stay, which it walks again and again
-    (a quarter of the time of a large file)."""
+    """Pause garbage collection: it would repeatedly scan the many values that readers build.
+
+    That took a quarter of the time of a large file.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -369,12 +376,12 @@ def _gc_paused() -> Iterator[None]:
 
 
 def write_options(fmt: Format, values: Mapping[str, str]) -> Any:
-    """The format's write options from texts; Invalid says which are accepted."""
+    """Parse the format's write options from texts. Raises Invalid, which lists the accepted ones."""
     return parameters.parse(fmt.write_options, values, f"parameter of {fmt.name}")
 
 
 def read_options(fmt: Format, values: Mapping[str, str]) -> Any:
-    """The format's read options from texts; Invalid says which are accepted."""
+    """Parse the format's read options from texts. Raises Invalid, which lists the accepted ones."""
     return parameters.parse(fmt.read_options, values, f"option of {fmt.name}")
 
 
@@ -387,7 +394,7 @@ def _problem_of(error: FleetMapError, item: FileGroup) -> Problem:
 
 
 def describe_parse_error(error: BaseException) -> tuple[int | None, str]:
-    """Line (from 1, where the parser told one) and a reason that a user understands."""
+    """Return the line (from 1, None if the parser reports none) and a readable reason."""
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark
         return (mark.line + 1 if mark else None), " ".join(filter(None, [error.context, error.problem])) or "not YAML"

@@ -1,4 +1,4 @@
-"""What the readers of a datum.yaml want: the environment_template's tools, mapviz and robot_localization.
+"""Consumer checks for datum.yaml: the environment_template's tools, mapviz and robot_localization.
 
 Sources: LCAS/environment_common (templating/datum.py and its converters: they look up datum_latitude, datum_longitude,
 gnss_fence.gnss_fence_coords, gmapping), navsat_transform.cpp (``datum``: three decimals), rcl_yaml_param_parser (values
@@ -21,11 +21,11 @@ SAME_DEGREES = 1e-9
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A site's datum as its readers look it up."""
+    """Check a site's datum by its readers' rules."""
     main = next(iter(files))
     top = yaml.load(files[main], LIMITS)
     if not isinstance(top, dict):
-        yield error_finding("a datum is a mapping", main)
+        yield error_finding("a datum must be a mapping", main)
         return
     position: dict[str, Any] = {}
     for key, bound in (("datum_latitude", 90.0), ("datum_longitude", 180.0)):
@@ -35,17 +35,22 @@ def check(files: Files) -> Iterator[Problem]:
         else:
             position[key] = value
     if abs(position.get("datum_latitude", 0.0)) > MAX_DATUM_LATITUDE:
-        reason = f"beyond ±{MAX_DATUM_LATITUDE:g} degrees no local frame is exact: this server refuses such a datum"
+        reason = (
+            f"latitude must be within ±{MAX_DATUM_LATITUDE:g} degrees: no local frame is exact beyond it, and this "
+            "server rejects such a datum"
+        )
         yield error_finding(reason, main, where="datum_latitude")
     fence = top.get("gnss_fence")
     corners = fence.get("gnss_fence_coords") if isinstance(fence, dict) else None
-    if corners is None or corners == []:  # as the writer leaves it where there is no fence
-        yield warning_finding("the environment_template's tools draw the map from the fence", main, where="gnss_fence")
+    if corners is None or corners == []:  # the writer's output without a fence
+        yield warning_finding(
+            "the fence is empty: the environment_template's tools draw the map from it", main, where="gnss_fence"
+        )
     elif not isinstance(corners, list) or len(corners) < 3 or not all(numbers(c, 2, 3) for c in corners):
-        reason = "must be a list of three corners [latitude, longitude] or more"
+        reason = "must be a list of at least three corners [latitude, longitude]"
         yield error_finding(reason, main, where="gnss_fence.gnss_fence_coords")
     elif any(abs(c[0]) > 90.0 or abs(c[1]) > 180.0 for c in corners):
-        reason = "a corner is no [latitude, longitude] in degrees"
+        reason = "each corner must be [latitude, longitude] in degrees"
         yield error_finding(reason, main, where="gnss_fence.gnss_fence_coords")
     size = top.get("gmapping")
     if size is not None and not (isinstance(size, dict) and all(is_number(size.get(w)) for w in SIZES)):
@@ -60,14 +65,18 @@ def _navsat(parameters: Any, position: dict[str, Any], main: str) -> Iterator[Pr
     datum = parameters.get("datum") if isinstance(parameters, dict) else None
     if datum is None:
         if isinstance(parameters, dict) and parameters.get("wait_for_datum"):
-            yield warning_finding("robot_localization waits for a datum that is not there", main, where=location)
+            yield warning_finding(
+                "wait_for_datum is set but there is no datum; robot_localization waits for one", main, where=location
+            )
         return
     if not numbers(datum, 3, 3):
         yield error_finding(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=location)
         return
     if len({type(v) for v in datum}) > 1:
         yield warning_finding(
-            f"ROS 2 wants values of one type in a list: write 0.0 for 0 in {shown(datum)}", main, where=location
+            f"mixed types in {shown(datum)}: ROS 2 requires one type per list, write 0.0 instead of 0",
+            main,
+            where=location,
         )
     for value, key in zip(datum, ("datum_latitude", "datum_longitude"), strict=False):
         if key in position and abs(value - position[key]) > SAME_DEGREES:

@@ -1,8 +1,8 @@
-"""The values that a YAML or JSON file may hold: declared once for each format, checked in one walk.
+"""Declared shapes of the values in YAML and JSON files, checked in one walk per file.
 
 A shape is ``ANY``, a rule for a value, a list with the shape of each item, or a ``Record``: keys with their shapes.
-Values out of range are refused with their place. Unknown keys, and values that hardly mean what they say, are
-reported by name: one warning for all of a kind. Absent keys and nulls are the reader's business.
+Values out of range are rejected with their location. Unknown keys and doubtful values are warned about: one warning
+per kind. Absent keys and nulls are left to the reader.
 """
 
 from __future__ import annotations
@@ -20,19 +20,18 @@ from app.syntax import yaml
 
 MAX_FINDINGS = 1000
 MAX_NAMES_SHOWN = 6
-"""Names that one warning lists."""
+"""Maximum number of names in one warning."""
 
 ANY: Final = None
-"""The shape of what is not checked."""
+"""Shape of unchecked values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A finite number from ``low`` to ``high``, also one in quotes; outside of ``usual`` it is doubtful.
+    """Rule for a finite number from ``low`` to ``high``, possibly in quotes; doubtful outside of ``usual``.
 
-    above: the number must be larger than ``low``. hint: what a doubtful number may mean instead. or_other: values of
-    other types are the reader's business. doubtful: nothing is refused, what would be is doubtful (keys that users may
-    have given a meaning of their own).
+    above: the number must be larger than ``low``. hint: likely explanation of a doubtful number. or_other: values of
+    other types are not checked. doubtful: report errors as doubts (for keys that users may have given another meaning).
     """
 
     low: float = -MAX_METRES
@@ -45,7 +44,7 @@ class Number:
     doubtful: bool = False
 
     def check(self, value: Any) -> tuple[str, str]:
-        """Return why the value is refused, and why it is doubtful; empty texts if it is not."""
+        """Return (error, doubt); empty texts if there is none."""
         refusal, doubt = self._check(value)
         return ("", refusal or doubt) if self.doubtful else (refusal, doubt)
 
@@ -66,26 +65,26 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """One of a closed set of texts (or truth values); others are doubtful."""
+    """Rule for one of a closed set of texts or booleans; others are doubtful."""
 
     allowed: tuple[Any, ...]
 
     def check(self, value: Any) -> tuple[str, str]:
-        """Return why the value is doubtful."""
+        """Return (error, doubt); the error is always empty."""
         if any(value == literal and type(value) is type(literal) for literal in self.allowed):
             return "", ""
-        return "", f"unknown value {_shorten(value)}: it is one of {', '.join(map(str, self.allowed))}"
+        return "", f"unknown value {_shorten(value)}: must be one of {', '.join(map(str, self.allowed))}"
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A text that is no code: words, their combinations by and, or, not, and comparisons."""
+    """Rule for a text that is not code: words combined with and, or, not, and comparisons."""
 
     def check(self, value: Any) -> tuple[str, str]:
-        """Return why the value is doubtful."""
+        """Return (error, doubt); the error is always empty."""
         if not isinstance(value, str) or (_CONDITION.fullmatch(value) and not _CALL.search(value)):
             return "", ""
-        return "", f"{_shorten(value)} is no condition of words: a planner that evaluates it runs it as code"
+        return "", f"{_shorten(value)} is not a condition of words; a planner that evaluates it runs it as code"
 
 
 _CONDITION = re.compile(r"[\w\s&|~!()=<>'\",.:/+*-]*")
@@ -94,30 +93,31 @@ _CALL = re.compile(r"(?!\b(?:and|or|not|in)\s*\()[\w\])'\"]\s*\(|__|\blambda\b|\
 
 @dataclass(frozen=True, slots=True)
 class Quaternion:
-    """A mapping x, y, z, w of length 1; others are doubtful (old files leave them all 0)."""
+    """Rule for a mapping x, y, z, w of length 1; other lengths are doubtful (old files leave all at 0)."""
 
     def check(self, value: Any) -> tuple[str, str]:
-        """Return why the value is refused, and why it is doubtful."""
+        """Return (error, doubt); empty texts if there is none."""
         parts = [_number(value.get(axis, 0.0)) for axis in "xyzw"] if isinstance(value, dict) else [None]
         numbers = [part for part in parts if part is not None]
         if len(numbers) < 4:
             return f"must be a mapping of numbers x, y, z, w, is {_shorten(value)}", ""
         length = math.hypot(*numbers)
-        return "", "" if abs(length - 1.0) < 0.01 else f"a quaternion of length {length:g}: it must be 1"
+        return "", "" if abs(length - 1.0) < 0.01 else f"quaternion of length {length:g}: must be 1"
 
 
 @dataclass(frozen=True, slots=True)
 class Typed:
-    """Open-RMF's parameters: [type, value], with the shape of the value."""
+    """Open-RMF parameter: [type, value], with the shape of the value."""
 
     shape: Any
 
 
 @dataclass(frozen=True)
 class Record:
-    """A mapping. each: the shape of keys that are not listed, names of the user's own; without it they are unknown.
+    """Mapping with a shape for each key.
 
-    open: keys that are not listed may be anything. loose: so may values that are no mapping.
+    each: shape of unlisted keys, if users may choose names; otherwise unlisted keys are unknown. open: unlisted keys
+    may have any value. loose: values of other types are accepted instead of a mapping.
     """
 
     keys: Mapping[str, Any]
@@ -128,12 +128,12 @@ class Record:
     rules: tuple[tuple[str, Any], ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "known", frozenset(self.keys))
+        object.__setattr__(self, "names", frozenset(self.keys))
         object.__setattr__(self, "rules", tuple((k, s) for k, s in self.keys.items() if s is not ANY))
 
 
 def record(names: str = "", each: Any = ANY, *, is_open: bool = False, is_loose: bool = False, **keys: Any) -> Record:
-    """Build a mapping's shape. names: keys whose values are not checked, separated by blanks."""
+    """Build a mapping's shape. names: keys with unchecked values, separated by spaces."""
     return Record({**dict.fromkeys(names.split()), **keys}, each, is_open, is_loose)
 
 
@@ -141,11 +141,11 @@ LATITUDE = Number(-90.0, 90.0, unit="degrees")
 LONGITUDE = Number(-180.0, 180.0, unit="degrees")
 COORDINATE = Number(unit="metres")
 LENGTH = Number(0.0, MAX_METRES, above=True, unit="metres")
-WIDTH = Number(0.0, MAX_METRES, usual=(1e-6, MAX_METRES), hint="there is no room in it", unit="metres")
+WIDTH = Number(0.0, MAX_METRES, usual=(1e-6, MAX_METRES), hint="should be above 0", unit="metres")
 NOT_NEGATIVE = Number(0.0, MAX_METRES)
 SPEED = Number(0.0, 1000.0, usual=(0.0, 50.0), hint="is it in metres per second?", unit="m/s")
 MAX_USUAL_ANGLE = 6.3
-"""Radians: a full turn. What is beyond it may be degrees."""
+"""Largest usual angle, in radians: a full turn. Larger values may be degrees."""
 
 ANGLE = Number(-1e4, 1e4, usual=(-MAX_USUAL_ANGLE, MAX_USUAL_ANGLE), hint="is it in radians?", unit="rad")
 POINT = record(x=COORDINATE, y=COORDINATE, z=COORDINATE)
@@ -155,7 +155,7 @@ Path = tuple[Any, ...]
 
 
 def check(value: Any, shape: Any, context: ReadContext, file: str | None = None) -> None:
-    """Check a file's value against its shape; see the module. file: default: the main file.
+    """Check a file's value against its shape. file: default: the main file.
 
     Raises UnreadableFile for the first value that is out of range.
     """
@@ -165,7 +165,7 @@ def check(value: Any, shape: Any, context: ReadContext, file: str | None = None)
 
 
 class _Findings:
-    """What is reported after the walk: places by reason."""
+    """Findings of a walk: locations by reason."""
 
     def __init__(self, file: str | None) -> None:
         self.file = file
@@ -207,23 +207,23 @@ def _walk(value: Any, shape: Any, path: Path, findings: _Findings) -> None:
         if not isinstance(value, dict):
             if shape.loose:
                 return
-            findings.add_doubt(path, f"{_shorten(value)} is no mapping")
+            findings.add_doubt(path, f"{_shorten(value)} is not a mapping")
             return
-        if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.known:
-            findings.add_unknown(path, frozenset(value.keys() - shape.known))
+        if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.names:
+            findings.add_unknown(path, frozenset(value.keys() - shape.names))
         for key, rule in shape.rules:
             if (inner := value.get(key)) is not None:
                 _walk(inner, rule, (key, path), findings)
         if shape.each is not ANY:
-            for key in value.keys() - shape.known:
+            for key in value.keys() - shape.names:
                 _walk(value[key], shape.each, (key, path), findings)
     elif kind is list:
         if not isinstance(value, list):
-            findings.add_doubt(path, f"{_shorten(value)} is no list")
+            findings.add_doubt(path, f"{_shorten(value)} is not a list")
             return
         for k, item in enumerate(value):
             _walk(item, shape[0], (k, path), findings)
-    elif kind is tuple:  # a row: a shape for each place
+    elif kind is tuple:  # one shape per item
         for k, (item, rule) in enumerate(zip(value, shape, strict=False) if isinstance(value, list) else ()):
             _walk(item, rule, (k, path), findings)
     elif kind is Typed:

@@ -1,4 +1,7 @@
-"""What a format declares, and what its reader and writer are given. Public as names of ``app.formats``."""
+"""Types that a format declares, and the contexts of its reader and writer.
+
+Public as names of ``app.formats``.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,22 @@ Files = Mapping[str, bytes]
 
 @dataclass(slots=True)
 class ReadContext(Warnings):
-    """What a reader is told, and where it leaves its warnings.
+    """Input of a reader, and the place for its warnings.
 
-    frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
-    layer: what the lines and polygons of a drawing are meant for, else None. options: the format's own read options.
-    requested_layers: the layers that will be used (None: all); a reader may leave others out. decode_cells: whether
-        anybody will look at
-    the cells of grids; if not, a reader checks an image's header only. keep_source_properties: whether anybody will ask
-    for this format
-    (or its family) back; if not, a reader may leave out what only it knows (``properties.<format>``, the document).
-    main: the file that was detected. folder: reads files that hold other formats' maps, as a folder of an upload is
-    read, for the formats that are such folders in one file; None inside one.
+    Attributes:
+        limits: limits for the upload.
+        frame: the environment's local frame; None without a datum.
+        level: level that the map belongs to.
+        grid: name for a grid, else None.
+        layer: layer that the lines and polygons of a drawing are meant for, else None.
+        options: the format's own read options.
+        requested_layers: layers that will be used (None: all); a reader may skip the others.
+        decode_cells: whether the cells of grids will be used; if not, a reader checks only an image's header.
+        keep_source_properties: whether the map may be exported in this format or its family again; if not, a reader may
+            skip format-specific data (``properties.<format>``, the document).
+        main: the file that was detected.
+        folder: reads files that contain maps of other formats as an upload of a folder is read, for formats that are
+            such a folder in one file; None inside such a folder.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -44,13 +52,13 @@ class ReadContext(Warnings):
     folder: Callable[[Files], Layers] | None = None
 
     def wants(self, layer: Layer) -> bool:
-        """Whether anybody will use this layer."""
+        """Whether this layer will be used."""
         return self.requested_layers is None or layer in self.requested_layers
 
 
 @dataclass(frozen=True, slots=True)
 class NestedMap:
-    """A map inside another one: its files, main file first, and what its writer declared (see ``WriteContext``)."""
+    """A map inside another one: its files, main file first, and its writer's report (see ``WriteContext``)."""
 
     files: dict[str, bytes]
     dropped: tuple[Dropped, ...] = ()
@@ -59,18 +67,21 @@ class NestedMap:
 
 
 UNTITLED = "map"
-"""What a map is called that is made for no environment."""
+"""Title of a map that is written for no environment."""
 
 
 @dataclass(slots=True)
 class WriteContext(Notes):
-    """What a writer is told, and where it declares what it lost or made up (loss is data).
+    """Input of a writer, and the place to declare lost and filled-in data (all loss must be declared).
 
-    title: the environment's name, for formats with a place for one. options: the format's own write options.
-    attribution: licences and credits of the sources, for formats with a place for them. make: for formats that hold
-    others: a map of the named format from these layers, with these of its options, its missing layers derived or not;
-    it raises NotFound for a format that is not there, and what planning and writing raise. stored: the
-    licences and credits of each part, where the layers are what is stored; None where a closure has changed them.
+    Attributes:
+        title: the environment's name, for formats that can contain one.
+        options: the format's own write options.
+        attribution: licences and credits of the sources, for formats that can contain them.
+        make: for formats that contain maps of other formats: convert these layers to the named format with these
+            options; the last argument says whether to derive missing layers. Raises NotFound for an unknown format,
+            and every error of planning and writing.
+        stored: licences and credits of each part if the layers are the stored ones; None if a closure has changed them.
     """
 
     title: str = UNTITLED
@@ -82,14 +93,15 @@ class WriteContext(Notes):
 
 @dataclass(frozen=True, slots=True)
 class LayerRequirements:
-    """What a writer needs: one of these sets of layers, and a datum or not.
+    """Requirements of a writer: one of several sets of layers, and optionally a datum.
 
-    one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
-    anchor: the coordinates the format speaks, so that items anchored otherwise need a datum. datum: needed always.
-    also: layers of which the writer uses a part where they are there, and does without where they are not.
-    accepts_family: objects of the format's own family are a whole map: with them nothing else is needed, no datum
-    either.
-    missing_content: what such layers must hold besides being there (an edge), and do not: what to supply, or None.
+    Attributes:
+        one_of: alternatives; the first complete one is enough. Every layer of ``Format.layers`` that exists is written.
+        anchor: anchor of the format's coordinates; items with the other anchor need a datum.
+        datum: a datum is always needed.
+        also: optional layers of which the writer uses a part.
+        accepts_family: objects of the format's own family are a complete map: nothing else is needed, not even a datum.
+        missing_content: returns what to supply if these layers lack required content (such as an edge), else None.
     """
 
     one_of: tuple[frozenset[Layer], ...]
@@ -102,16 +114,21 @@ class LayerRequirements:
 
 @dataclass(frozen=True, slots=True)
 class NoOptions:
-    """For formats without options of their own."""
+    """Options of formats without options of their own."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """For formats whose files hold one part of a layer each: the write options that select the part.
+    """Write options that select a part, for formats whose files contain one part of a layer each.
 
-    name: the option with the part's name. stem: a part's name -> that of its files, without the ending. level: the
-    option with its level. default: the name of the part that is written where no name is given. So ``*`` for either
-    option gives every part (``app.convert.site``).
+    Attributes:
+        layer: layer of the part.
+        name: option with the part's name.
+        stem: converts a part's name to the stem of its files.
+        level: option with the part's level.
+        default: name of the part that is written by default.
+
+    The value ``*`` for either option selects every part (``app.convert.site``).
     """
 
     layer: Layer
@@ -123,10 +140,12 @@ class Parts:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which of the stored parts a map holds, for formats that do not take all they carry.
+    """Selection of stored parts, for formats that do not write all parts of their layers.
 
-    choose: of the parts, those that these write options ask for. from_filename: the options that a wanted file's name
-    says. parts: the options that select the part, where a file holds one.
+    Attributes:
+        choose: returns those of the parts that these write options select.
+        from_filename: options that follow from the name of a requested file.
+        parts: options that select the part, for formats that contain one part per file.
     """
 
     choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
@@ -136,17 +155,18 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class Claims:
-    """How a format claims files of an upload, where its name and content alone do not decide.
+    """Rules by which a format claims files of an upload if name and content alone do not decide.
 
-    priority: the higher one is asked first, and believed where two files tell the same network.
-    companions: (main file, its content, all names) -> further files that belong to it.
-    related_files: (main file, all names) -> files of other maps that it looks into.
-    sort: (files, its main files) -> the main files that are maps, each with all that belongs to it.
-    is_sidecar: a main file of this name only speaks for others (a world file), and yields to one of them.
-    missing_metadata: what a file lacks to be such a map by itself (a picture without a place); else empty.
-    completing_options: the read options that supply it.
-    leads_folder: folder of an environment_template where its file is believed and drawings give way.
-    gives_way: whether it gives way there as a drawing does.
+    Attributes:
+        priority: formats with higher priority detect first, and win if two files describe the same network.
+        companions: (main file, its content, all names) -> further files that belong to it.
+        related_files: (main file, all names) -> files of other maps that it reads.
+        sort: (files, its main files) -> the main files that are maps, each with all files that belong to it.
+        is_sidecar: whether a main file of this name only describes another one (a world file) and yields to it.
+        missing_metadata: what a file lacks to be such a map by itself (an image without a position); else empty.
+        completing_options: read options that supply it.
+        leads_folder: folder of an environment_template in which its file takes precedence over drawings.
+        gives_way: whether it yields there as a drawing does.
     """
 
     priority: int = 0
@@ -161,7 +181,7 @@ class Claims:
 
 
 def one_map_per_folder(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
-    """``Claims.sort`` of formats whose main files of one folder are one map (graphs ``0.yaml``, ``1.yaml`` …)."""
+    """Group main files of one folder into one map (graphs ``0.yaml``, ``1.yaml`` …), as ``Claims.sort``."""
     del files
     folders: dict[str, list[str]] = {}
     for main in mains:
@@ -170,24 +190,28 @@ def one_map_per_folder(files: Files, mains: Sequence[str]) -> dict[str, list[str
 
 
 Bends = Literal["shape", "nodes", "foreign"]
-"""What becomes of an edge's bends: the format has shapes; or its edges are straight, so that bends become nodes
-(``app.model.bends``), which become bends again when it is read; or it has shapes that its consumers ignore, so that
-bends of edges from elsewhere become nodes, and stay ones."""
+"""Treatment of an edge's bends.
+
+``shape``: the format has shapes. ``nodes``: its edges are straight; bends become nodes (``app.model.bends``) and become
+bends again on reading. ``foreign``: its consumers ignore shapes; bends of edges from other formats become nodes
+permanently.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """Facts of a format by which it differs from most.
+    """Traits of a format that differ from the default.
 
-    family: the format with which it shares objects and their properties; its own name where it is not given.
-    is_drawing: its lines and polygons may be meant for any layer (the upload's ``layer`` says which).
-    is_container: it is a folder of other formats' maps.
-    own_ids: its ids are the world's, not the file's: another id is another thing.
-    own_network: its topology has all its paths, so none is made of its objects.
-    outlines: it writes where grids lie, not their cells.
-    marks_blocked: it can express a blocked edge, so that such an edge stays in it; other formats leave it out.
-    keeps_bends: see ``Bends``.
-    has_title: it names the environment (``WriteContext.title``), so its bytes depend on that name.
+    Attributes:
+        family: format with which it shares objects and their properties; default: the format's own name.
+        is_drawing: its lines and polygons may be meant for any layer (the upload's ``layer`` decides).
+        is_container: it is a folder of maps of other formats.
+        own_ids: its ids are global, not local to the file: another id is another thing.
+        own_network: its topology contains all its paths, so none is derived from its objects.
+        outlines: it writes the positions of grids, not their cells.
+        marks_blocked: it can express a blocked edge; other formats omit such an edge.
+        keeps_bends: see ``Bends``.
+        has_title: it contains the environment's name (``WriteContext.title``), so its bytes depend on that name.
     """
 
     family: str | None = None
@@ -203,18 +227,21 @@ class Traits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Format:
-    """A file format. Only what is declared here is known of it elsewhere.
+    """A file format. Other packages rely only on these declarations.
 
-    name: its id. title: its name for people.
-    files: the names it is served as, main file first, each with its media type.
-    layers: layers it can hold.
-    detect: is this file (name, content) the main file of such a map? Called for every file of every upload.
-    read, write: between files and layers; None where it cannot be read or served.
-    check: the loader rules of the map's consumers (see ``app.formats.check``).
-    needs: what writing takes.
-    read_options, write_options: dataclasses of ``app.parameters.parameter`` fields.
-    extensions: endings of main files. version: raise it when the same layers give other bytes (it is in every ETag).
-    selection, claims, traits: for formats that differ from most.
+    Attributes:
+        name: id.
+        title: display name.
+        files: names of the files of an exported map, main file first, each with its media type.
+        layers: layers that it can contain.
+        detect: whether a file (name, content) is the main file of such a map; called for every file of every upload.
+        read, write: convert files to layers and back; None if not supported.
+        check: loader rules of the map's consumers (see ``app.formats.check``).
+        needs: requirements of the writer.
+        read_options, write_options: dataclasses of ``app.parameters.parameter`` fields.
+        extensions: extensions of main files.
+        version: increase it when the same layers give other bytes (it is part of every ETag).
+        selection, claims, traits: for formats that differ from the default.
     """
 
     name: str
@@ -236,5 +263,5 @@ class Format:
 
     @property
     def family(self) -> str:
-        """The format whose objects and properties are its own, too: itself, unless several formats share them."""
+        """Format whose objects and properties it shares: itself by default."""
         return self.traits.family or self.name

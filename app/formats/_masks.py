@@ -1,4 +1,4 @@
-"""The parameter files of costmap filter masks beside their grids: see ``app.model.masks``."""
+"""Parameter files of costmap filter masks beside their grids: see ``app.model.masks``."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _BY_NAME = (
     (re.compile(r"keep_?out|no_?go|preferred", re.IGNORECASE), FilterInfo(KEEPOUT, 0.0, 1.0)),
     (re.compile(r"speed", re.IGNORECASE), FilterInfo(SPEED_PERCENT, 100.0, -1.0)),
 )
-"""What a mask means that does not say so: by its name, and as Nav2's own examples have it."""
+"""Default filter info of masks without parameters: by name pattern, with the values of Nav2's examples."""
 
 
 def companions(main: str, names: Sequence[str]) -> list[str]:
-    """The parameter files of a mask: ``<mask>_filter_info.yaml``, ``<mask>_params.yaml``, also without ``_mask``."""
+    """Return a mask's parameter files: ``<mask>_filter_info.yaml``, ``<mask>_params.yaml``, also without ``_mask``."""
     folder, _, base = main.rpartition("/")
     stem = base.rpartition(".")[0]
     stems = dict.fromkeys([stem, stem.removesuffix("_mask")])
@@ -33,9 +33,9 @@ def companions(main: str, names: Sequence[str]) -> list[str]:
 
 
 def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
-    """The properties of a grid that a parameter file gives it; empty, with a warning, where it says nothing of masks.
+    """Read a grid's properties from a parameter file; empty, with a warning, if it has no mask parameters.
 
-    Raises UnreadableFile where the parameters are of the wrong type.
+    Raises UnreadableFile if a parameter has the wrong type.
     """
     try:
         document = yaml.load(data, context.limits)
@@ -46,10 +46,12 @@ def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
         ) from error
     servers = list(masks.servers(document))
     if not servers:
-        context.warn(f"it has no parameters of a {masks.NODE}: it is kept as a source only", file=file)
+        context.warn(f"the file has no parameters of a {masks.NODE}; it is stored as a source only", file=file)
         return {}
     if len(servers) > 1:
-        context.warn(f"it has parameters of {len(servers)} filter info servers: the first one counts", file=file)
+        context.warn(
+            f"the file has parameters of {len(servers)} filter info servers; only the first one is used", file=file
+        )
     faults = list(_invalid_keys(servers[0]))
     if faults:
         places = [Problem(reason, file, where=location) for location, reason in faults]
@@ -58,25 +60,25 @@ def read(file: str, data: bytes, context: ReadContext) -> dict[str, Any]:
 
 
 def _invalid_keys(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """(key, what is wrong with it)."""
+    """Yield (key, error) for each invalid parameter."""
     kind = parameters.get("type", KEEPOUT)
     if isinstance(kind, bool) or not isinstance(kind, int) or kind not in masks.TYPES:
-        yield "type", f"type must be a whole number from 0 to {masks.TYPES[-1]}, got {str(kind)[:40]!r}"
+        yield "type", f"type must be an integer from 0 to {masks.TYPES[-1]}, got {str(kind)[:40]!r}"
     for key in ("base", "multiplier"):
         value = parameters.get(key, 0.0)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             yield key, f"{key} must be a number, got {str(value)[:40]!r}"
     for key in ("mask_topic", "filter_info_topic"):
         if not isinstance(parameters.get(key, ""), str):
-            yield key, f"{key} must be a text, got {str(parameters[key])[:40]!r}"
+            yield key, f"{key} must be a string, got {str(parameters[key])[:40]!r}"
 
 
 def _kept_parameters(grid: OccupancyGrid) -> dict[str, Any] | None:
-    """The parameter file that a grid keeps, with base and multiplier as floats (ROS refuses whole numbers there)."""
+    """Return the parameter file that a grid stores, with base and multiplier as floats (ROS rejects integers there)."""
     source_properties = grid.properties.get(masks.NAME)
     document = source_properties.get("params") if isinstance(source_properties, Mapping) else None
     server = next(masks.servers(document), None)
-    if server is None or list(_invalid_keys(server)):  # whoever edited it meant something else
+    if server is None or list(_invalid_keys(server)):  # not valid after an edit: use the defaults
         return None
     normalised: dict[str, Any] = _to_floats(document, 0)
     return normalised
@@ -97,7 +99,7 @@ def _to_floats(value: Any, depth: int) -> Any:
 
 
 def write(grid: OccupancyGrid, stem: str, context: WriteContext) -> dict[str, bytes]:
-    """``<grid>_filter_info.yaml`` of a mask; nothing of a grid that is none. stem: of the grid's files."""
+    """Write ``<grid>_filter_info.yaml`` for a mask; nothing for other grids. stem: of the grid's files."""
     file = f"{stem}{SUFFIX}.yaml"
     document = _kept_parameters(grid)
     if document is None:
@@ -105,9 +107,9 @@ def write(grid: OccupancyGrid, stem: str, context: WriteContext) -> dict[str, by
         if info is None:
             return {}
         document = masks.params(stem, info)
-        why = "no source says them: those of Nav2's examples"
+        why = "not in any source: values of Nav2's examples"
         context.fill("filter info: type, base, multiplier", info.as_dict(), why)
     kind = next(masks.servers(document)).get("type", KEEPOUT)
     if kind in (SPEED_PERCENT, SPEED_METRES) and bool((grid.cells == UNKNOWN).any()):
-        context.warn("a speed mask with unknown cells: Nav2 takes them for errors", file=f"{stem}.yaml")
+        context.warn("the speed mask has unknown cells; Nav2 treats them as errors", file=f"{stem}.yaml")
     return {file: yaml.mapping(document, 0).encode()}

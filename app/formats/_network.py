@@ -1,4 +1,4 @@
-"""What formats of networks share: names as ids, poses of nodes, and all networks of an environment as one.
+"""Shared code of network formats: names as ids, poses of nodes, and merging the networks of an environment.
 
 Nodes are points and edges directed lines between them (see ``app.model.features``); metres in the local frame.
 """
@@ -27,24 +27,24 @@ MAX_NAME = 256
 MAX_ID_CHARACTERS = 480
 
 SAME_ANGLE = 1e-9
-"""Radians: a quaternion made from an angle gives it back this exactly."""
+"""Angle tolerance in radians, within which a quaternion built from an angle returns it."""
 
 CROSS_PART_PROPERTIES = frozenset({"drawn_from"})
-"""Canonical properties that speak of other parts of the environment, not of the item."""
+"""Canonical properties that refer to other parts of the environment, not to the item."""
 
 
 def raise_unreadable(reason: str, location: str) -> NoReturn:
-    """UnreadableFile for what stands at this key."""
+    """Raise UnreadableFile for the value at this location."""
     raise UnreadableFile(f"{location}: {reason}", [Problem(reason, where=location)])
 
 
 def is_name(name: str) -> bool:
-    """Whether a text can stand in one line of any format."""
+    """Whether a text can be written in one line of any format."""
     return 0 < len(name) <= MAX_NAME and is_writable(name)
 
 
 def check_name(name: str, location: str) -> str:
-    """The name, refused where it is none."""
+    """Return the name. Raises UnreadableFile if it is invalid."""
     if not is_name(name):
         raise_unreadable(
             f"a name must have 1 to {MAX_NAME} characters and no control characters, got {name[:60]!r}", location
@@ -53,14 +53,14 @@ def check_name(name: str, location: str) -> str:
 
 
 def identifier(name: str) -> str:
-    """The name as an id, or where it is too long for one its beginning and a hash of all of it."""
+    """Return the name as an id; a name that is too long becomes its beginning and a hash."""
     if len(name) <= MAX_ID_CHARACTERS:
         return name
     return f"{name[: MAX_ID_CHARACTERS - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
 def number(value: Any, location: str) -> float:
-    """A finite number; refused are texts, booleans and what is too large for a float."""
+    """Return a finite number. Raises UnreadableFile for texts, booleans and numbers that a float cannot represent."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise_unreadable(f"{str(value)[:60]!r} is not a number", location)
     if not math.isfinite(value):
@@ -69,17 +69,17 @@ def number(value: Any, location: str) -> float:
 
 
 def shorten_list(names: Sequence[Any]) -> str:
-    """The first of the names, for a message."""
+    """Format the first few names for a message."""
     return ", ".join(map(str, names[:5])) + (" …" if len(names) > 5 else "")
 
 
 def natural_sort_key(name: str) -> tuple[int, str]:
-    """Sorts WayPoint9 before WayPoint10."""
+    """Return a key that sorts WayPoint9 before WayPoint10."""
     return len(name), name
 
 
 def node_points(xyz: Array) -> NDArray[np.object_]:
-    """Points from [n, 3], two-dimensional where z is 0."""
+    """Build points from float64 [n, 3]; points with z = 0 become two-dimensional."""
     out = np.asarray(shapely.points(xyz[:, :2]), object).reshape(len(xyz))
     high = xyz[:, 2] != 0
     if high.any():
@@ -90,7 +90,7 @@ def node_points(xyz: Array) -> NDArray[np.object_]:
 def edge_lines(
     xyz: Array, sources: Sequence[int] | NDArray[np.intp], targets: Sequence[int] | NDArray[np.intp]
 ) -> NDArray[np.object_]:
-    """Lines of two points between the places of nodes, two-dimensional where both lie at 0."""
+    """Build lines of two points between nodes, given by index; two-dimensional if both ends have z = 0."""
     ends = np.stack([xyz[np.array(sources, np.intp)], xyz[np.array(targets, np.intp)]], axis=1)
     out: NDArray[np.object_] = np.empty(len(ends), object)
     high = (ends[:, :, 2] != 0).any(axis=1)
@@ -102,12 +102,12 @@ def edge_lines(
 
 
 def quaternion(yaw: float) -> list[float]:
-    """[x, y, z, w] of a turn about z by this angle in radians."""
+    """Return the quaternion [x, y, z, w] of a rotation about z by this angle in radians."""
     return [0.0, 0.0, math.sin(yaw / 2.0) + 0.0, math.cos(yaw / 2.0) + 0.0]
 
 
 def yaw(orientation: Any) -> float | None:
-    """The angle about z in radians, -π to π, of a quaternion [x, y, z, w]; None where it is none."""
+    """Return the angle about z in radians, -π to π, of a quaternion [x, y, z, w]; None if it is invalid."""
     if not isinstance(orientation, (list, tuple)) or len(orientation) != 4:
         return None
     if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in orientation):
@@ -120,12 +120,12 @@ def yaw(orientation: Any) -> float | None:
 
 
 def is_flat(orientation: Any) -> bool:
-    """Whether a quaternion only turns about z."""
+    """Whether a quaternion rotates about z only."""
     return yaw(orientation) is None or max(abs(orientation[0]), abs(orientation[1])) < SAME_ANGLE
 
 
 def yaw_or_source(source_yaw: Any, orientation: Any) -> float | None:
-    """The angle of a quaternion in radians: as its source said it where that is the same angle, else from -π to π."""
+    """Return a quaternion's angle in radians: the source's value if it is the same angle, else from -π to π."""
     now = yaw(orientation)
     if now is None:
         return None
@@ -139,7 +139,7 @@ def yaw_or_source(source_yaw: Any, orientation: Any) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A directed edge: its id, the places of its nodes in ``Net.nodes``, and its shape in metres."""
+    """Directed edge: id, indexes of its nodes in ``MergedNetwork.nodes``, and shape in metres."""
 
     id: str
     source: int
@@ -151,7 +151,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node: an id that is the only one in all networks, and where it stands in metres; z is None in 2-D."""
+    """Node: an id that is unique in all networks, and a position in metres; z is None in 2-D."""
 
     id: str
     x: float
@@ -163,7 +163,7 @@ class Node:
 
 @dataclass(slots=True)
 class MergedNetwork:
-    """All networks of an environment as one; ids of nodes are distinct, and so are those of edges."""
+    """All networks of an environment as one; node ids are unique, and so are edge ids."""
 
     nodes: list[Node] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
@@ -171,10 +171,11 @@ class MergedNetwork:
 
 
 def merge_networks(layers: Layers, context: WriteContext) -> MergedNetwork:
-    """All networks, nodes and edges in the order of their parts. MissingDatum where one is on earth without a datum.
+    """Merge all networks, with nodes and edges in the order of their parts.
 
-    Edges find their nodes in their own part first, then in another one. What is neither a node with a point nor an
-    edge between nodes is declared as dropped; ids that several networks use get a number, with a warning.
+    Edges refer to nodes of their own part first, then of other parts. Items that are neither a node with a point nor an
+    edge between nodes are declared as dropped; ids that occur in several networks get a number, with a warning. Raises
+    MissingDatum if a network is in wgs84 and there is no datum.
     """
     net = MergedNetwork()
     homes: list[dict[str, int]] = []
@@ -202,9 +203,12 @@ def merge_networks(layers: Layers, context: WriteContext) -> MergedNetwork:
         net.levels.append(key.level)
     dropped_count = _join_edges(net, parts, shapes, homes, everywhere)
     if renamed:
-        context.warn(f"{len(renamed)} ids stand in several networks and got a number: {shorten_list(renamed)}")
-    context.drop("items that are neither a node with a point nor an edge", strange, "they are no part of a network")
-    context.drop("edges that begin or end at no node", dropped_count, "there is nothing that they could join")
+        context.warn(
+            f"{len(renamed)} ids occur in more than one network; a numeric suffix makes them unique: "
+            f"{shorten_list(renamed)}"
+        )
+    context.drop("items that are neither a node with a point nor an edge", strange, "they are not part of a network")
+    context.drop("edges without both end nodes", dropped_count, "they connect nothing")
     return net
 
 
@@ -232,7 +236,7 @@ def _join_edges(
 
 
 def source_document(layers: Layers, name: str) -> dict[str, Any]:
-    """What the first network's source of this format says as a whole; empty where there is none."""
+    """Return the document of the first network from this format; empty if there is none."""
     for part in layers.vector("topology").values():
         document = part.document.get(name)
         if isinstance(document, dict):
@@ -241,25 +245,25 @@ def source_document(layers: Layers, name: str) -> dict[str, Any]:
 
 
 def get_source_properties(properties: Properties, name: str) -> dict[str, Any]:
-    """What a format knows of an item; empty where it knows nothing."""
+    """Return an item's source properties of a format; empty if there are none."""
     members = properties.get(name)
     return members if isinstance(members, dict) else {}
 
 
 def count(items: Any) -> int:
-    """How many items a list holds; what is no list holds none (other formats' files may say anything)."""
+    """Return a list's length; 0 for any other value (files of other formats may contain anything)."""
     return len(items) if isinstance(items, list) else 0
 
 
 def report_3d_loss(net: MergedNetwork, context: WriteContext, why: str) -> None:
-    """Declare what a flat format without levels loses."""
+    """Declare the data that a flat format without levels drops."""
     context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), why)
     if len(set(net.levels)) > 1:
         context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
 
 
 def duplicates(names: Sequence[str]) -> list[str]:
-    """The names that stand more than once, each once, in order."""
+    """Return the names that occur more than once, each once, in order."""
     seen: set[str] = set()
     repeats: dict[str, None] = {}
     for name in names:
@@ -270,5 +274,5 @@ def duplicates(names: Sequence[str]) -> list[str]:
 
 
 def empty(document: Properties) -> Features:
-    """A part without items that keeps what its source says as a whole."""
+    """Return a part without items that contains only a collection document."""
     return Features((), np.empty(0, object), (), np.empty(0, bool), document)

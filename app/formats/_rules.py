@@ -1,4 +1,4 @@
-"""What the checks of the consumers' loader rules share (see ``Format.check``): findings, numbers as C++ reads them."""
+"""Helpers for consumer checks (see ``Format.check``): findings, and numbers as C++ reads them."""
 
 from __future__ import annotations
 
@@ -13,54 +13,54 @@ from app.formats import JUST_WRITTEN
 from app.limits import Limits
 
 LIMITS = Limits()
-"""A check reads what is served, or files that the user of a command line has: within the usual bounds."""
+"""Limits for files that a check reads: exported maps, or files of a command-line user."""
 
 MAX_QUICK_BYTES = 2**19
 HEAD_BYTES = 2**13
-"""Of a larger text that was just written here, only so much of its beginning is looked at."""
+"""Number of bytes that are checked at the start of a larger text that the server has just written."""
 
 MAX_NAMES_SHOWN = 5
 
 
 def is_brief(data: bytes) -> bool:
-    """Whether this text is too large to be read once more while somebody waits for it."""
+    """Whether this text is too large to be parsed again during a request."""
     return len(data) > MAX_QUICK_BYTES and JUST_WRITTEN.get()
 
 
 def error_finding(
     problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None
 ) -> Problem:
-    """A finding: the consumer does not load the map, or takes it for another one."""
+    """Build a finding of level error: the consumer rejects the map, or misreads it."""
     return Problem(problem, file, line, where, "error")
 
 
 def warning_finding(
     problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None
 ) -> Problem:
-    """A finding: the consumer loads the map, and may not do with it what its maker meant."""
+    """Build a finding of level warning: the consumer loads the map but may not use it as intended."""
     return Problem(problem, file, line, where, "warning")
 
 
 def names(items: Iterable[object]) -> str:
-    """The first few, and how many more there are: one finding for all that break one rule."""
+    """List the first few items and the number of others, for one finding per broken rule."""
     every = [str(item)[:60] for item in items]
     more = f" and {len(every) - MAX_NAMES_SHOWN} more" if len(every) > MAX_NAMES_SHOWN else ""
     return ", ".join(every[:MAX_NAMES_SHOWN]) + more
 
 
 def shown(value: Any) -> str:
-    """A value in a finding."""
+    """Format a value for a finding."""
     text = repr(value)
     return text if len(text) <= 60 else text[:59] + "…"
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """A finite JSON or YAML number; a truth value is none."""
+    """Whether a value is a finite JSON or YAML number; a boolean is not."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def numbers(value: Any, minimum: int, maximum: int | None = None) -> bool:
-    """A list of that many finite numbers."""
+    """Whether a value is a list of that many finite numbers."""
     return isinstance(value, list) and minimum <= len(value) <= (maximum or len(value)) and all(map(is_number, value))
 
 
@@ -69,7 +69,7 @@ _SPECIAL = {"": 1.0, "+": 1.0, "-": -1.0}
 
 
 def cpp_number(text: Any) -> float | None:
-    """The number that yaml-cpp's ``as<double>`` makes of a scalar's text (quoted or not); None where it throws."""
+    """Parse a scalar's text (quoted or not) as yaml-cpp's ``as<double>`` does; None if that throws."""
     if not isinstance(text, str):
         return None
     if _CPP.match(text):
@@ -85,26 +85,26 @@ _FALSE = frozenset(w for word in ("n", "no", "false", "off") for w in (word, wor
 
 
 def cpp_bool(text: Any) -> bool | None:
-    """The truth value that yaml-cpp's ``as<bool>`` makes of a scalar's text; None where it throws."""
+    """Parse a scalar's text as yaml-cpp's ``as<bool>`` does; None if that throws."""
     if text in _TRUE or text in _FALSE:
         return text in _TRUE
     return None
 
 
 MAX_WHOLE_YAML_BYTES = 8 * 2**20
-"""Bytes of YAML up to which a check reads a file as a whole."""
+"""Maximum size of a YAML file that a check parses completely, in bytes."""
 
 
 def mappings(value: Any) -> list[tuple[int, dict[str, Any]]]:
-    """The mappings of a list, with their places; of anything else nothing."""
+    """Yield the mappings of a list with their index; nothing if the value is not a list."""
     return [(k, v) for k, v in enumerate(value) if isinstance(v, dict)] if isinstance(value, list) else []
 
 
 def duplicates(items: Iterable[Any]) -> list[Any]:
-    """Each item that occurs more than once, in order."""
+    """Return each item that occurs more than once, in order."""
     return [item for item, count in Counter(items).items() if count > 1]
 
 
 def missing(members: Any, keys: Iterable[str]) -> list[str]:
-    """Which of the keys a mapping lacks."""
+    """Return the keys that a mapping lacks."""
     return [key for key in keys if not isinstance(members, dict) or members.get(key) is None]

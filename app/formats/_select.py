@@ -1,4 +1,4 @@
-"""Which of several named parts a map is made of, where a format holds one: grids, voxel maps."""
+"""Select one of several named parts (grids, voxel maps) for formats that contain one."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from app.model.names import did_you_mean
 
 
 def file_stem(name: str, default: str = MAP) -> str:
-    """Turn a part's name into that of its files, without the ending: one folder deep, and not hidden."""
-    # A second character ":" would make a Windows drive of it, which no archive may hold.
+    """Convert a part's name to the stem of its files: no subfolder, not hidden."""
+    # A leading "x:" would be a Windows drive, which archives may not contain.
     return re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", name.lstrip(".")).lstrip(".") or default
 
 
@@ -28,11 +28,16 @@ def select_part(
     supply: str,
     default: str = MAP,
 ) -> list[PartKey]:
-    """The named part; else the one with the usual name, else the only one; on its level, else on the ground, else on
-    the only one.
+    """Select the named part, else the part named ``default``, else the only one.
 
-    noun: the part as users call it (``grid``). option: the parameter that names it. supply: what to upload. Raises
-    MissingLayer, NotFound, or Ambiguous with the names to choose from.
+    On the given level, else on the ground, else on the only one.
+
+    Args:
+        noun: word for the part in messages (``grid``).
+        option: parameter that names it.
+        supply: what to upload.
+
+    Raises MissingLayer, NotFound, or Ambiguous with the names to choose from.
     """
     every = [key for key in keys if key.layer == layer]
     if not every:
@@ -55,6 +60,6 @@ def select_part(
         ground = [key for key in matches if key.level == GROUND]
         if not ground:
             levels = ", ".join(key.level for key in matches)
-            raise Ambiguous(f"the {noun} {name!r} is there on several levels, name one with level=…: {levels}")
+            raise Ambiguous(f"{noun} {name!r} exists on several levels, name one with level=…: {levels}")
         matches = ground
     return matches

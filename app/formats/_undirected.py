@@ -1,8 +1,8 @@
-"""Graphs whose edges have no direction (``prm``, ``ffr_network``) <-> directed edges, and back.
+"""Convert between graphs with undirected edges (``prm``, ``ffr_network``) and directed edges.
 
-A line of the file is two directed edges: the first carries what the file says of it, the second ``backward``; both
-carry ``line``, the line's place in the file, so that they find each other again. A line that says ``oneway: true`` (our
-own word: these formats have none) is one edge.
+A line of the file becomes two directed edges: the first has the line's properties, the second has ``backward``; both
+have ``line``, the line's index in the file, so that the writer can join them again. A line with ``oneway: true`` (our
+extension: these formats have no such key) is one edge.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from app.model.features import Properties, unique_ids
 
 ONEWAY = "oneway"
 WORDS = ("action", "name", "speed_limit", "width")
-"""Canonical words of edges that a line may say, too."""
+"""Canonical edge properties that a line may have, too."""
 
 NODE_CANONICAL = frozenset({"kind", "name", "drawn_from"})
 EDGE_CANONICAL = frozenset({"kind", "source", "target", "drawn_from", *WORDS})
@@ -34,7 +34,7 @@ EDGE_CANONICAL = frozenset({"kind", "source", "target", "drawn_from", *WORDS})
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line of a file: places of the nodes at its ends, and what else it says."""
+    """A line of a file: indexes of its end nodes, and its other keys."""
 
     a: int
     b: int
@@ -42,7 +42,7 @@ class Line:
 
 
 def canonical(keys: Iterable[str], members: dict[str, Any]) -> dict[str, Any]:
-    """The canonical words among what an item says, where their values are of the right type."""
+    """Return the canonical properties among an item's members that have a value of the right type."""
     out: dict[str, Any] = {}
     for key in keys:
         value = members.get(key)
@@ -57,7 +57,7 @@ def canonical(keys: Iterable[str], members: dict[str, Any]) -> dict[str, Any]:
 def edges(
     lines: Sequence[Line], ids: Sequence[str], xyz: Array, name: str
 ) -> tuple[list[str], list[Any], list[Properties]]:
-    """Lines -> (ids, geometries, properties) of directed edges. ids, xyz: of the nodes. name: the format's."""
+    """Convert lines to (ids, geometries, properties) of directed edges. ids, xyz: of the nodes. name: the format's."""
     rows: list[tuple[int, int]] = []
     properties: list[Properties] = []
     for k, line in enumerate(lines):
@@ -85,14 +85,14 @@ def edges(
 
 
 def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
-    """Directed edges as lines, in the order of their nodes' places; what lines cannot say is declared."""
+    """Convert directed edges to lines, ordered by node index; declare what lines cannot express."""
     ordered = sorted(
         net.edges,
         key=lambda e: (get_source_properties(e.properties, name).get("backward") is True, natural_sort_key(e.id)),
     )
     pairs: list[tuple[Edge, Edge | None]] = []
     waiting = ordered
-    for exact in (True, False):  # first the two edges of one line of a file, then whatever leads back
+    for exact in (True, False):  # first the two edges of one line of a file, then any edge in the opposite direction
         open_: dict[tuple[Any, ...], list[Edge]] = defaultdict(list)
         closed: list[tuple[Edge, Edge]] = []
         for edge in waiting:
@@ -121,16 +121,18 @@ def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
             oneway += 1
         out.append(Line(edge.source, edge.target, members))
     context.drop("attributes of edges", dropped_count, "the format has no place for them")
-    context.drop("attributes of the way back", differing, "a line says the same of both directions")
+    context.drop(
+        "attributes of the opposite direction", differing, "a line has one set of attributes for both directions"
+    )
     if oneway:
-        reason = f"{oneway} edges lead one way only, which the format cannot say: they are marked {ONEWAY}: true"
-        context.warn(f"{reason}, but other readers will drive them both ways")
+        reason = f"{oneway} edges are one-way, which the format cannot express: they are marked {ONEWAY}: true"
+        context.warn(f"{reason}; other readers use them in both directions")
     return sorted(out, key=lambda line: (line.a, line.b))
 
 
 def warn_isolated(count: int, linked: Iterable[int], names: Sequence[str], context: ReadContext) -> None:
-    """Name nodes that no line reaches."""
+    """Warn about nodes without lines."""
     reached = set(linked)
     lonely = [names[k] for k in range(count) if k not in reached]
     if lonely:
-        context.warn(f"{len(lonely)} nodes have no lines: {shorten_list(lonely)}")
+        context.warn(f"{len(lonely)} isolated nodes without lines: {shorten_list(lonely)}")

@@ -1,13 +1,12 @@
-"""datum.yaml: where an environment's (0, 0) is, and the GNSS fence around it.
+"""datum.yaml: position of an environment's local origin (0, 0), and the GNSS fence around it.
 
-Positions are [latitude, longitude], degrees WGS 84: the reverse of GeoJSON and KML. The file is the parameter file of
-robot_localization's navsat_transform_node, of mapviz and of gmapping in one.
+Positions are [latitude, longitude], degrees WGS 84: the reverse of GeoJSON and KML. One file is the parameter file of
+robot_localization's navsat_transform_node, of mapviz and of gmapping.
 Source: the environment_template's config/location/datum.yaml; navsat_transform.cpp for the meaning of ``datum``.
 
-The heading is ``navsat_transform_node.datum[2]``: the yaw in radians, counter-clockwise from east, that the local +x
-axis has on earth; so the bearing of the local +y axis, clockwise from north, is the same angle negated. mapviz'
-altitude is kept and not believed; ``datum_altitude``, which no consumer reads, is ours and stands there only where it
-is not 0.
+The heading is ``navsat_transform_node.datum[2]``: the yaw of the local +x axis in radians, counter-clockwise from
+east; so the bearing of the local +y axis, clockwise from north, is the same angle negated. mapviz' altitude is stored
+but not used; ``datum_altitude`` is our extension, which no consumer reads, and is written only if it is not 0.
 """
 
 from __future__ import annotations
@@ -48,25 +47,27 @@ NAME = "datum"
 FENCE = "fence"
 MAPVIZ_ALTITUDE = 100.0
 HALF_MAP = 100.0
-"""Metres from the datum: the template's map size, where nothing says how far the environment reaches."""
+"""Default distance from the datum to each side of the map, in metres: the template's map size."""
 
 
 @dataclass(frozen=True, slots=True)
 class NavSat:
-    """Parameters of robot_localization's navsat_transform_node besides the datum, as the template has them."""
+    """Parameters of robot_localization's navsat_transform_node except the datum, with the template's defaults."""
 
     magnetic_declination_radians: float = parameter(
-        0.0, "of navsat_transform_node, where no source has it", minimum=-4.0, maximum=4.0, unit="rad"
+        0.0, "navsat_transform_node parameter, used if no source has it", minimum=-4.0, maximum=4.0, unit="rad"
     )
     yaw_offset: float = parameter(
-        0.0, "of navsat_transform_node, where no source has it", minimum=-7.0, maximum=7.0, unit="rad"
+        0.0, "navsat_transform_node parameter, used if no source has it", minimum=-7.0, maximum=7.0, unit="rad"
     )
-    zero_altitude: bool = parameter(True, "of navsat_transform_node, where no source has it")
-    broadcast_utm_transform: bool = parameter(False, "of navsat_transform_node, where no source has it")
-    broadcast_utm_transform_as_parent_frame: bool = parameter(False, "of navsat_transform_node, where no source has it")
-    publish_filtered_gps: bool = parameter(True, "of navsat_transform_node, where no source has it")
-    use_odometry_yaw: bool = parameter(False, "of navsat_transform_node, where no source has it")
-    wait_for_datum: bool = parameter(True, "of navsat_transform_node, where no source has it")
+    zero_altitude: bool = parameter(True, "navsat_transform_node parameter, used if no source has it")
+    broadcast_utm_transform: bool = parameter(False, "navsat_transform_node parameter, used if no source has it")
+    broadcast_utm_transform_as_parent_frame: bool = parameter(
+        False, "navsat_transform_node parameter, used if no source has it"
+    )
+    publish_filtered_gps: bool = parameter(True, "navsat_transform_node parameter, used if no source has it")
+    use_odometry_yaw: bool = parameter(False, "navsat_transform_node parameter, used if no source has it")
+    wait_for_datum: bool = parameter(True, "navsat_transform_node parameter, used if no source has it")
 
 
 _SIZE = record(xmin=COORDINATE, xmax=COORDINATE, ymin=COORDINATE, ymax=COORDINATE)
@@ -100,23 +101,26 @@ SHAPE = record(
         wait_for_datum=_BOOL,
     ),
 )
-"""What the file holds. Source: environment_template, robot_localization's navsat_transform_node, mapviz."""
+"""Shape of the file. Source: environment_template, robot_localization's navsat_transform_node, mapviz."""
 
 MAX_USUAL_METRES = 100_000.0
-"""From the datum to a corner of the fence; beyond it the two are most likely not of one place."""
+"""Distance from the datum to a corner of the fence, in metres, beyond which one of them is probably wrong."""
 
 NAVSAT = tuple(f.name for f in fields(NavSat))
-"""Their names, in the template's order."""
+"""Names of the parameters, in the template's order."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions(NavSat):
-    """What the file says where no source does."""
+    """Values to write if no source has them."""
 
     half_size: float = parameter(
-        HALF_MAP, "from the datum to each side of the map, where nothing tells its extent", minimum=1.0, maximum=1e5,
+        HALF_MAP,
+        "distance from the datum to each side of the map, if the environment has no known extent",
+        minimum=1.0,
+        maximum=1e5,
         unit="m",
-    )  # fmt: skip
+    )
 
 
 HEAD = "# Site datum: the place of the local (0, 0), degrees WGS 84\n"
@@ -125,9 +129,9 @@ SIZE_HEAD = "\n# Map size (x east, y north), metres from the datum\n"
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The datum, and the fence as the one polygon of the location layer (longitude, latitude, wgs84).
+    """Read the datum, and the fence as one polygon of the location layer (longitude, latitude, wgs84).
 
-    All other keys are kept in the collection's document. Raises UnreadableFile with the key that is wrong.
+    All other keys are stored in the collection document. Raises UnreadableFile with the invalid key.
     """
     top = yaml.load(files[context.main or next(iter(files))], context.limits)
     if not isinstance(top, dict):
@@ -157,18 +161,18 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _check_place(latitude: float, longitude: float, ring: NDArray[np.float64] | None, context: ReadContext) -> None:
-    """Report a datum and a fence that hardly mean what they say."""
+    """Warn about an implausible datum or fence."""
     if latitude == longitude == 0.0:
-        context.warn("the datum is at 0, 0, in the sea: set the site's own place", where="datum_latitude")
+        context.warn("the datum is at 0, 0; set the position of your site", where="datum_latitude")
     if ring is None:
         return
     location = "gnss_fence.gnss_fence_coords"
     far = [k for k, (x, y) in enumerate(ring.tolist()) if distance((longitude, latitude), (x, y)) > MAX_USUAL_METRES]
     if far:
         reason = f"{len(far)} of {len(ring)} points are more than {MAX_USUAL_METRES / 1000:g} km from the datum"
-        context.warn(f"{reason}: are latitude and longitude swapped?", where=f"{location}[{far[0]}]")
+        context.warn(f"{reason}; are latitude and longitude swapped?", where=f"{location}[{far[0]}]")
     if not shapely.Polygon(ring).is_valid:
-        context.warn("the fence crosses itself: what is inside of it is not defined", where=location)
+        context.warn("the fence crosses itself; its inside is undefined", where=location)
 
 
 def _unreadable_error(reason: str, location: str) -> UnreadableFile:
@@ -176,7 +180,7 @@ def _unreadable_error(reason: str, location: str) -> UnreadableFile:
 
 
 def _number(value: Any, location: str) -> float:
-    """A finite number, also one in quotes."""
+    """Return a finite number, possibly given in quotes."""
     if isinstance(value, str):
         try:
             value = yaml.scalar(value)
@@ -189,7 +193,7 @@ def _number(value: Any, location: str) -> float:
 
 def _degrees(value: Any, location: str, bound: float) -> float:
     if value is None:
-        raise _unreadable_error("is missing: the datum needs datum_latitude and datum_longitude in degrees", location)
+        raise _unreadable_error("missing: the datum needs datum_latitude and datum_longitude in degrees", location)
     degrees = _number(value, location)
     if not -bound <= degrees <= bound:
         raise _unreadable_error(f"must be between {-bound:g} and {bound:g} degrees, got {degrees:g}", location)
@@ -197,7 +201,7 @@ def _degrees(value: Any, location: str, bound: float) -> float:
 
 
 def _yaw(navsat: Mapping[str, Any], latitude: float, longitude: float, context: ReadContext) -> float:
-    """Radians counter-clockwise from east to the local +x axis."""
+    """Return the angle from east to the local +x axis, counter-clockwise, in radians."""
     location = "navsat_transform_node.datum"
     raw_datum = navsat.get("datum")
     if raw_datum is None:
@@ -206,30 +210,30 @@ def _yaw(navsat: Mapping[str, Any], latitude: float, longitude: float, context: 
         raise _unreadable_error("must be [latitude, longitude, yaw in radians]", location)
     other = [_number(v, f"{location}[{k}]") for k, v in enumerate(raw_datum[:3])]
     if abs(other[0] - latitude) > 1e-9 or abs(other[1] - longitude) > 1e-9:
-        context.warn("differs from datum_latitude and datum_longitude, which count", where=location)
+        context.warn("differs from datum_latitude and datum_longitude, which take precedence", where=location)
     for key in ("yaw_offset", "magnetic_declination_radians"):
         value = navsat.get(key, 0.0)
         if isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0:
             context.warn(
-                f"is {value}: robot_localization adds it to the datum's yaw, this server takes the yaw as it stands",
+                f"is {value}: robot_localization adds it to the datum's yaw; this server uses the yaw as given",
                 where=f"navsat_transform_node.{key}",
             )
     return other[2] if len(other) > 2 else 0.0
 
 
 def _heading(yaw: float) -> float:
-    """Degrees clockwise from true north to the local +y axis, within ±180."""
+    """Return degrees clockwise from true north to the local +y axis, within ±180."""
     return math.degrees(-math.remainder(yaw, 2 * math.pi)) + 0.0
 
 
 def _fence(members: Any, context: ReadContext) -> NDArray[np.float64] | None:
-    """float64 [n, 2] (longitude, latitude) as the file lists them, or None where there is no fence."""
+    """Return float64 [n, 2] (longitude, latitude) in the file's order, or None without a fence."""
     location = "gnss_fence.gnss_fence_coords"
     if members is not None and not isinstance(members, dict):
         raise _unreadable_error("must be a mapping with gnss_fence_coords", "gnss_fence")
     listed = (members or {}).get("gnss_fence_coords")
     if listed is None or listed == []:
-        context.warn("is missing: the environment has a datum but no fence", where=location)
+        context.warn("missing; the environment has a datum but no fence", where=location)
         return None
     if not isinstance(listed, list):
         raise _unreadable_error("must be a list of [latitude, longitude]", location)
@@ -241,7 +245,7 @@ def _fence(members: Any, context: ReadContext) -> NDArray[np.float64] | None:
         ring[k] = _degrees(pair[1], f"{at}[1]", 180.0), _degrees(pair[0], f"{at}[0]", 90.0)
     if len(np.unique(ring, axis=0)) < 3:
         raise _unreadable_error(
-            f"a fence needs at least 3 different points, this one has {len(np.unique(ring, axis=0))}", location
+            f"a fence needs at least 3 different points, got {len(np.unique(ring, axis=0))}", location
         )
     return ring
 
@@ -250,10 +254,10 @@ def _fence(members: Any, context: ReadContext) -> NDArray[np.float64] | None:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``datum.yaml`` in the template's layout. The caller sees to it that there is a datum."""
+    """Write ``datum.yaml`` in the template's layout. The caller ensures that there is a datum."""
     datum, frame = layers.datum, layers.frame
     if datum is None or frame is None:
-        raise ValueError("a datum is needed")
+        raise ValueError("datum required")
     fence, document, closed = _select_fence(layers, context)
     latitude, longitude = yaml.text(datum.latitude), yaml.text(datum.longitude)
     out = [HEAD, f"datum_latitude: {latitude}\ndatum_longitude: {longitude}\n"]
@@ -262,7 +266,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     out.append(FENCE_HEAD)
     ring = None if fence is None else shapely.get_coordinates(fence.exterior)
     if ring is None:
-        context.warn("the environment has no fence: gnss_fence_coords is empty", where="gnss_fence.gnss_fence_coords")
+        context.warn("the environment has no fence; gnss_fence_coords is empty", where="gnss_fence.gnss_fence_coords")
         pairs = []
     else:
         pairs = [f"[{yaml.text(y)}, {yaml.text(x)}]" for x, y in (ring if closed else ring[:-1]).tolist()]
@@ -287,7 +291,7 @@ _KEYS = frozenset(
 
 
 def _select_fence(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any], bool]:
-    """(the fence as a polygon in degrees or None, the source's other keys, whether its first point was repeated)."""
+    """Return the fence as a polygon in degrees or None, the source's other keys, and whether its ring was closed."""
     source_document: dict[str, Any] = {}
     candidates: list[tuple[bool, float, str, Any, bool]] = []
     dropped_count = 0
@@ -297,7 +301,7 @@ def _select_fence(layers: Layers, context: WriteContext) -> tuple[Any, dict[str,
             source_document = dict(document)
         places = part.in_wgs84(layers.frame)
         if part.local.any():
-            # Computed degrees are rounded, so that every machine prints the same; given ones are written as given.
+            # Computed degrees are rounded for equal output on every machine; given degrees are written unchanged.
             places = places.copy()
             places[part.local] = shapely.transform(places[part.local], lambda xy: np.round(xy, DEGREES) + 0.0)
         for feature, geometry in zip(part, places, strict=True):
@@ -310,11 +314,11 @@ def _select_fence(layers: Layers, context: WriteContext) -> tuple[Any, dict[str,
                     candidates.append((not is_fence, -piece.area, f"{key.level}/{feature.id}/{k}", piece, closed))
                 else:
                     dropped_count += 1
-    context.drop("location items that are no polygons", dropped_count, "datum.yaml has room for one fence")
+    context.drop("location items that are not polygons", dropped_count, "datum.yaml holds one fence")
     if not candidates:
         return None, source_document, False
     candidates.sort(key=lambda row: row[:3])
-    context.drop("further location polygons", len(candidates) - 1, "datum.yaml has room for one fence")
+    context.drop("further location polygons", len(candidates) - 1, "datum.yaml holds one fence")
     fence = candidates[0][3]
     context.drop("holes of the fence", len(fence.interiors), "a fence in datum.yaml is one ring")
     return fence, source_document, candidates[0][4]
@@ -325,7 +329,7 @@ def _options(context: WriteContext) -> WriteOptions:
 
 
 def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: WriteContext) -> dict[str, Any]:
-    """gmapping as the source has it, with what it lacks from the extent of fence and data, in whole metres."""
+    """Return the source's gmapping; missing keys come from the extent of fence and data, in whole metres."""
     gmapping = document.get("gmapping")
     size = dict(gmapping) if isinstance(gmapping, dict) else {}
     lacking = [key for key in ("xmin", "xmax", "ymin", "ymax") if key not in size]
@@ -334,9 +338,9 @@ def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: Write
     extent = _extent(layers, ring)
     if extent is None:
         half = _options(context).half_size
-        why, extent, option = "nothing tells the extent", (-half, -half, half, half), "half_size"
+        why, extent, option = "the environment has no known extent", (-half, -half, half, half), "half_size"
     else:
-        why, option = "the extent of the fence and the data, whole metres", None
+        why, option = "extent of the fence and the data, in whole metres", None
     west, south, east, north = extent
     bounds = {"xmin": math.floor(west), "xmax": math.ceil(east), "ymin": math.floor(south), "ymax": math.ceil(north)}
     for key in lacking:
@@ -346,7 +350,7 @@ def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: Write
 
 
 def _extent(layers: Layers, ring: Any) -> tuple[float, float, float, float] | None:
-    """West, south, east, north of everything that is there, in local metres."""
+    """Return west, south, east and north of all data, in local metres."""
     frame = layers.frame
     boxes: list[NDArray[np.float64]] = []
     if ring is not None and frame is not None:
@@ -365,13 +369,13 @@ def _extent(layers: Layers, ring: Any) -> tuple[float, float, float, float] | No
 
 
 def _mapviz(document: Mapping[str, Any], datum: Datum, old: tuple[Any, Any], context: WriteContext) -> str:
-    """mapviz' origins: those that stood at the source's datum stand at the datum."""
+    """Return mapviz' origins; those at the source's datum move to the current datum."""
     mapviz = document.get("mapviz_initialize_origin")
     if mapviz is None:
         new_origin: dict[str, Any] = {"name": "dont_change_this", "latitude": None, "longitude": None}
         new_origin |= {"altitude": MAPVIZ_ALTITUDE, "heading": 0.0}
         mapviz = {"local_xy_origins": [new_origin]}
-        context.fill("mapviz_initialize_origin", "one origin at the datum", "no source has it")
+        context.fill("mapviz_initialize_origin", "one origin at the datum", "not in any source")
         old = (None, None)
     origins = mapviz.get("local_xy_origins") if isinstance(mapviz, dict) else None
     if not isinstance(mapviz, dict) or not isinstance(origins, list):
@@ -386,17 +390,17 @@ def _mapviz(document: Mapping[str, Any], datum: Datum, old: tuple[Any, Any], con
 
 
 def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) -> str:
-    """navsat_transform_node's parameters, its datum made from ours."""
+    """Return navsat_transform_node's parameters, with the current datum."""
     members = document.get("navsat_transform_node")
     navsat = dict(members) if isinstance(members, dict) else {}
     defaults = {key: getattr(_options(context), key) for key in NAVSAT}
     for key in NAVSAT:
         if key not in navsat:
-            context.fill(f"navsat_transform_node: {key}", defaults[key], "no source has it", key)
+            context.fill(f"navsat_transform_node: {key}", defaults[key], "not in any source", key)
     listed = navsat.pop("datum", None)
     yaw: Any = listed[2] if isinstance(listed, list) and len(listed) > 2 else None
     more = listed[3:] if isinstance(listed, list) else []
-    # The source's own yaw where it says the same: it may be several turns, and has digits that degrees would lose.
+    # Keep the source's yaw for the same angle: it may exceed a full turn and has digits that degrees would lose.
     if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
         yaw = -math.radians(datum.heading) + 0.0
     values = [yaml.text(datum.latitude), yaml.text(datum.longitude), *map(yaml.text, [yaw, *more])]
@@ -404,7 +408,7 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
 
 
 def _mapping_text(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
-    """A mapping's text: these keys in this order, then the others sorted."""
+    """Return a mapping's text: these keys in this order, then the others sorted."""
     out = [yaml.mapping({key: values[key]}, column) for key in first if key in values]
     extra_members = {key: value for key, value in values.items() if key not in first}
     return "".join(out) + (yaml.mapping(extra_members, column) if extra_members else "")
@@ -414,7 +418,7 @@ _KEY = re.compile(rb"(?m)^datum_latitude\s*:")
 
 
 def detect(name: str, data: bytes) -> bool:
-    """YAML with the datum's latitude and longitude at its top level."""
+    """Detect YAML with the datum's latitude and longitude at its top level."""
     yaml_name = name.lower().endswith((".yaml", ".yml"))
     return yaml_name and bool(_KEY.search(data)) and b"datum_longitude" in data
 

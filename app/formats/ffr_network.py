@@ -1,14 +1,13 @@
 """ffr_network: environment_common's FFR networks, as YAML: named points, and lines between their coordinates.
 
 ``internal_points``: ``{name, x, y}`` in metres in the local frame; ``network_lines``: ``{start: {x, y}, end: {x, y}}``,
-in both directions. A line's ends are the points at these very coordinates. Source: environment_common,
-convertors/ffrnetwork_to_tmap.py, which reads ``topological/network.ffr.yaml`` (it puts each line to both of its ends;
-that the way back then leads from a node to itself is a slip of its).
+bidirectional. A line connects the points with exactly its end coordinates. Source: environment_common,
+convertors/ffrnetwork_to_tmap.py, which reads ``topological/network.ffr.yaml`` (it adds each line to both end nodes;
+due to a bug the reverse edge leads from a node to itself).
 
 Canonical: a node's id is its name, an edge's ``<from>-<to>``; see ``_undirected`` for edges of both directions. A
-    point's
-``z`` is its altitude. ``properties.ffr_network`` holds ``more`` (further keys of a point, or of a line and under
-``start`` and ``end`` of its ends), ``name`` where it is not the id; the document's ``ffr_network`` holds ``top``
+point's ``z`` is its altitude. ``properties.ffr_network`` contains ``more`` (further keys of a point, or of a line and
+under ``start`` and ``end`` of its ends), ``name`` if it is not the id; the document's ``ffr_network`` contains ``top``
 (further keys of the file) and ``dangling`` (lines that end at no point).
 """
 
@@ -49,7 +48,7 @@ NAME = "ffr_network"
 FILE = "network.ffr.yaml"
 POINTS, LINES = "internal_points", "network_lines"
 DECIMALS = 6
-"""Coordinates that agree to a micrometre are the same place."""
+"""Decimal places to which equal coordinates agree: a micrometre."""
 
 AXES = ("x", "y", "z")
 _END = record(x=COORDINATE, y=COORDINATE)
@@ -57,22 +56,22 @@ SHAPE = record(
     internal_points=[record("name", x=COORDINATE, y=COORDINATE, z=COORDINATE)],
     network_lines=[record("name", start=_END, end=_END, width=WIDTH)],
 )
-"""What the file holds."""
+"""Shape of the file."""
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
 def read(files: Files, context: ReadContext) -> Layers:
-    """The network as topology. Raises UnreadableFile naming the point or line."""
+    """Read the network as topology. Raises UnreadableFile naming the point or line."""
     if not context.wants("topology"):
         return Layers()
     main = context.main or next(iter(files))
     top = yaml.load(files[main], context.limits)
     if not isinstance(top, dict) or not isinstance(top.get(POINTS), list):
-        reason = f"an FFR network is a mapping with a list of {POINTS}"
+        reason = f"an FFR network must be a mapping with a list of {POINTS}"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where=POINTS)])
     names, xyz, high, rests = _points(top[POINTS])
     if repeats := duplicates(names):
-        context.warn(f"{len(repeats)} names stand twice or more: {shorten_list(repeats)}")
+        context.warn(f"{len(repeats)} duplicate point names: {shorten_list(repeats)}")
     index_by_spot: dict[tuple[float, float], int] = {}
     crowded = []
     for k, (x, y) in enumerate(xyz[:, :2].tolist()):
@@ -80,7 +79,8 @@ def read(files: Files, context: ReadContext) -> Layers:
             crowded.append(names[k])
     if crowded:
         context.warn(
-            f"{len(crowded)} points stand where another one does: {shorten_list(crowded)}; lines go to the first"
+            f"{len(crowded)} points share the position of another one: {shorten_list(crowded)}; lines connect to "
+            "the first"
         )
     file_lines, dangling = _lines(top.get(LINES), index_by_spot, context)
     _fields.check(top, SHAPE, context)
@@ -108,12 +108,12 @@ def _spot(x: float, y: float) -> tuple[float, float]:
 
 
 def _points(points: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[dict[str, Any]]]:
-    """(names, float64 [n, 3] metres, whether a z stands there, further keys)."""
+    """Return names, float64 [n, 3] metres, whether each point has a z, and further keys."""
     names, rows, high, rests = [], [], [], []
     for k, point in enumerate(points):
         location = f"{POINTS}[{k}]"
         if not isinstance(point, dict):
-            raise_unreadable("a point is a mapping with name, x and y", location)
+            raise_unreadable("a point must be a mapping with name, x and y", location)
         name = point.get("name")
         if isinstance(name, bool) or not isinstance(name, (int, float, str)):
             raise_unreadable("a point must have a name", f"{location}.name")
@@ -129,31 +129,31 @@ def _xy(point: Any, location: str) -> tuple[float, float]:
         raise_unreadable("must be a mapping with x and y", location)
     x, y = (number(point.get(axis), f"{location}.{axis}") for axis in "xy")
     if max(abs(x), abs(y)) > MAX_METRES:
-        raise_unreadable(f"coordinates must lie within ±{MAX_METRES:g} m", location)
+        raise_unreadable(f"coordinates must be within ±{MAX_METRES:g} m", location)
     return x, y
 
 
 def _lines(
     entries: Any, index_by_spot: Mapping[tuple[float, float], int], context: ReadContext
 ) -> tuple[list[Line], list[dict[str, Any]]]:
-    """(lines between points; those that end at none, as they stand)."""
+    """Return the lines between points, and the dangling ones unchanged."""
     if entries is not None and not isinstance(entries, list):
         raise_unreadable("must be a list", LINES)
     file_lines, dangling = [], []
     for k, line in enumerate(entries or ()):
         location = f"{LINES}[{k}]"
         if not isinstance(line, dict):
-            raise_unreadable("a line is a mapping with start and end", location)
+            raise_unreadable("a line must be a mapping with start and end", location)
         ends = [_xy(line.get(end), f"{location}.{end}") for end in ("start", "end")]
         spots = [index_by_spot.get(_spot(*end)) for end in ends]
         if spots[0] is None or spots[1] is None:
             x, y = ends[0] if spots[0] is None else ends[1]
-            reason = f"no point stands at its end x {x:g}, y {y:g}: it is kept, but is no part of the network"
+            reason = f"no point at its end x {x:g}, y {y:g}; the line is stored but is not part of the network"
             context.warn(reason, where=location)
             dangling.append(line)
             continue
         if spots[0] == spots[1]:
-            context.warn("it ends where it starts", where=location)
+            context.warn("the line ends at its start point", where=location)
         extra_members = {key: value for key, value in line.items() if key not in ("start", "end")}
         for end in ("start", "end"):
             more = {key: value for key, value in line[end].items() if key not in "xy"}
@@ -165,9 +165,9 @@ def _lines(
 
 # --- writing ---------------------------------------------------------------------------------------------------------
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``network.ffr.yaml``: all networks as one, points by length and text of their names, lines by their points.
+    """Write ``network.ffr.yaml``: all networks as one, points in natural order of names, lines by their points.
 
-    Edges of both directions between two nodes are one line. MissingDatum for wgs84 items without a datum.
+    Edges of both directions between two nodes are one line. Raises MissingDatum for wgs84 items without a datum.
     """
     net = merge_networks(layers, context)
     order = sorted(range(len(net.nodes)), key=lambda k: natural_sort_key(net.nodes[k].id))
@@ -179,7 +179,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     at = list(zip(xy_texts[::2], xy_texts[1::2], strict=True))
     spots = [_spot(x, y) for x, y in xy.tolist()]
     if len(set(spots)) < len(spots):
-        reason = "nodes stand where another one does: their lines will be taken for the other's"
+        reason = "nodes share the position of another one; readers connect their lines to the other one"
         context.warn(f"{len(spots) - len(set(spots))} {reason}")
     top = document.get("top")
     top = {key: v for key, v in top.items() if key not in (POINTS, LINES)} if isinstance(top, dict) else {}
@@ -220,13 +220,13 @@ def _parse_end(end: str, members: Mapping[str, Any], at: tuple[str, str]) -> str
     return f"{end}:\n    x: {at[0]}\n    y: {at[1]}\n{yaml.mapping(extra_members, 4) if extra_members else ''}"
 
 
-# --- telling ---------------------------------------------------------------------------------------------------------
+# --- detection -------------------------------------------------------------------------------------------------------
 _POINTS = re.compile(rb"(?m)^[\"']?internal_points[\"']?[ \t]*:")
 _LINES = re.compile(rb"(?m)^[\"']?network_lines[\"']?[ \t]*:")
 
 
 def detect(name: str, data: bytes) -> bool:
-    """YAML with both lists at the top."""
+    """Detect YAML with both lists at the top."""
     del name
     return b"network_lines" in data and bool(_POINTS.search(data) and _LINES.search(data))
 

@@ -1,19 +1,19 @@
-"""prm: the probabilistic roadmap that environment_common makes of a map's picture, as YAML.
+"""prm: the probabilistic roadmap that environment_common builds from a map's image, as YAML.
 
-``nodes``: ``{id, x, y}``, whole pixels of the picture, x from its left, y from its *top*; ``edges``: ``{from, to,
-weight}`` between ids, in both directions, the weight being their distance in pixels. Source: environment_common,
+``nodes``: ``{id, x, y}``, whole pixels of the image, x from its left, y from its *top*; ``edges``: ``{from, to,
+weight}`` between ids, bidirectional, with the distance in pixels as weight. Source: environment_common,
 convertors/metric_to_prm.py, which writes ``topological/prm_autogen.yaml`` from ``metric/map/map.yaml``.
 
-A pixel is a place only with its picture: we write ``picture`` ({resolution, origin, height}, our own word) beside the
-two lists. Without it the map's YAML and picture are looked up in the upload (``metric/map/`` of an
-environment_template, else beside the roadmap, else the only map.yaml), or options say all three. A node stands at the
-centre of its pixel, metres in the local frame. On writing pixels are those of the stored grid ``map``, else of the
-picture that the roadmap came with, else of a picture that would just hold the network.
+Pixels need their image to become positions: we write ``picture`` ({resolution, origin, height}, our extension) beside
+the two lists. Without it the map's YAML and image are looked up in the upload (``metric/map/`` of an
+environment_template, else beside the roadmap, else the only map.yaml), or options give all three. A node is at the
+centre of its pixel, metres in the local frame. On writing, pixels are those of the stored grid ``map``, else of the
+image that the roadmap came with, else of an assumed image that just contains the network.
 
 Canonical: a node's id is its ``id`` as a text, an edge's ``<from>-<to>``; see ``_undirected`` for edges of both
-    directions.
-``properties.prm`` holds ``more`` (further keys) and ``id`` where it is no whole number; the document's ``prm`` holds
-``picture`` ({resolution, origin, height}), ``top`` (further keys of the file) and ``dangling`` (edges to nowhere).
+directions. ``properties.prm`` contains ``more`` (further keys) and ``id`` if it is not an integer; the document's
+``prm`` contains ``picture`` ({resolution, origin, height}), ``top`` (further keys of the file) and ``dangling`` (edges
+to unknown nodes).
 """
 
 from __future__ import annotations
@@ -77,16 +77,16 @@ SHAPE = record(
     nodes=[record("id name", x=_PIXEL, y=_PIXEL)],
     edges=[record("from to", weight=NOT_NEGATIVE)],
 )
-"""What a roadmap holds."""
+"""Shape of the file."""
 
 MAX_ROUNDING_PIXELS = 1e-4
-"""A pixel this near to a whole one is that one: metres are kept to a nanometre."""
+"""Maximum distance from a whole pixel that counts as that pixel; metres are stored to a nanometre."""
 
 RESOLUTION = 0.05
-"""Metres a pixel of a picture that is made up: the usual one."""
+"""Default size of a pixel of an assumed image, in metres."""
 
 MARGIN = 1.0
-"""Metres around the network in a picture that is made up."""
+"""Margin around the network in an assumed image, in metres."""
 
 MAPS = ("map.yaml", "map.yml", "map_autogen.yaml")
 PICTURES = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
@@ -94,29 +94,29 @@ PICTURES = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """The picture that the pixels belong to, for a roadmap that comes without its map."""
+    """Image that the pixels belong to, for a roadmap that is uploaded without its map."""
 
     resolution: float | None = parameter(
-        None, "size of a pixel of the map's picture, for a roadmap without its map", minimum=1e-6, maximum=1e4, unit="m"
+        None, "pixel size of the map's image, for a roadmap without its map", minimum=1e-6, maximum=1e4, unit="m"
     )
     origin: tuple[float, float, float] = parameter(
-        (0.0, 0.0, 0.0), "x,y,yaw of the picture's lower left corner (metres, radians), for a roadmap without its map"
+        (0.0, 0.0, 0.0), "x,y,yaw of the image's lower left corner (metres, radians), for a roadmap without its map"
     )
     height: int | None = parameter(
-        None, "rows of the map's picture, for a roadmap without its map", minimum=1, maximum=2**31
+        None, "height of the map's image in pixels, for a roadmap without its map", minimum=1, maximum=2**31
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _Picture:
-    """Where the pixels of a picture lie: metres a pixel, (x, y, yaw) of the lower left corner, rows."""
+    """Georeference of an image: metres per pixel, (x, y, yaw) of the lower left corner, rows."""
 
     resolution: float
     origin: tuple[float, float, float]
     height: int
 
     def metres(self, pixels: Array) -> Array:
-        """Centres of pixels [n, 2] (x from the left, y from the top) -> metres [n, 2]."""
+        """Convert pixels [n, 2] (x from the left, y from the top) to the metres [n, 2] of their centres."""
         x, y, yaw = self.origin
         u = (pixels[:, 0] + 0.5) * self.resolution
         v = (self.height - 0.5 - pixels[:, 1]) * self.resolution
@@ -124,7 +124,7 @@ class _Picture:
         return np.stack([x + cos * u - sin * v, y + sin * u + cos * v], axis=1)
 
     def pixels(self, metres: Array) -> Array:
-        """The reverse of ``metres``: not rounded."""
+        """Convert metres to pixels, not rounded."""
         x, y, yaw = self.origin
         dx, dy = metres[:, 0] - x, metres[:, 1] - y
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -132,32 +132,34 @@ class _Picture:
         return np.stack([u - 0.5, self.height - 0.5 - v], axis=1)
 
     def as_dict(self) -> dict[str, Any]:
-        """For the document."""
+        """Return the members for the document."""
         return {"resolution": self.resolution, "origin": list(self.origin), "height": self.height}
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
 def read(files: Files, context: ReadContext) -> Layers:
-    """The roadmap as topology. Raises UnreadableFile naming the node, or what to supply where the map is unknown."""
+    """Read the roadmap as topology. Raises UnreadableFile naming the node, or what to supply if the map is unknown."""
     if not context.wants("topology"):
         return Layers()
     main = context.main or next(iter(files))
     top = yaml.load(files[main], context.limits)
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
-        reason = "a roadmap is a mapping with a list of nodes"
+        reason = "a roadmap must be a mapping with a list of nodes"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
     picture = _picture(top.get(PICTURE), files, main, context)
     names, pixels, rests = _nodes(top["nodes"])
     if repeats := duplicates(names):
-        context.warn(f"{len(repeats)} ids stand twice or more: {shorten_list(repeats)}; edges to them go to the first")
+        context.warn(
+            f"{len(repeats)} duplicate ids: {shorten_list(repeats)}; edges connect to the first node of that id"
+        )
     if len(pixels) and (pixels.min() < -0.5 or pixels[:, 1].max() > picture.height - 0.5):
-        context.warn(f"some nodes lie outside the map's picture ({picture.height} rows)")
+        context.warn(f"some nodes lie outside the map's image ({picture.height} rows)")
     _fields.check(top, SHAPE, context)
     index_by_name = {name: k for k, name in reversed(list(enumerate(names)))}
     ids = unique_ids(map(identifier, names))
     xyz = np.concatenate([picture.metres(pixels), np.zeros((len(names), 1))], axis=1)
     if len(xyz) and np.abs(xyz).max() > MAX_METRES:
-        raise_unreadable(f"nodes must lie within ±{MAX_METRES:g} m", "nodes")
+        raise_unreadable(f"nodes must be within ±{MAX_METRES:g} m", "nodes")
     file_lines, dangling = _edges(top.get("edges"), index_by_name, context)
     warn_isolated(len(names), (k for line in file_lines for k in (line.a, line.b)), names, context)
     properties: list[Properties] = []
@@ -179,7 +181,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Picture:
-    """What the options say, else the file itself, else the map beside it."""
+    """Return the image's georeference: from the options, else the file itself, else the map beside it."""
     options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
     if options.resolution is not None and options.height is not None:
         _check_origin(options.origin, main)
@@ -195,30 +197,30 @@ def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Pi
             image = files[f"{name.rpartition('/')[0]}/{base}".lstrip("/")]
             rows = images.read_size(image, context.limits)[1]
             return _parse_picture({**beside, "height": rows})
-        except (*BAD_INPUT, FleetMapError):  # the map's own reader says what is wrong with it
+        except (*BAD_INPUT, FleetMapError):  # the map's own reader reports its errors
             continue
     reason = (
-        "the nodes are pixels of a map's picture: add that map (map.yaml and its picture) to the upload, or the "
+        "the nodes are pixels of a map's image: add that map (map.yaml and its image) to the upload, or set the "
         "options resolution, origin and height"
     )
     raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
 
 
 def _parse_picture(members: Any) -> _Picture:
-    """A mapping's resolution, origin and height, checked."""
+    """Check and return a mapping's resolution, origin and height."""
     if not isinstance(members, dict):
         raise_unreadable("must be a mapping with resolution, origin and height", PICTURE)
     origin, height = members.get("origin"), members.get("height")
     if not isinstance(origin, list) or len(origin) != 3:
         raise_unreadable("must be [x, y, yaw]", f"{PICTURE}.origin")
     if isinstance(height, bool) or not isinstance(height, int) or not 1 <= height <= 2**31:
-        raise_unreadable("must be a whole number above 0", f"{PICTURE}.height")
+        raise_unreadable("must be an integer above 0", f"{PICTURE}.height")
     resolution = number(members.get("resolution"), f"{PICTURE}.resolution")
     if not 1e-6 <= resolution <= 1e4:
         raise_unreadable("must be between 1e-6 and 1e4 metres", f"{PICTURE}.resolution")
     x, y, yaw = (number(v, f"{PICTURE}.origin") for v in origin)
     if max(map(abs, (x, y, yaw))) > MAX_METRES:
-        raise_unreadable(f"must lie within ±{MAX_METRES:g}", f"{PICTURE}.origin")
+        raise_unreadable(f"must be within ±{MAX_METRES:g}", f"{PICTURE}.origin")
     return _Picture(resolution, (x, y, yaw), height)
 
 
@@ -229,7 +231,7 @@ def _check_origin(origin: Sequence[float], file: str) -> None:
 
 
 def related_files(main: str, names: Sequence[str]) -> Iterable[str]:
-    """Maps of the upload that the pixels may belong to, the likeliest first, and the pictures beside them."""
+    """Return maps of the upload that the pixels may belong to, likeliest first, and the images beside them."""
     folder = main.rpartition("/")[0]
     root = folder.rpartition("/")[0] if folder.rpartition("/")[2] == "topological" else None
     likely = [] if root is None else [f"{root}/metric/map".lstrip("/")]
@@ -246,50 +248,50 @@ def related_files(main: str, names: Sequence[str]) -> Iterable[str]:
 
 
 def _nodes(entries: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any]]]:
-    """(ids as texts, float64 [n, 2] pixels, further keys; ``id`` among them where it is no whole number)."""
+    """Return ids as texts, float64 [n, 2] pixels, and further keys, with ``id`` if it is not an integer."""
     names, rows, rests = [], [], []
     for k, node in enumerate(entries):
         location = f"nodes[{k}]"
         if not isinstance(node, dict):
-            raise_unreadable("a node is a mapping with id, x and y", location)
+            raise_unreadable("a node must be a mapping with id, x and y", location)
         extra_members = {key: value for key, value in node.items() if key not in ("id", "x", "y")}
         names.append(_id(node.get("id"), f"{location}.id"))
         if not isinstance(node["id"], int):
             extra_members["id"] = node["id"]
         rows.append((number(node.get("x"), f"{location}.x"), number(node.get("y"), f"{location}.y")))
         if max(map(abs, rows[-1])) > 1e12:
-            raise_unreadable("a pixel this far away is of no picture", location)
+            raise_unreadable("pixel coordinates must be within ±1e12", location)
         rests.append(extra_members)
     return names, np.array(rows, np.float64).reshape(-1, 2), rests
 
 
 def _id(value: Any, location: str) -> str:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise_unreadable("an id is a number or a text", location)
+        raise_unreadable("an id must be a number or a string", location)
     return check_name(value if isinstance(value, str) else yaml.text(value), location)
 
 
 def _edges(
     entries: Any, index_by_name: Mapping[str, int], context: ReadContext
 ) -> tuple[list[Line], list[dict[str, Any]]]:
-    """(edges between nodes; those to nowhere as they stand)."""
+    """Return the edges between nodes, and the dangling ones unchanged."""
     if entries is not None and not isinstance(entries, list):
         raise_unreadable("must be a list", "edges")
     file_lines, dangling = [], []
     for k, edge in enumerate(entries or ()):
         location = f"edges[{k}]"
         if not isinstance(edge, dict):
-            raise_unreadable("an edge is a mapping with from and to", location)
+            raise_unreadable("an edge must be a mapping with from and to", location)
         ends = [_id(edge.get(end), f"{location}.{end}") for end in ("from", "to")]
         absent = [end for end in ends if end not in index_by_name]
         if absent:
             context.warn(
-                f"there is no node {absent[0]!r}: the edge is kept, but is no part of the network", where=location
+                f"unknown node {absent[0]!r}; the edge is stored but is not part of the network", where=location
             )
             dangling.append(edge)
             continue
         if ends[0] == ends[1]:
-            context.warn(f"{ends[0]} is joined with itself", where=location)
+            context.warn(f"{ends[0]} is connected to itself", where=location)
         extra_members = {key: value for key, value in edge.items() if key not in ("from", "to")}
         if "weight" in extra_members:
             number(extra_members["weight"], f"{location}.weight")
@@ -300,18 +302,18 @@ def _edges(
 # --- writing ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What the file says where no source does."""
+    """Values to write if no source has them."""
 
     pixel_size: float = parameter(
-        RESOLUTION, "of the picture that is thought of, where no map's is known", minimum=1e-3, maximum=100.0, unit="m"
+        RESOLUTION, "pixel size of the assumed image, if no map's image is known", minimum=1e-3, maximum=100.0, unit="m"
     )
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``prm.yaml``: all networks as one roadmap, nodes by length and text of their ids, edges by their nodes.
+    """Write ``prm.yaml``: all networks as one roadmap, nodes in natural order of ids, edges by their nodes.
 
-    Nodes of other formats are moved to the centres of their pixels, and numbered where their ids are no whole numbers
-    (the id becomes the ``name``). MissingDatum for wgs84 items without a datum.
+    Nodes of other formats move to the centres of their pixels; ids that are not integers are replaced by numbers (the
+    id becomes the ``name``). Raises MissingDatum for wgs84 items without a datum.
     """
     net = merge_networks(layers, context)
     report_3d_loss(net, context, "pixels have no altitude and no level")
@@ -332,13 +334,13 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def _pixels(net: MergedNetwork, exact: Array, resolution: float, context: WriteContext) -> Array:
-    """float64 [n, 2]: the nodes' pixels, whole numbers but for nodes that a roadmap had elsewhere."""
+    """Return float64 [n, 2] pixels of the nodes: whole numbers, except for a roadmap's own fractional ones."""
     near = np.round(exact)
     own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
     is_integer = np.asarray((np.abs(exact - near) <= MAX_ROUNDING_PIXELS).all(axis=1), bool)
     moved = int((~is_integer & ~own_nodes).sum())
-    context.drop("places of nodes within their pixels", moved, f"pixels of {resolution:g} m are whole numbers")
-    # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
+    context.drop("positions of nodes within their pixels", moved, f"pixels of {resolution:g} m are whole numbers")
+    # The pixel that contains the position, including its left and lower edge.
     inside = np.stack(
         [np.floor(exact[:, 0] + 0.5 + MAX_ROUNDING_PIXELS), np.ceil(exact[:, 1] - 0.5 - MAX_ROUNDING_PIXELS)], axis=1
     )
@@ -363,14 +365,14 @@ def _node_texts(net: MergedNetwork, ids: Sequence[Any], pixels: Array, context: 
         out.append(f"- id: {yaml.text(i)}\n  x: {x}\n  y: {y}\n{yaml.mapping(members, 2) if members else ''}")
     context.drop("attributes of nodes", dropped_count, "the format has no place for them")
     if renamed:
-        context.warn(f"{renamed} nodes got a number for an id; their own one is their name, where they had none")
+        context.warn(f"{renamed} nodes got a number as id; their old id is used as name unless they had one")
     return out
 
 
 def _line_texts(
     net: MergedNetwork, ids: Sequence[Any], pixels: Array, document: Mapping[str, Any], context: WriteContext
 ) -> list[str]:
-    """The edges, and those of the source that lead nowhere."""
+    """Return the texts of the edges, and of the source's dangling edges."""
     weighed = 0
     out = []
     for line in lines(net, context, NAME):
@@ -388,7 +390,7 @@ def _line_texts(
     )
     out += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in dangling]
     if weighed:
-        context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format that does not say it")
+        context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format without weights")
     return out
 
 
@@ -404,7 +406,7 @@ def _plain(value: float) -> float:
 
 
 def _sort_nodes(net: MergedNetwork) -> MergedNetwork:
-    """The same with nodes in the order of their ids."""
+    """Sort the network's nodes by id."""
     order = sorted(range(len(net.nodes)), key=lambda k: natural_sort_key(net.nodes[k].id))
     new_index = {old: new for new, old in enumerate(order)}
     moved = [
@@ -417,7 +419,7 @@ _WHOLE_NUMBER = re.compile(r"(?:0|[1-9][0-9]{0,17})\Z", re.ASCII)
 
 
 def _ids(net: MergedNetwork) -> list[Any]:
-    """The ids as the file says them: whole numbers and a roadmap's own texts; the others get free numbers."""
+    """Return the ids to write: integers and a roadmap's own texts unchanged, unused numbers for the others."""
     out: list[Any] = []
     for node in net.nodes:
         source_id = get_source_properties(node.properties, NAME).get("id")
@@ -440,7 +442,7 @@ def _ids(net: MergedNetwork) -> list[Any]:
 
 
 def _select_picture(layers: Layers, document: Mapping[str, Any], xy: Array, context: WriteContext) -> _Picture:
-    """The picture whose pixels are written."""
+    """Return the image to whose pixels positions are converted."""
     grids = layers.grids()
     keys = choose(sorted(grids), None)
     if keys:
@@ -448,7 +450,7 @@ def _select_picture(layers: Layers, document: Mapping[str, Any], xy: Array, cont
         return _Picture(grid.resolution, grid.origin, grid.height)
     source_picture = document.get("picture")
     if isinstance(source_picture, dict):
-        with contextlib.suppress(UnreadableFile):  # a document may be edited
+        with contextlib.suppress(UnreadableFile):  # the document may have been edited
             return _parse_picture(source_picture)
     low = np.floor(xy.min(axis=0) - MARGIN) if len(xy) else np.zeros(2)
     high = np.ceil(xy.max(axis=0) + MARGIN) if len(xy) else np.ones(2)
@@ -456,12 +458,12 @@ def _select_picture(layers: Layers, document: Mapping[str, Any], xy: Array, cont
     rows = max(1, math.ceil((high[1] - low[1]) / size))
     picture = _Picture(size, (float(low[0]), float(low[1]), 0.0), rows)
     item = "picture: resolution, origin, height"
-    context.fill(item, picture.as_dict(), "no map's picture is known", "pixel_size")
+    context.fill(item, picture.as_dict(), "no map's image is known", "pixel_size")
     return picture
 
 
 def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
-    """The networks, and the grid whose pixels they are given in: ``map``, else the only one; on the ground first."""
+    """Select the networks, and the grid for pixels: ``map``, else the only one; on the ground level first."""
     grids = [key for key in keys if key.layer == "occupancy"]
     names = {key.name for key in grids}
     grids = [key for key in grids if key.name == MAP or len(names) == 1]
@@ -469,14 +471,14 @@ def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa:
     return [*(key for key in keys if key.layer == "topology"), *grids[:1]]
 
 
-# --- telling ---------------------------------------------------------------------------------------------------------
+# --- detection -------------------------------------------------------------------------------------------------------
 _NODES = re.compile(rb"(?m)^nodes[ \t]*:[ \t]*\r?\n[ \t]*- +\{?(?:id|x|y)[ \t]*:")
 _EDGES = re.compile(rb"(?m)^edges[ \t]*:")
 _EDGE = re.compile(rb"[\s{,](?:from|to)[ \t]*:")
 
 
 def detect(name: str, data: bytes) -> bool:
-    """YAML with a list of nodes that begin with id, x or y, and with edges from and to."""
+    """Detect YAML with a list of nodes that begin with id, x or y, and with edges from and to."""
     if not name.lower().endswith((".yaml", ".yml")) or not _NODES.search(data[: 2**16]):
         return False
     match = _EDGES.search(data)

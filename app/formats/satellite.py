@@ -1,13 +1,12 @@
-"""Georeferenced pictures: GeoTIFF, PNG and JPEG with a world file, pictures whose corners are given, floor plans.
+"""Georeferenced images: GeoTIFF, PNG and JPEG with a world file, images with given corners, floor plans.
 
-A GeoTIFF says by itself where it lies. A world file (.pgw, .jgw, .tfw, .wld) has six lines A, D, B, E, C, F: x =
-A·column + B·row + C and y = D·column + E·row + F for the *centre* of a pixel (ESRI's and GDAL's rule); the CRS stands
-in a .prj or .aux.xml beside it. ``corners`` are [latitude, longitude]. Pixels stay as they came; they are resampled
-where a request asks for another CRS (``app.model.resampling``). Written: a cloud optimized GeoTIFF, or PNG with a world
-file.
+A GeoTIFF contains its position. A world file (.pgw, .jgw, .tfw, .wld) has six lines A, D, B, E, C, F: x = A·column +
+B·row + C and y = D·column + E·row + F for the *centre* of a pixel (the rule of ESRI and GDAL); the CRS is in a .prj or
+.aux.xml beside it. ``corners`` are [latitude, longitude]. Pixels are stored unchanged; they are resampled only if a
+request selects another CRS (``app.model.resampling``). Written: a cloud optimized GeoTIFF, or PNG with a world file.
 
-Coordinates without a CRS are degrees where they can be (pixels of at most 0.0002°, about 20 m, on the globe), else
-metres of the local frame; both with a warning.
+Coordinates without a CRS are read as degrees if plausible (pixels of at most 0.0002°, about 20 m, within the degrees
+of the globe), else as metres of the local frame; both with a warning.
 """
 
 from __future__ import annotations
@@ -52,35 +51,35 @@ WORLD_ENDS = {
     ".tiffw": TIFF_ENDS,
     ".wld": IMAGE_ENDS,
 }
-"""A world file's ending -> those of its picture."""
+"""Extensions of the images that belong to a world file, by its own extension."""
 
 MAX_WORLD = 4096
 MAX_SIDECAR = 2**20
 DEGREE_PIXEL = 2e-4
-"""Degrees. Pixels that would be larger on earth (20 m) are no degrees: a plan in metres has 0.001 to 1 a pixel."""
+"""Largest pixel size read as degrees (20 m on earth). A plan in metres has pixels of 0.001 to 1."""
 
 HOW_TO_SUPPLY = (
-    "a picture does not say where it lies: add a world file (.pgw, .jgw, .tfw), or the option corners=lat,lon,… of two "
-    "opposite or all four corners, or, for a floor plan, metres_per_pixel with origin and yaw"
+    "no position for the image: add a world file (.pgw, .jgw, .tfw), or set corners=lat,lon,… of two opposite "
+    "or all four corners, or, for a floor plan, metres_per_pixel with origin and yaw"
 )
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?|[-+]?(nan|inf(inity)?)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """Where a picture lies that does not say it itself."""
+    """Position of an image that does not contain one."""
 
     crs: str | None = parameter(
-        None, "CRS of a picture or world file that names none: EPSG:<number>, wgs84 (longitude, latitude) or local"
+        None, "CRS of an image or world file that names none: EPSG:<number>, wgs84 (longitude, latitude) or local"
     )
     corners: tuple[float, ...] | None = parameter(
         None,
-        "lat,lon of two opposite corners, or of all four: upper left, upper right, lower right, lower left, "
-        "for a picture that does not say where it lies",
+        "lat,lon of two opposite corners, or of all four in the order upper left, upper right, lower right, "
+        "lower left; for an image without a position",
     )
     metres_per_pixel: float | None = parameter(
         None,
-        "scale of a floor plan that does not say where it lies: size of a pixel",
+        "pixel size of a floor plan without a position",
         minimum=1e-5,
         maximum=1e4,
         unit="m",
@@ -88,34 +87,35 @@ class ReadOptions:
     origin: tuple[float, float] = parameter(
         (0.0, 0.0), "x,y of a floor plan's lower left corner in the local frame", unit="m"
     )
-    yaw: float = parameter(0.0, "how far a floor plan is turned counter-clockwise round its origin", unit="rad")
-    picture: str | None = parameter(None, "name to store the picture under; default: that of its file")
-    file: str | None = parameter(None, "which file the options place, where several pictures are uploaded")
+    yaw: float = parameter(0.0, "rotation of a floor plan about its origin, counter-clockwise", unit="rad")
+    picture: str | None = parameter(None, "name to store the image under; default: the file's name")
+    file: str | None = parameter(None, "file that the options apply to, if several images are uploaded")
 
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """Which picture, and how it is written."""
+    """Image to write, and its encoding."""
 
-    picture: str | None = parameter(None, "name of the picture; *: all; default: satellite, else the only one")
-    level: str | None = parameter(None, "level of the picture; *: all; default: the one it is on")
+    picture: str | None = parameter(None, "name of the image; *: all; default: satellite, else the only one")
+    level: str | None = parameter(None, "level of the image; *: all; default: the level of the image")
     file_type: Literal["tif", "png"] | None = parameter(
         None, "tif: a cloud optimized GeoTIFF with everything (default); png: 8 bit with a world file"
     )
     crs: Literal["source", "local", "wgs84"] = parameter(
-        "source", "source: its own pixels and CRS; local or wgs84: resampled to metres of the local frame or to degrees"
+        "source",
+        "source: original pixels and CRS; local or wgs84: resampled to metres of the local frame or to degrees",
     )
     resolution: float | None = parameter(
-        None, "resample to this size of a pixel, in metres or degrees of the CRS", minimum=1e-9, maximum=1e6
+        None, "pixel size to resample to, in metres or degrees of the CRS", minimum=1e-9, maximum=1e6
     )
     resampling: Literal["nearest", "bilinear", "cubic"] | None = parameter(
-        None, "how a value between pixels is made; default: bilinear, nearest for palettes"
+        None, "interpolation between pixels; default: bilinear, nearest for palettes"
     )
 
 
-# --- telling ------------------------------------------------------------------------------------------------------
+# --- detection ----------------------------------------------------------------------------------------------------
 def detect(name: str, data: bytes) -> bool:
-    """A GeoTIFF, or a world file. A picture alone may be of anything."""
+    """Detect a GeoTIFF or a world file. An image alone may show anything."""
     end = _world_file_ending(name)
     if end is None:
         return geotiff.is_georeferenced(data)
@@ -125,12 +125,12 @@ def detect(name: str, data: bytes) -> bool:
 
 
 def yields(name: str) -> bool:
-    """A world file only speaks for its picture."""
+    """Whether the file is a world file, which only describes its image."""
     return _world_file_ending(name) is not None
 
 
 def lacking(name: str, data: bytes) -> str:
-    """What to add to a picture that does not say where it lies."""
+    """Return what to add to an image without a position; else an empty text."""
     del name
     return HOW_TO_SUPPLY if _is_picture(data) and not geotiff.is_georeferenced(data) else ""
 
@@ -145,7 +145,7 @@ def _world_file_ending(name: str) -> str | None:
 
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
-    """Of a world file its picture, of a picture its world file; with the .prj and .aux.xml beside the two."""
+    """Return a world file's image or an image's world file, and the .prj and .aux.xml beside them."""
     del data
     by_lower = _by_lower_case(tuple(names))
     lower = main.lower()
@@ -164,8 +164,10 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
 
 @lru_cache(maxsize=4)
 def _by_lower_case(names: tuple[str, ...]) -> dict[str, str]:
-    """Names by their small letters, the first of those that differ in nothing else; kept, since every picture of an
-    upload asks for the same."""
+    """Map lower-case names to names, the first of those that differ only in case.
+
+    Cached, since it is called for every image of an upload.
+    """
     by_lower: dict[str, str] = {}
     for name in names:
         by_lower.setdefault(name.lower(), name)
@@ -174,7 +176,7 @@ def _by_lower_case(names: tuple[str, ...]) -> dict[str, str]:
 
 # --- reading ------------------------------------------------------------------------------------------------------
 def read(files: Files, context: ReadContext) -> Layers:
-    """One picture. Raises UnreadableFile (with file and reason), TooLarge, or Invalid for options that cannot be."""
+    """Read one image. Raises UnreadableFile (with file and reason), TooLarge, or Invalid for invalid options."""
     main = context.main or next(iter(files))
     options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
     _check_options(options)
@@ -182,10 +184,10 @@ def read(files: Files, context: ReadContext) -> Layers:
     image = main if _world_file_ending(main) is None else next((n for n in files if _is_picture(files[n])), None)
     if image is None:
         stem, end = main.rpartition(".")[0], WORLD_ENDS[_world_file_ending(main) or ".wld"]
-        reason = f"the picture of this world file is not in the upload: add {stem.rpartition('/')[2]}{end[0]} beside it"
+        reason = f"the upload lacks the image of this world file: add {stem.rpartition('/')[2]}{end[0]} beside it"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)])
     if not _is_picture(files[image]):
-        reason = "its first bytes are not those of a TIFF, PNG, JPEG or BMP picture"
+        reason = "not a TIFF, PNG, JPEG or BMP image: its first bytes do not match"
         raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image)])
     if not context.wants("imagery"):
         return Layers()
@@ -226,8 +228,10 @@ def _decode(data: bytes, limits: Limits) -> geotiff.Raster:
 
 
 def _pixels(image: Image.Image, mode: str, kind: type[np.generic]) -> NDArray[Any]:
-    """[height, width, bands] of a picture in this mode, a strip of rows at a time: Pillow's own way takes twice the
-    memory."""
+    """Return [height, width, bands] of an image in this mode, converted in strips of rows.
+
+    Pillow's own conversion takes twice the memory.
+    """
     bands = len(Image.new(mode, (1, 1)).getbands())
     out = np.empty((image.height, image.width, bands), kind)
     rows = max(1, images.STRIP // image.width)
@@ -256,10 +260,10 @@ def _check_options(options: ReadOptions) -> None:
             reason = f"corners must be lat,lon of two or four corners (4 or 8 numbers), got {len(corners)} numbers"
             problems.append(Problem(reason, where="corners"))
         elif any(abs(v) > (180.0 if k % 2 else 90.0) for k, v in enumerate(corners)):
-            reason = "corners are latitude (-90 to 90) and longitude (-180 to 180) by turns, degrees"
+            reason = "corners must be latitude (-90 to 90) and longitude (-180 to 180) in turn, in degrees"
             problems.append(Problem(reason, where="corners"))
         if options.metres_per_pixel is not None:
-            reason = "a picture is placed by its corners or by metres_per_pixel, not by both"
+            reason = "corners and metres_per_pixel exclude each other: use one of them"
             problems.append(Problem(reason, where="metres_per_pixel"))
     if any(abs(v) > MAX_METRES for v in options.origin):
         problems.append(Problem(f"origin must be within ±{MAX_METRES:g} m", where="origin"))
@@ -270,25 +274,27 @@ def _check_options(options: ReadOptions) -> None:
 def _place(
     raster: geotiff.Raster, image: str, world: str | None, files: Files, options: ReadOptions, context: ReadContext
 ) -> tuple[Affine, str]:
-    """Where the picture lies: what it says itself, else its world file, else the options."""
+    """Return the image's transform and CRS: from the image itself, else its world file, else the options."""
     height, width = raster.pixels.shape[:2]
     file_transform, teller = raster.transform, image
     if file_transform is not None and world is not None:
-        context.warn("the world file is not used: the picture says itself where it lies", file=world)
+        context.warn("the world file is ignored: the image contains its position", file=world)
     elif file_transform is None and world is not None:
         file_transform, teller = _read_world(files[world], world), world
     option = "corners" if options.corners else "metres_per_pixel" if options.metres_per_pixel else None
     if file_transform is not None:
         if option:
             context.warn(
-                f"the option {option} is not used: {teller} says where the picture lies", file=image, where=option
+                f"option {option} is ignored: {teller} gives the position of the image", file=image, where=option
             )
         return file_transform, _find_crs(file_transform, raster, teller, options, context)
     if options.crs is not None and option:
         reason = (
-            "corners are latitude and longitude" if option == "corners" else "metres_per_pixel is of the local frame"
+            "corners are latitude and longitude"
+            if option == "corners"
+            else "metres_per_pixel refers to the local frame"
         )
-        context.warn(f"the option crs is not used: {reason}", file=image, where="crs")
+        context.warn(f"option crs is ignored: {reason}", file=image, where="crs")
     if options.corners is not None:
         return _from_corners(options.corners, width, height, image, context), WGS84
     if options.metres_per_pixel is not None:
@@ -304,19 +310,19 @@ def _find_crs(
     option = options.crs
     if raster.crs is not None:
         if option is not None:
-            context.warn("the option crs is not used: the picture names its own", file=teller, where="crs")
+            context.warn("option crs is ignored: the image names its own CRS", file=teller, where="crs")
         return raster.crs
     if option is not None:
         return {"wgs84": WGS84, LOCAL: LOCAL}.get(option.lower(), option.upper())
     if _looks_like_degrees(transform, raster.pixels.shape[1], raster.pixels.shape[0]):
         context.warn(
-            "it names no CRS: its numbers are taken for degrees (longitude, latitude on WGS 84); if they are not, say "
+            "no CRS; coordinates are read as degrees (longitude, latitude on WGS 84). If they are not, set "
             "crs=EPSG:<number> or crs=local",
             file=teller,
         )
         return WGS84
     context.warn(
-        "it names no CRS: its numbers are taken for metres of the local frame; if they are not, say crs=EPSG:<number>",
+        "no CRS; coordinates are read as metres of the local frame. If they are not, set crs=EPSG:<number>",
         file=teller,
     )
     return LOCAL
@@ -330,7 +336,7 @@ def _looks_like_degrees(transform: Affine, width: int, height: int) -> bool:
 
 
 def _read_world(data: bytes, name: str) -> Affine:
-    """A world file's six numbers, from the centre of the first pixel to its outer corner."""
+    """Read a world file's six numbers; move the origin from the centre of the first pixel to its outer corner."""
     tokens = data.split()
     bad_index = next((k for k, token in enumerate(tokens[:6]) if not _NUMBER.fullmatch(token)), None)
     if len(tokens) != 6 or bad_index is not None:
@@ -347,7 +353,7 @@ def _read_world(data: bytes, name: str) -> Affine:
 
 
 def _from_corners(corners: Sequence[float], width: int, height: int, image: str, context: ReadContext) -> Affine:
-    """Longitude and latitude over the picture, from (latitude, longitude) of its corners."""
+    """Fit a transform to longitude and latitude, from (latitude, longitude) of the corners."""
     latitude, longitude = corners[0::2], corners[1::2]
     if len(latitude) == 2:
         west, east = sorted(longitude)
@@ -365,17 +371,19 @@ def _from_corners(corners: Sequence[float], width: int, height: int, image: str,
     transform, off = fit
     if off > 0.02 * math.hypot(width, height):
         reason = (
-            f"the corners are no parallelogram ({off:.0f} pixels off): give them as upper left, upper right, lower "
-            "right, lower left, each as latitude,longitude"
+            f"the corners are not a parallelogram ({off:.0f} pixels off): give them as upper left, upper right, "
+            "lower right, lower left, each as latitude,longitude"
         )
         raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="corners")])
     if off > 0.5:
-        context.warn(f"the corners are {off:.1f} pixels off the nearest parallelogram, which is taken", file=image)
+        context.warn(
+            f"the corners are {off:.1f} pixels off the nearest parallelogram, which is used instead", file=image
+        )
     return transform
 
 
 def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
-    """The CRS of a .prj or .aux.xml beside a picture."""
+    """Return the CRS of a .prj or .aux.xml beside an image."""
     for name in sorted(files):
         lower, data = name.lower(), files[name]
         if not lower.endswith((".prj", ".aux.xml")):
@@ -390,25 +398,27 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
             if text and text.strip():
                 return geotiff.crs_from_wkt(text)
         except (UnreadableFile, UnicodeError) as error:
-            reason = error.detail if isinstance(error, UnreadableFile) else "it is not UTF-8 text"
+            reason = error.detail if isinstance(error, UnreadableFile) else "not UTF-8 text"
             raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name)]) from error
     return None
 
 
 def _check_place(picture: GeoImage, image: str) -> None:
-    """Refuse what lies nowhere: beyond the local frame, or where PROJ knows no place on earth."""
+    """Reject positions beyond the local frame, or without coordinates on earth in PROJ."""
     reason = geotiff.position_problem(picture)
     if reason is not None:
         local = picture.crs == LOCAL
-        advice = "say crs=EPSG:<number>" if local else "say another with crs=EPSG:<number>, or crs=local"
+        advice = "set crs=EPSG:<number>" if local else "set another one with crs=EPSG:<number>, or crs=local"
         reason = f"{reason}: {advice}"
         raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where=None if local else "crs")])
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``satellite.tif``, or ``satellite.png`` with its world file. Raises MissingLayer, NotFound, Ambiguous,
-    MissingDatum, or Invalid for a grid that cannot be."""
+    """Write ``satellite.tif``, or ``satellite.png`` with its world file.
+
+    Raises MissingLayer, NotFound, Ambiguous, MissingDatum, or Invalid for an impossible raster.
+    """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
     pictures = {k: p for k, p in layers.parts_of("imagery").items() if isinstance(p, GeoImage)}
     key = choose(sorted(pictures), options)[0]
@@ -419,7 +429,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         if new_picture is not picture:
             picture = replace(new_picture, properties=_without_statistics(new_picture.properties))
     elif options.resampling is not None:
-        raise Invalid("resampling only says how crs=local, crs=wgs84 or a resolution are made: ask for one of them")
+        raise Invalid("resampling has no effect without crs=local, crs=wgs84 or a resolution: set one of them")
     stem = file_stem(options.picture or NAME, NAME)
     named: str | None = picture.crs
     if picture.crs == LOCAL:
@@ -430,8 +440,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         return _write_png(picture, named, stem, context)
     if named is None:
         context.warn(
-            "its coordinates are metres of the local frame, which it cannot name as a CRS; "
-            "crs=wgs84 places it on earth where there is a datum",
+            "its coordinates are metres of the local frame, which has no CRS name; use crs=wgs84 for a position "
+            "on earth (needs a datum)",
             file=f"{stem}.tif",
         )
     tags = _tags(picture)
@@ -444,15 +454,18 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """The named picture; else ``satellite``, else the only one; on its level, else on the ground, else the only one."""
+    """Select the named image; else ``satellite``, else the only one.
+
+    On the given level, else on the ground, else on the only one.
+    """
     supply = "upload one (a GeoTIFF, or a PNG with its world file)"
     return select_part(
-        keys, "imagery", options.picture, options.level, noun="picture", option="picture", supply=supply, default=NAME
+        keys, "imagery", options.picture, options.level, noun="image", option="picture", supply=supply, default=NAME
     )
 
 
 def options_from_filename(name: str) -> dict[str, str]:
-    """``satellite.png`` and ``satellite.pgw`` ask for PNG; ``plan.tif`` for the picture ``plan``, too."""
+    """Return the options that a file name implies: ``.png`` and ``.pgw`` PNG, ``plan.tif`` the image ``plan``."""
     lower = name.lower()
     for end, kind in ((".png.aux.xml", "png"), (".png", "png"), (".pgw", "png"), (".tif", "tif")):
         if lower.endswith(end) and len(name) > len(end):
@@ -468,7 +481,7 @@ def _tags(picture: GeoImage) -> dict[str, str]:
 
 
 def _without_statistics(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """Of resampled bands: their stated statistics hold no longer."""
+    """Remove the statistics of resampled bands, which are no longer valid."""
     bands = []
     for band in properties.get("bands", ()):
         source_properties = band.get(NAME) if isinstance(band, Mapping) else None
@@ -484,13 +497,15 @@ def _write_png(picture: GeoImage, crs: str | None, stem: str, context: WriteCont
     height, width, count = picture.pixels.shape
     pixels = display_pixels(picture)
     if picture.pixels.dtype != np.uint8:
-        why = f"PNG holds 8 bit here: {picture.pixels.dtype} was stretched to 0…255; file_type=tif keeps the values"
+        why = (
+            f"PNG is written with 8 bit: {picture.pixels.dtype} was stretched to 0…255; file_type=tif keeps the values"
+        )
         context.drop("pixel values", height * width, why)
     colours = picture.colours
     shown = 3 if {"red", "green", "blue"} <= set(colours) else 1
     extra = count - shown - any(c in ("alpha", "mask") for c in colours)
-    context.drop("bands", extra, "PNG holds grey or red, green and blue with transparency; file_type=tif keeps all")
-    context.drop("tags", len(_tags(picture)), "they are the GeoTIFF's own; file_type=tif keeps them")
+    context.drop("bands", extra, "PNG is written as grey or RGB with transparency; file_type=tif keeps all bands")
+    context.drop("tags", len(_tags(picture)), "they are GeoTIFF metadata; file_type=tif keeps them")
     a, b, c, d, e, f = picture.transform
     digits = METRES if crs is None or abs(a) + abs(e) > 0.1 else DEGREES
     numbers = [*map(_exact, (a, d, b, e)), _round(c + a / 2 + b / 2, digits), _round(f + d / 2 + e / 2, digits)]
@@ -509,12 +524,12 @@ def _exact(value: float) -> str:
 
 
 def _round(value: float, digits: int) -> str:
-    """To a nanometre, or as far as 15 digits go: half a pixel forth and back leaves it the same."""
+    """Round to a nanometre, or to 15 digits if these are fewer, so that a shift by half a pixel and back is exact."""
     return repr(float(f"{round(value, digits):.15g}") + 0.0)
 
 
 def _aux_xml(crs: str) -> bytes:
-    """GDAL's file for what a picture cannot say itself: QGIS and GDAL take the CRS from it."""
+    """Return GDAL's sidecar file with the CRS, which QGIS and GDAL read."""
     from xml.sax.saxutils import escape
 
     return f"<PAMDataset>\n  <SRS>{escape(geotiff.crs_to_wkt(crs))}</SRS>\n</PAMDataset>\n".encode()
@@ -523,7 +538,7 @@ def _aux_xml(crs: str) -> bytes:
 register(
     Format(
         name=NAME,
-        title="Georeferenced picture (GeoTIFF, or PNG and JPEG with a world file)",
+        title="Georeferenced image (GeoTIFF, or PNG and JPEG with a world file)",
         files={"satellite.tif": "image/tiff", "satellite.png": "image/png", "satellite.pgw": "text/plain"},
         layers=frozenset({"imagery"}),
         detect=detect,

@@ -1,11 +1,11 @@
-"""waypoints_csv: waypoints as a table, one in a row: ``name,x,y,yaw`` or ``name,latitude,longitude,yaw``.
+"""waypoints_csv: waypoints as a table, one per row: ``name,x,y,yaw`` or ``name,latitude,longitude,yaw``.
 
 The first row names the columns, in any order; ``yaw`` may be absent or empty. ``x`` and ``y`` are metres in the local
 frame, ``latitude`` and ``longitude`` degrees WGS 84, ``yaw`` radians, counter-clockwise from the local x axis. UTF-8,
-separated by commas, texts in quotes where they need them (RFC 4180).
+comma-separated, quoted where necessary (RFC 4180).
 
-Each row is a node without edges; its id is its name. ``yaw`` is its orientation. Further columns are texts under
-``properties.waypoints_csv``, and come back. A map has the coordinates that the upload had, else metres.
+Each row is a node without edges; its id is its name. ``yaw`` is its orientation. Further columns are stored as texts
+under ``properties.waypoints_csv`` and written again. A map has the coordinates of the upload, by default metres.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ LIMITS = {"x": MAX_METRES, "y": MAX_METRES, "latitude": 90.0, "longitude": 180.0
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The rows as nodes. Raises UnreadableFile naming the line and column."""
+    """Read the rows as nodes. Raises UnreadableFile naming the line and column."""
     if not context.wants("topology"):
         return Layers()
     data = files[context.main or next(iter(files))]
     if len(data) > context.limits.text_bytes:
-        raise TooLarge(f"the table has {len(data)} bytes; the limit for a text is {context.limits.text_bytes}")
+        raise TooLarge(f"the table has {len(data)} bytes; the limit for text files is {context.limits.text_bytes}")
     rows = _rows(data.decode("utf-8-sig"))
     header = [title.strip() for title in next(rows, ("", []))[1]]
     axes = _axes(header)
     if axes is None or duplicates(header):
         raise_unreadable(
-            "the first row must name the columns, each once: name, and x and y or latitude and longitude", "line 1"
+            "the first row must name each column once: name, and either x and y or latitude and longitude", "line 1"
         )
     names: list[str] = []
     places: list[tuple[float, ...]] = []
     properties: list[Properties] = []
     for location, row in rows:
         if len(row) != len(header):
-            raise_unreadable(f"has {len(row)} values, the first row names {len(header)} columns", location)
+            raise_unreadable(f"has {len(row)} values, but the first row names {len(header)} columns", location)
         cells = dict(zip(header, row, strict=True))
         names.append(check_name(cells.pop("name").strip(), f"{location}, name"))
         places.append(tuple(_number(cells.pop(axis), axis, location) for axis in axes))
@@ -74,7 +74,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         source_members |= {column: text for column, text in cells.items() if text}
         properties.append({**node, NAME: source_members})
     if repeats := duplicates(names):
-        context.warn(f"{len(repeats)} names stand twice or more and got a number: {shorten_list(repeats)}")
+        context.warn(f"{len(repeats)} duplicate names: {shorten_list(repeats)}; later ones got a number")
     xy = np.array(places, np.float64).reshape(-1, 2)
     points = np.asarray(shapely.points(xy if axes == METRES else xy[:, ::-1]), object).reshape(-1)
     anchor: Anchor = "local" if axes == METRES else "wgs84"
@@ -84,18 +84,18 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _rows(text: str) -> Iterator[tuple[str, list[str]]]:
-    """(where it is, cells) of each row that is not empty."""
+    """Yield (line, cells) of each row that is not empty."""
     rows = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         for row in rows:
             if row:
                 yield f"line {rows.line_num}", row
     except csv.Error as error:
-        raise_unreadable(f"no CSV: {error}", f"line {rows.line_num}")
+        raise_unreadable(f"not CSV: {error}", f"line {rows.line_num}")
 
 
 def _axes(header: Sequence[str]) -> tuple[str, str] | None:
-    """Which columns are the coordinates; None where this is no such table."""
+    """Return the names of the coordinate columns; None if this is no such table."""
     candidates = [axes for axes in (METRES, DEGREES) if set(axes) <= set(header)]
     return candidates[0] if "name" in header and len(candidates) == 1 else None
 
@@ -110,20 +110,20 @@ def _number(text: str, column: str, location: str) -> float:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``waypoints.csv``: the nodes of all networks, by name. MissingDatum where degrees and metres meet without one."""
+    """Write ``waypoints.csv``: the nodes of all networks, sorted by id. Raises MissingDatum if degrees need a datum."""
     net = merge_networks(layers, context)
     columns = source_document(layers, NAME).get("columns")
     columns = columns if isinstance(columns, list) and _axes(list(map(str, columns))) else ["name", *METRES, "yaw"]
     axes = _axes(columns) or METRES
-    context.drop("edges", len(net.edges), "a table of waypoints has none")
-    context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), "waypoints are flat")
+    context.drop("edges", len(net.edges), "a table of waypoints has no edges")
+    context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), "waypoints are two-dimensional")
     if len(set(net.levels)) > 1:
-        context.drop("levels of nodes", len(net.nodes), "all networks are one table")
+        context.drop("levels of nodes", len(net.nodes), "all networks are joined into one table")
     places = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
     digits = decimals.METRES
     if axes == DEGREES:
         if layers.frame is None:
-            raise MissingDatum("waypoints in degrees need a datum: give the environment one")
+            raise MissingDatum("waypoints in degrees need a datum: set the environment's datum")
         places, digits = layers.frame.to_wgs84(places)[:, ::-1], decimals.DEGREES
     dropped_count = 0
     out = io.StringIO(newline="")
@@ -143,7 +143,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A first row that names such columns."""
+    """Detect a first row with such columns."""
     if not name.lower().endswith(".csv"):
         return False
     first = data[:4096].decode("utf-8-sig", "replace").partition("\n")[0]

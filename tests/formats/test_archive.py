@@ -1,4 +1,4 @@
-"""ZIP archives: what is safe comes out byte for byte, what is not is refused before a byte is written anywhere."""
+"""ZIP archives: safe ones are unpacked byte for byte, unsafe ones are refused before any file is written."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def zipped(*members: tuple[str | zipfile.ZipInfo, bytes]) -> bytes:
 
 
 class Pipe(io.RawIOBase):
-    """A target that cannot seek, so that sizes follow the data."""
+    """A target without seek, so that sizes follow the data."""
 
     def __init__(self) -> None:
         self.body = bytearray()
@@ -54,7 +54,7 @@ def with_mode(mode: int, name: str = "a") -> bytes:
 
 
 def patched(data: bytes, mark: bytes, offset: int, new: bytes, occurrence: int = 0) -> bytes:
-    """The archive with other bytes at this offset of the n-th header with this mark."""
+    """Patch bytes at this offset of the n-th header with this signature."""
     at = -1
     for _ in range(occurrence + 1):
         at = data.index(mark, at + 1)
@@ -65,11 +65,11 @@ LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"
 
 
 def renamed(name: bytes) -> bytes:
-    """An archive with one member of this raw name in both headers."""
+    """Build an archive with one member of this raw name in both headers."""
     return zipped(("x" * len(name), b"1")).replace(b"x" * len(name), name)
 
 
-def test_what_is_packed_comes_out_and_the_same_files_give_the_same_bytes():
+def test_packed_files_round_trip_and_bytes_are_deterministic():
     data = archives.pack(FILES, "doc.kml")
     assert archives.unpack(data, Limits()) == FILES
     assert list(archives.unpack(data, Limits())) == ["doc.kml", "empty.txt", "images/é.png", "inner.zip"]
@@ -92,7 +92,7 @@ def test_archives_of_other_packers_are_read():
     assert archives.unpack(zipped(), Limits()) == {}
 
 
-def test_a_name_without_a_flag_is_utf8_from_unix_and_cp437_from_dos():
+def test_unflagged_name_is_utf8_from_unix_and_cp437_from_dos():
     raw = "é.txt".encode()
     unix = renamed(raw)
     assert list(archives.unpack(unix, Limits())) == ["é.txt"]
@@ -142,13 +142,13 @@ def test_unsafe_archives_are_refused(why: str, data: bytes):
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_a_name_twice_is_refused():
+def test_duplicate_name_is_refused():
     with pytest.raises(UnsafeArchive, match="same name as another member"):
         archives.unpack(zipped(("a", b"1"), ("a", b"2")), Limits())
 
 
-def test_members_that_overlap_are_refused():
-    """One member lies inside another one's data: the trick behind bombs that quote themselves."""
+def test_overlapping_members_are_refused():
+    """One member inside another one's data, as in self-quoting bombs."""
     inner = zipped(("b", b"2" * 10))
     stored = zipfile.ZipInfo("a")
     out = io.BytesIO()
@@ -165,20 +165,20 @@ def test_members_that_overlap_are_refused():
         archives.unpack(outer[:start] + directory + end, Limits())
 
 
-def lying(declared: int) -> bytes:
-    """A member of a million zeros that declares another size in both headers."""
+def with_declared_size(declared: int) -> bytes:
+    """Build a member of a million zeros that declares another size in both headers."""
     data = zipped(("a", bytes(1_000_000)))
     size = struct.pack("<L", declared)
     return patched(patched(data, LOCAL, 22, size), CENTRAL, 24, size)
 
 
-def test_real_output_is_counted():
+def test_unpacked_bytes_are_counted_not_declared_ones():
     with pytest.raises(UnsafeArchive, match="more than its declared 1000 bytes"):
-        archives.unpack(lying(1000), Limits())
+        archives.unpack(with_declared_size(1000), Limits())
     with pytest.raises(UnsafeArchive, match="differs from its declared size"):
-        archives.unpack(lying(2_000_000), Limits())
+        archives.unpack(with_declared_size(2_000_000), Limits())
     with pytest.raises(TooLarge):
-        archives.unpack(lying(0xFFFFFFFE), Limits())
+        archives.unpack(with_declared_size(0xFFFFFFFE), Limits())
     with pytest.raises(TooLarge):
         archives.unpack(zipped(("a", bytes(1001))), Limits(unpacked_bytes=1000))
     with pytest.raises(TooLarge, match="members"):
@@ -205,7 +205,7 @@ def test_other_compressions_are_refused_with_a_reason(kind: int):
         archives.unpack(out.getvalue(), Limits())
 
 
-def test_a_wrong_checksum_is_damage():
+def test_wrong_checksum_is_refused():
     data = zipped(("a", b"1" * 99))
     wrong = struct.pack("<L", zlib.crc32(b"2"))
     with pytest.raises(UnreadableFile, match="checksum"):
@@ -221,7 +221,7 @@ def test_every_truncation_is_refused():
 
 @settings(deadline=None, max_examples=300)
 @given(st.data())
-def test_no_change_of_bytes_does_anything_but_a_refusal_or_the_same_files(data):
+def test_mutated_archive_is_refused_or_within_limits(data):
     body = bytearray(archives.pack(FILES, "doc.kml"))
     for _ in range(data.draw(st.integers(1, 4))):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
@@ -239,8 +239,8 @@ def test_unusable_names_are_not_packed(name: str):
         archives.pack({name: b""})
 
 
-def test_large_members_stay_whole():
-    """More than one piece in and out, also where the packed data ends long before its output does."""
+def test_large_members_round_trip():
+    """More than one piece of input and output, also if the packed data ends long before its output."""
     files = {"zeros": bytes(5_000_000), "noise": bytes(range(256)) * 20_000, "ones": b"1" * (2**20)}
     assert archives.unpack(archives.pack(files), Limits()) == files
 
@@ -248,7 +248,7 @@ def test_large_members_stay_whole():
 BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", ".pcd", ".ply")
 
 
-def test_texts_of_all_formats_are_bound_as_texts():
+def test_text_limits_apply_to_files_of_all_formats():
     endings = {end for fmt in all_formats().values() for end in fmt.extensions}
     texts = sorted(end for end in endings if not end.endswith((*BINARY, *archives._IMAGES)))
     assert ".site.ron" in texts
@@ -261,12 +261,12 @@ BUILDERS: list[Callable[[], bytes]] = [lambda: b"", lambda: b"PK", lambda: b"PK\
 
 
 @pytest.mark.parametrize("build", BUILDERS)
-def test_what_is_no_archive_is_unreadable(build: Callable[[], bytes]):
+def test_non_archive_is_unreadable(build: Callable[[], bytes]):
     with pytest.raises(UnreadableFile):
         archives.unpack(build(), Limits())
 
 
-def test_what_is_packed_is_accepted_however_uniform_it_is(monkeypatch: pytest.MonkeyPatch):
+def test_packed_uniform_files_are_accepted(monkeypatch: pytest.MonkeyPatch):
     array, text = "config/fleet_map/0.bin", "config/fleet_map/content.json"
     packed = archives.pack({array: bytes(20_000_000)})
     assert len(packed) < 100_000

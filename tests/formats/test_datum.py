@@ -1,4 +1,4 @@
-"""datum.yaml: real files come back the same; the heading means what robot_localization means; bad ones are named."""
+"""datum.yaml: real files round-trip, the heading matches robot_localization, errors name their location."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def real(shared: Path) -> list[Path]:
     return sorted((shared / "data").rglob("datum*.yaml"))
 
 
-def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+def test_real_files_round_trip(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
     paths = real(shared)
     assert len(paths) == 9
     for path in paths:
@@ -98,7 +98,7 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         assert part.geometry[0].bounds == (box["minlon"], box["minlat"], box["maxlon"], box["maxlat"])
 
 
-def test_the_sample_in_full() -> None:
+def test_sample_is_written_as_expected() -> None:
     data = (SAMPLES / "datum.yaml").read_bytes()
     fact = FACTS["datum.yaml"]
     layers, context = read(data)
@@ -120,7 +120,7 @@ def test_the_sample_in_full() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, -0.5, math.pi / 2, math.pi, -3.0, 7.0, 100.0])
-def test_the_heading_is_that_of_robot_localization(yaw: float) -> None:
+def test_heading_matches_robot_localization(yaw: float) -> None:
     """A robot at the datum whose yaw is 0 in the local frame points along +x: by ``yaw`` counter-clockwise of east."""
     layers, _ = read(FILE.replace("-0.5, 0.0]", f"-0.5, {yaw}]"))
     frame = LocalFrame(datum(layers))
@@ -131,7 +131,7 @@ def test_the_heading_is_that_of_robot_localization(yaw: float) -> None:
     assert yaml.safe_load(served)["navsat_transform_node"]["datum"] == [53.25, -0.5, yaw]  # its own digits and turns
 
 
-def test_a_new_datum_moves_what_stood_at_the_old_one_and_nothing_else() -> None:
+def test_new_datum_moves_only_origins_at_old_datum() -> None:
     layers, _ = read((SAMPLES / "datum.yaml").read_bytes())
     served, _ = write(Layers(layers.parts, Datum(-33.4, 151.25, 12.5, 90.0), layers.levels))
     top = yaml.safe_load(served)
@@ -145,7 +145,7 @@ def test_a_new_datum_moves_what_stood_at_the_old_one_and_nothing_else() -> None:
     assert (back.altitude, back.heading) == (12.5, pytest.approx(90.0))
 
 
-def test_what_no_source_says_is_filled_in_from_the_extent() -> None:
+def test_missing_size_is_filled_in_from_extent() -> None:
     frame = LocalFrame(Datum(10.0, 20.0))
     corners = frame.to_wgs84(np.array([[-30.2, -10.4], [50.5, -10.4], [50.5, 80.9], [-30.2, 80.9]]))
     fence = features([("f", shapely.Polygon(corners), {"kind": "fence"})], "wgs84")
@@ -159,7 +159,7 @@ def test_what_no_source_says_is_filled_in_from_the_extent() -> None:
     assert whats == {"gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
 
 
-def test_what_no_source_says_can_be_said() -> None:
+def test_missing_values_come_from_options() -> None:
     context = WriteContext(
         options=formats.write_options(FORMAT, {"wait_for_datum": "no", "yaw_offset": "1.57", "half_size": 50})
     )
@@ -176,7 +176,7 @@ def test_what_no_source_says_can_be_said() -> None:
     assert {key: served[key] for key in other} == {**other, **{k: v for k, v in source.items() if k in other}}
 
 
-def test_a_datum_without_a_fence_is_served_and_read() -> None:
+def test_datum_without_fence_round_trips() -> None:
     served, write_context = write(Layers({}, Datum(10.0, 20.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == []
     assert "no fence" in write_context.warnings[0].problem
@@ -190,7 +190,7 @@ def test_a_datum_without_a_fence_is_served_and_read() -> None:
     assert datum(bare) == Datum(10.0, 20.0)
 
 
-def test_the_fence_is_chosen_and_the_rest_declared() -> None:
+def test_one_fence_is_written_and_others_are_reported_as_dropped() -> None:
     small = shapely.Polygon([(0, 0), (0, 1), (1, 1)])
     big = shapely.Polygon([(0, 0), (0, 3), (3, 3), (3, 0)], [[(1, 1), (1, 2), (2, 2)]])
     rows: list[tuple[str, Any, dict[str, Any]]] = [
@@ -201,7 +201,7 @@ def test_the_fence_is_chosen_and_the_rest_declared() -> None:
     served, context = write(Layers({SITE: features(rows, "wgs84")}, Datum(1.0, 1.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == [[0, 0], [3, 0], [3, 3], [0, 3]]
     assert {d.subject: d.count for d in context.dropped} == {
-        "location items that are no polygons": 1,
+        "location items that are not polygons": 1,
         "further location polygons": 1,
         "holes of the fence": 1,
     }
@@ -209,7 +209,7 @@ def test_the_fence_is_chosen_and_the_rest_declared() -> None:
     assert len(yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"]) == 3
 
 
-def test_a_local_fence_is_written_in_degrees() -> None:
+def test_local_fence_is_written_in_degrees() -> None:
     square = shapely.Polygon([(0, 0), (100, 0), (100, 100), (0, 100)])
     served, _ = write(Layers({SITE: features([("f", square, {"kind": "fence"})], "local")}, Datum(53.25, -0.5)))
     coords = yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"]
@@ -223,7 +223,7 @@ def test_degrees_near_zero_are_numbers_for_pyyaml() -> None:
     assert (top["datum_latitude"], top["datum_longitude"]) == (1e-7, -2e-12)
 
 
-def test_doubts_are_told() -> None:
+def test_doubtful_values_are_warned_about() -> None:
     text = FILE.replace("datum: [53.25, -0.5, 0.0]", "yaw_offset: 1.57\n  datum: [53.2501, -0.5, 0.0]")
     layers, context = read(text)
     assert datum(layers).latitude == 53.25
@@ -260,7 +260,7 @@ def test_doubts_are_told() -> None:
         ("\n  datum: [53.25, -0.5, 0.0]", " 5", "navsat_transform_node", None),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named(before: str, after: str, where: str | None, line: int | None) -> None:
+def test_invalid_values_are_refused_with_location(before: str, after: str, where: str | None, line: int | None) -> None:
     assert before in FILE
     with pytest.raises(UnreadableFile) as caught:
         read(FILE.replace(before, after, 1))
@@ -299,7 +299,7 @@ more = st.dictionaries(st.text("abcdef", min_size=1, max_size=5), scalars | st.l
     degrees, degrees, st.floats(-10, 10), st.lists(st.tuples(degrees, degrees), min_size=3, max_size=8, unique=True),
     st.booleans(), more, more, more,
 )  # fmt: skip
-def test_any_file_comes_back_the_same(
+def test_any_file_round_trips(
     latitude: float, longitude: float, yaw: float, ring: list[tuple[float, float]], closed: bool,
     size: dict[str, Any], navsat: dict[str, Any], rest: dict[str, Any],
 ) -> None:  # fmt: skip
@@ -332,5 +332,5 @@ def test_any_file_comes_back_the_same(
         ("x.yaml", b"a:\n  datum_latitude: 1\n  datum_longitude: 2\n", False),
     ],
 )
-def test_what_is_taken_for_a_datum(name: str, data: bytes, is_one: bool) -> None:
+def test_detect_accepts_datum_files_only(name: str, data: bytes, is_one: bool) -> None:
     assert FORMAT.detect(name, data) is is_one

@@ -1,4 +1,4 @@
-"""What holds for every format, by its registration and its samples alone: a new format is tested here by itself."""
+"""Requirements on every format, tested with its registration and samples: new formats are included automatically."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIMITS = Limits()
 
 
 def cases() -> list[tuple[str, str, dict[str, bytes]]]:
-    """(format, case, files): each folder below samples/<format>, and each lone file there, is a map."""
+    """Yield (format, case, files): each folder below samples/<format>, and each file outside of one, is a map."""
     out = []
     for folder in sorted(SAMPLES.iterdir()) if SAMPLES.is_dir() else []:
         for item in sorted(folder.iterdir()):
@@ -50,7 +50,7 @@ def layers_of(name: str, files: dict[str, bytes], hints: UploadHints | None = No
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_format_says_all_that_is_asked_of_it(name: str) -> None:
+def test_format_declares_required_attributes(name: str) -> None:
     fmt = formats.get_format(name)
     assert fmt.title
     assert fmt.layers <= set(LAYERS)
@@ -60,18 +60,18 @@ def test_a_format_says_all_that_is_asked_of_it(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_format_has_a_sample(name: str) -> None:
+def test_format_has_sample(name: str) -> None:
     assert any(f == name for f, _, _ in cases()), f"add a sample of our own to tests/samples/{name}"
 
 
 @pytest.mark.parametrize(("name", "files"), CASES)
-def test_content_alone_tells_the_format(name: str, files: dict[str, bytes]) -> None:
+def test_detect_identifies_format_by_content(name: str, files: dict[str, bytes]) -> None:
     groups, _ = formats.group(files)
     assert name in {g.format.name for g in groups}
 
 
 @pytest.mark.parametrize(("name", "files"), CASES)
-def test_what_is_written_reads_as_the_same_and_writes_the_same_bytes(name: str, files: dict[str, bytes]) -> None:
+def test_written_map_reads_back_equal_and_writes_same_bytes(name: str, files: dict[str, bytes]) -> None:
     first = offline(files, name, hints=UploadHints(name), datum=HERE).files
     second = offline(first, name, hints=UploadHints(name), datum=HERE).files
     assert first == second
@@ -81,7 +81,7 @@ def test_what_is_written_reads_as_the_same_and_writes_the_same_bytes(name: str, 
 
 
 def mutations(data: bytes, seed: int) -> list[bytes]:
-    """Truncated, flipped, doubled, with other types and huge numbers."""
+    """Yield truncated and flipped files, repeated content, other types and huge numbers."""
     dice = random.Random(seed)
     out = [b"", data[:1], data[: len(data) // 2], data[:-1], data + data, data[::-1]]
     out += [data[: dice.randrange(len(data))] for _ in range(8)]
@@ -105,7 +105,7 @@ def mutations(data: bytes, seed: int) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("name", "files"), CASES)
-def test_damaged_files_are_refused_with_file_and_reason_or_read(name: str, files: dict[str, bytes]) -> None:
+def test_damaged_file_is_read_or_refused_with_file_and_reason(name: str, files: dict[str, bytes]) -> None:
     refused = 0
     for victim in sorted(files):
         for k, damaged in enumerate(mutations(files[victim], seed=len(victim))):
@@ -122,7 +122,7 @@ def test_damaged_files_are_refused_with_file_and_reason_or_read(name: str, files
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_format_is_not_made_from_nothing(name: str) -> None:
+def test_plan_without_layers_raises(name: str) -> None:
     from app.convert.recipe import AvailableLayers, plan_chain
 
     fmt = formats.get_format(name)
@@ -138,7 +138,7 @@ FILE_NAME_IS_CONTENT = {"gazebo": "worlds are chosen by their file", "rmf_nav_gr
 
 
 @pytest.mark.parametrize(("name", "files"), [case for case in CASES if case.values[0] not in FILE_NAME_IS_CONTENT])
-def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[str, bytes]) -> None:
+def test_equal_files_with_other_names_give_equal_layers(name: str, files: dict[str, bytes]) -> None:
     def hashes(named: dict[str, bytes]) -> dict[PartKey, bytes]:
         encoded_parts = {
             k: parts.compose(ChunkStage(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()
@@ -156,8 +156,8 @@ def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_format_that_names_the_environment_says_so(name: str) -> None:
-    """Else a map of one environment would be served for another one of equal content."""
+def test_format_with_title_declares_has_title(name: str) -> None:
+    """Otherwise a map of one environment would be returned for another one of equal content."""
     fmt = formats.get_format(name)
     rows: list[Any] = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(9, 0), {"kind": "node"})]
     rows.append(("e", shapely.LineString([(0, 0), (9, 0)]), {"kind": "edge", "source": "a", "target": "b"}))

@@ -1,4 +1,4 @@
-"""ffr_network: points and the lines between their coordinates come back, in both directions, nothing lost."""
+"""ffr_network: points and lines round-trip without loss, lines in both directions."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def write(part: Features) -> tuple[dict[str, Any], WriteContext]:
     return yaml.safe_load(files["network.ffr.yaml"]), context
 
 
-def seeds_tmap(data: dict[str, Any]) -> set[tuple[str, str]]:
-    """Lines as ffrnetwork_to_tmap.py finds them: points by their coordinates' text; KeyError where it would fail."""
+def reference_lines(data: dict[str, Any]) -> set[tuple[str, str]]:
+    """Find lines as ffrnetwork_to_tmap.py does: points by their coordinates' text; KeyError where it would fail."""
     nodes = {f"x{n['x']}y{n['y']}": n["name"] for n in data["internal_points"]}
     return {
         (nodes[f"x{e['start']['x']}y{e['start']['y']}"], nodes[f"x{e['end']['x']}y{e['end']['y']}"])
@@ -46,7 +46,7 @@ def seeds_tmap(data: dict[str, Any]) -> set[tuple[str, str]]:
 
 
 def plain(value: Any) -> Any:
-    """Without the order of lists and keys, and the difference of 0 and 0.0."""
+    """Normalise: ignore the order of lists and keys, and the difference of 0 and 0.0."""
     if isinstance(value, dict):
         return {key: plain(value[key]) for key in sorted(value)}
     if isinstance(value, list):
@@ -54,7 +54,7 @@ def plain(value: Any) -> Any:
     return float(value) if isinstance(value, int) else value
 
 
-def test_facts_of_our_sample() -> None:
+def test_sample_matches_expected_facts() -> None:
     fact = json.loads((SAMPLES / "facts.json").read_text())["yard.ffr.yaml"]
     assert formats.detect("network.ffr.yaml", YARD) is FORMAT
     part, context = read(YARD)
@@ -66,19 +66,19 @@ def test_facts_of_our_sample() -> None:
     assert part.geometry[1].z == 0.5
     assert [p.get("width") for p in part.properties if p["kind"] == "edge"] == [2.5, 2.5, None, None]
     warnings = "\n".join(w.problem for w in context.warnings)
-    assert "no point stands" in warnings
-    assert "have no lines: well" in warnings
+    assert "no point at" in warnings
+    assert "without lines: well" in warnings
 
 
-def test_everything_that_a_file_says_comes_back() -> None:
+def test_every_key_round_trips() -> None:
     part, _ = read(YARD)
     back, context = write(part)
     assert context.dropped == context.warnings == []
     assert plain(back) == plain(yaml.safe_load(YARD))
-    assert seeds_tmap({**back, "network_lines": back["network_lines"][:2]}) == {("gate", "barn"), ("12", "gate")}
+    assert reference_lines({**back, "network_lines": back["network_lines"][:2]}) == {("gate", "barn"), ("12", "gate")}
 
 
-def test_the_same_pair_twice_and_both_ways_stay_apart() -> None:
+def test_parallel_and_reverse_lines_stay_separate() -> None:
     ends = "{start: {x: %s, y: 0}, end: {x: %s, y: 0}, n: %d}"
     lines = [ends % (0, 1, 1), ends % (1, 0, 2), ends % (0, 1, 3), ends % (1, 1, 4)]
     text = "internal_points: [{name: a, x: 0, y: 0}, {name: b, x: 1, y: 0}]\nnetwork_lines: [" + ", ".join(lines) + "]"
@@ -89,7 +89,7 @@ def test_the_same_pair_twice_and_both_ways_stay_apart() -> None:
     assert context.warnings == []
 
 
-def test_a_network_from_elsewhere() -> None:
+def test_network_of_another_format_is_written() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0.1, 0.2), {"kind": "node", "name": "Gate"}),
         ("b", shapely.Point(1 / 3, 2.0), {"kind": "node"}),
@@ -100,17 +100,17 @@ def test_a_network_from_elsewhere() -> None:
     ]
     rows[3][2]["speed_limit"] = 2.0
     back, context = write(features(rows, "local"))
-    assert seeds_tmap(back) == {("a", "b"), ("b", "c")}
+    assert reference_lines(back) == {("a", "b"), ("b", "c")}
     assert [e.get("oneway") for e in back["network_lines"]] == [None, True]
     assert back["network_lines"][0]["speed_limit"] == 2.0
-    assert any("one way" in w.problem for w in context.warnings)
+    assert any("one-way" in w.problem for w in context.warnings)
     assert {d.subject for d in context.dropped} == {
-        "attributes of the way back",
+        "attributes of the opposite direction",
         "names of nodes that are not their ids",
     }
 
 
-def test_it_becomes_a_tmap2_with_both_directions() -> None:
+def test_network_becomes_tmap2_with_both_directions() -> None:
     top = yaml.safe_load(offline({"network.ffr.yaml": YARD}, "tmap2").files["network.tmap2.yaml"])
     edges = {(n["node"]["name"], e["node"]) for n in top["nodes"] for e in n["node"]["edges"]}
     assert edges == {("gate", "barn"), ("barn", "gate"), ("12", "gate"), ("gate", "12")}
@@ -130,7 +130,7 @@ def test_it_becomes_a_tmap2_with_both_directions() -> None:
         ("internal_points: []\nnetwork_lines: [[1, 2]]", "network_lines[0]"),
     ],
 )
-def test_what_is_wrong_is_named(text: str, where: str) -> None:
+def test_invalid_values_are_refused_with_location(text: str, where: str) -> None:
     with pytest.raises(BadUpload) as caught:
         read(text.encode())
     assert [p.where for p in caught.value.problems] == [where]

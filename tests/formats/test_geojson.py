@@ -1,4 +1,4 @@
-"""GeoJSON in and out: everything comes back, metres are never degrees, our layers survive, bad bytes are refused."""
+"""GeoJSON: round trips, metres are never degrees, all layers, hostile bytes."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def same_features(a: Features, b: Features, metres: float = 0.0) -> None:
 
 
 @pytest.mark.parametrize("datum", [None, DATUM])
-def test_a_collection_comes_back_whole(datum: Datum | None) -> None:
+def test_collection_round_trips(datum: Datum | None) -> None:
     served = orjson.loads(write(Layers(read(SAMPLE.read_bytes()).parts, datum)))
     original = orjson.loads(SAMPLE.read_bytes())
     fleet_map = served.pop("fleet_map", None)
@@ -88,7 +88,7 @@ def test_a_collection_comes_back_whole(datum: Datum | None) -> None:
     assert geojson.detect("x", SAMPLE.read_bytes())
 
 
-def test_what_the_objects_are() -> None:
+def test_sample_objects_match_expected() -> None:
     context = ReadContext()
     objects = part(read(SAMPLE.read_bytes(), context), HOME)
     assert objects.ids == ("a", "7", "7#2", "Barn", "feature/4", "Zoë", "flat", "empty")
@@ -100,7 +100,7 @@ def test_what_the_objects_are() -> None:
     assert not objects.geometry[6].has_z
     assert objects.geometry[3].is_valid, "an open ring is closed"
     assert objects.document["attribution"] == ["CC0-1.0"]
-    assert any("stand more than once" in p.problem for p in context.warnings)
+    assert any("duplicate ids" in p.problem for p in context.warnings)
     assert not objects.local.any()
 
 
@@ -118,12 +118,12 @@ def test_what_the_objects_are() -> None:
         collection(feature(point(1, 2, 3), {"kind": None, "name": 4, "osm": 5})),
     ],
 )
-def test_every_root_comes_back(top: dict[str, Any]) -> None:
+def test_every_root_type_round_trips(top: dict[str, Any]) -> None:
     assert orjson.loads(write(read(top))) == json.loads(json.dumps(top))
     assert geojson.detect("x", json.dumps(top).encode())
 
 
-def test_a_single_feature_stays_one_beside_a_datum() -> None:
+def test_single_feature_round_trips_with_datum() -> None:
     layers = Layers(read(feature(point(1, 2), {"name": "x"})).parts, DATUM)
     served = orjson.loads(write(layers))
     assert served["type"] == "Feature"
@@ -132,7 +132,7 @@ def test_a_single_feature_stays_one_beside_a_datum() -> None:
     assert {k: v for k, v in served.items() if k != "fleet_map"} == feature(point(1, 2), {"name": "x"})
 
 
-def test_edits_show_and_the_rest_stays() -> None:
+def test_edits_are_written_and_other_features_unchanged() -> None:
     layers = read(SAMPLE.read_bytes())
     objects = part(layers, HOME)
     rows = [(f.id, f.geometry, f.properties) for f in objects if f.id != "a"]
@@ -175,7 +175,7 @@ rows = st.builds(
 
 @given(st.lists(rows, max_size=5))
 @settings(max_examples=150, deadline=None)
-def test_any_collection_comes_back(features_: list[dict[str, Any]]) -> None:
+def test_any_collection_round_trips(features_: list[dict[str, Any]]) -> None:
     top = orjson.loads(orjson.dumps(collection(*features_)))
     assert orjson.loads(write(read(orjson.dumps(top)))) == top
 
@@ -214,7 +214,7 @@ def everything(anchor: Any = "local") -> Layers:
 
 @pytest.mark.parametrize("datum", [None, DATUM])
 @pytest.mark.parametrize("anchor", ["local", "wgs84"])
-def test_all_layers_survive(anchor: Any, datum: Datum | None) -> None:
+def test_all_layers_round_trip(anchor: Any, datum: Datum | None) -> None:
     before = everything(anchor)
     before = Layers(before.parts, datum, before.levels)
     data = write(before)
@@ -230,7 +230,7 @@ def test_all_layers_survive(anchor: Any, datum: Datum | None) -> None:
     assert geojson.detect("x", data)
 
 
-def test_metres_never_pass_as_degrees() -> None:
+def test_metres_are_not_written_as_degrees() -> None:
     layers = everything()
     served = orjson.loads(write(layers))
     assert served["coordRefSys"] == words.LOCAL_3D
@@ -245,7 +245,7 @@ def test_metres_never_pass_as_degrees() -> None:
     assert node["properties"]["layer"] == "topology"
 
 
-def test_an_editor_that_forgets_place_leaves_items_on_earth() -> None:
+def test_items_without_place_are_read_from_geometry() -> None:
     served = orjson.loads(write(Layers(everything().parts, DATUM)))
     for f in served["features"]:
         f.pop("place", None)
@@ -254,7 +254,7 @@ def test_an_editor_that_forgets_place_leaves_items_on_earth() -> None:
     assert set(part(after, TOPOLOGY).ids) == {"WayPoint1", "B & <ö>", "e1"}
 
 
-def test_the_apis_topology_is_one_again() -> None:
+def test_api_topology_response_is_read_as_topology() -> None:
     line = {"type": "LineString", "coordinates": [[1, 2], [3, 4]]}
     edge = {"kind": "edge", "source": "a", "target": "b"}
     nodes = [feature(point(1, 2), {"kind": "node"}, id="a"), feature(point(3, 4), {"kind": "node"}, id="b")]
@@ -265,7 +265,7 @@ def test_the_apis_topology_is_one_again() -> None:
     dangling = collection(*nodes, feature(line, {**edge, "target": "c"}, id="a_c"))
     layers = read(dangling, context)
     assert set(layers.parts) == {HOME}
-    assert "not there" in context.warnings[0].problem
+    assert "missing nodes" in context.warnings[0].problem
     assert orjson.loads(write(layers)) == dangling
     local = collection(
         *[{**n, "geometry": None, "place": n["geometry"]} for n in nodes],
@@ -275,7 +275,7 @@ def test_the_apis_topology_is_one_again() -> None:
     assert part(read(local), TOPOLOGY).local.all()
 
 
-def test_a_drawing_is_not_written_twice() -> None:
+def test_network_derived_from_drawing_is_not_written_twice() -> None:
     drawing = read(SAMPLE.read_bytes())
     from app.model.network import from_drawing
 
@@ -289,7 +289,7 @@ def test_a_drawing_is_not_written_twice() -> None:
     assert len(alone["features"]) == len(network)
 
 
-def test_local_objects_of_an_upload_stay_local() -> None:
+def test_local_objects_of_upload_stay_local() -> None:
     top = collection(
         {**feature(None, {"name": "x"}), "place": point(100.5, 2000.25)},
         {**feature(None, {}), "place": {"type": "LineString", "coordinates": [[0, 0, 0], [5, 5, 0]]}},
@@ -309,7 +309,7 @@ def test_local_objects_of_an_upload_stay_local() -> None:
     assert orjson.loads(write(layers)) == foreign
 
 
-def test_what_geojson_cannot_hold_is_declared() -> None:
+def test_unsupported_layers_are_reported_as_dropped() -> None:
     from app.model.grid import OccupancyGrid
 
     grid = OccupancyGrid(np.zeros((2, 2), np.uint8), 0.1)
@@ -320,7 +320,7 @@ def test_what_geojson_cannot_hold_is_declared() -> None:
     assert served["attribution"] == "© somebody"
 
 
-def test_ogr_reads_it(tmp_path: Path) -> None:
+def test_written_geojson_is_read_by_ogr(tmp_path: Path) -> None:
     tool = shutil.which("ogrinfo")
     if tool is None:
         if os.environ.get("CI"):
@@ -347,12 +347,12 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
     [
         ("", "invalid JSON"),
         ("[]", "one object"),
-        ('{"type": "Topology"}', "no GeoJSON type"),
-        ('{"type": ["Feature"]}', "no GeoJSON type"),
+        ('{"type": "Topology"}', "unsupported type"),
+        ('{"type": ["Feature"]}', "unsupported type"),
         ('{"type": "FeatureCollection"}', "features"),
         ('{"type": "FeatureCollection", "features": [5]}', "type Feature"),
         ('{"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": 5}]}', "object or null"),
-        (collection(feature({"type": "Circle"})), "no geometry type"),
+        (collection(feature({"type": "Circle"})), "unsupported geometry type"),
         (collection(feature({"type": "Point"})), "array"),
         (collection(feature({"type": "Point", "coordinates": ["1", "2"]})), "numbers"),
         (collection(feature({"type": "Point", "coordinates": [True, 2]})), "numbers"),
@@ -363,11 +363,11 @@ def test_ogr_reads_it(tmp_path: Path) -> None:
         (collection(feature({"type": "LineString", "coordinates": [[1, 2], [1, None]]})), "numbers"),
         (collection(feature({"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]})), "four positions"),
         (collection(feature({"type": "Polygon", "coordinates": [5]})), "arrays"),
-        (collection(feature({"type": "GeometryCollection", "geometries": [None]})), "no geometry type"),
+        (collection(feature({"type": "GeometryCollection", "geometries": [None]})), "unsupported geometry type"),
         (collection(feature(point(181, 0))), "longitude, latitude"),
         (collection(feature(point(0, 90.5))), "longitude, latitude"),
         (collection(feature(point(500_000, 5_000_000))), "EPSG:4326"),
-        (collection({**feature(None), "place": point(1e9, 0)}, coordRefSys=words.LOCAL_2D), "beyond"),
+        (collection({**feature(None), "place": point(1e9, 0)}, coordRefSys=words.LOCAL_2D), "outside"),
         (collection(feature(point(1, 2)), crs={"type": "name", "properties": {"name": "EPSG:3857"}}), "EPSG:3857"),
         (collection(feature(point(1, 2), [1])), "properties"),
         (collection(feature(point(1, 2), {}), fleet_map={"datum": {"latitude": 99, "longitude": 0}}), "latitude"),
@@ -383,14 +383,14 @@ def test_bad_content_is_refused_with_a_reason(data: Any, reason: str) -> None:
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "0x10", "1_0", "01"])
-def test_only_finite_json_numbers(number: str) -> None:
+def test_non_finite_numbers_are_refused(number: str) -> None:
     text = json.dumps(collection(feature(point(1, 2), {"a": 1})))
     for place in ('"a": 1', "1, 2"):
         with pytest.raises(UnreadableFile):
             read(text.replace(place, place.replace("1", number)))
 
 
-def test_a_bad_place_is_named_with_its_line() -> None:
+def test_bad_position_is_reported_with_line() -> None:
     rows_ = ",\n".join(json.dumps(feature(point(k * 100, 0), {}, id=f"f{k}")) for k in range(4))
     with pytest.raises(UnreadableFile) as refused:
         read('{"type": "FeatureCollection", "features": [\n' + rows_ + "]}")
@@ -418,7 +418,7 @@ def test_depth_and_size_are_bounded() -> None:
         read(SAMPLE.read_bytes(), limits=Limits(text_bytes=100))
 
 
-def test_what_is_not_claimed(shared: Path) -> None:
+def test_detect_rejects_route_graphs_and_other_json(shared: Path) -> None:
     for path in sorted((shared / "data/nav2_route_graph").rglob("*.geojson")):
         assert not geojson.detect(path.name, path.read_bytes()), path.name
     for other in (b"", b"{", b'{"type": "object"}', b'{"type": "Point"}', b"<osm/>", b'["FeatureCollection"]'):
@@ -453,7 +453,7 @@ def test_truncated_and_mutated_files_never_crash() -> None:
             write(read(json.dumps(copy)))
 
 
-def test_properties_that_anybody_edited_do_no_harm() -> None:
+def test_arbitrary_edited_properties_are_written_safely() -> None:
     odd: list[Any] = [
         5,
         {"id": {}},
@@ -467,7 +467,7 @@ def test_properties_that_anybody_edited_do_no_harm() -> None:
     )
 
 
-def test_a_large_file_in_time() -> None:
+def test_large_file_is_read_in_time() -> None:
     rows_ = [feature(point(k % 170, k % 80), {"n": k}, id=k) for k in range(50_000)]
     data = orjson.dumps(collection(*rows_))
     started = time.process_time()

@@ -1,4 +1,4 @@
-"""Pictures: what comes out equals Pillow's own reading; damaged or lying ones are refused; PNG is written whole."""
+"""Images: decoding equals Pillow's, damaged files and false headers are refused, PNG is written correctly."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def png(width: int, height: int, packed: bytes, depth: int = 8, colour: int = 0,
 
 
 def pictures() -> dict[str, bytes]:
-    """One of each kind, all 53 × 37."""
+    """Return one image of each kind, all 53 × 37."""
     grey8, rgb = Image.fromarray(SHADES), Image.fromarray(COLOURS)
     rgba = rgb.convert("RGBA")
     rgba.putalpha(Image.fromarray(np.where(SHADES > 128, 255, SHADES).astype(np.uint8)))
@@ -79,7 +79,7 @@ def pictures() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", pictures())
-def test_every_kind_reads_as_an_independent_reader_sees_it(name: str, facts: Any) -> None:
+def test_every_image_kind_matches_independent_reader(name: str, facts: Any) -> None:
     data = pictures()[name]
     shades, opaque = images.read_grey(data, LIMITS).pixels()
     expected, alpha = facts.grey(Image.open(io.BytesIO(data)))
@@ -94,7 +94,7 @@ def test_every_kind_reads_as_an_independent_reader_sees_it(name: str, facts: Any
         assert not opaque.all()
 
 
-def test_deep_grey_png_with_a_transparent_value() -> None:
+def test_deep_grey_png_with_transparent_value_is_read() -> None:
     rows = np.array([[0, 257, 65535]], ">u2")
     packed = zlib.compress(b"\0" + rows.tobytes())
     data = png(3, 1, packed, depth=16, extra=chunk(b"tRNS", struct.pack(">H", 257)))
@@ -106,7 +106,7 @@ def test_deep_grey_png_with_a_transparent_value() -> None:
 
 @pytest.mark.parametrize("most", [1, 2, 3, 7, 15, 100, 127, 254, 255, 256, 1000, 4095, 65535])
 @pytest.mark.parametrize("magic", ["P2", "P5"])
-def test_pgm_of_any_depth(magic: str, most: int, facts: Any) -> None:
+def test_pgm_of_any_depth_is_read(magic: str, most: int, facts: Any) -> None:
     values = np.unique(np.linspace(0, most, 300).astype(int))
     header = f"{magic}\n# made by a test\n{len(values)} 1 #width\n# and\r\n\t{most}\n".encode()
     body = (
@@ -129,11 +129,11 @@ def test_plain_and_binary_pgm_are_equal(shared: Path) -> None:
     assert (plain == binary).all()
 
 
-def test_comments_between_the_numbers_of_a_plain_pgm() -> None:
+def test_plain_pgm_with_comments_is_read() -> None:
     assert grey(b"P2 # x\n2 2 255\n1 2 # 9 9\n3# 7\n 4\n").tolist() == [[1, 2], [3, 4]]
 
 
-def test_what_follows_the_pixels_is_another_picture() -> None:
+def test_pgm_reader_ignores_data_after_pixels() -> None:
     assert grey(b"P5 2 1 255\n\x01\x02P5 1 1 255\n\x03").tolist() == [[1, 2]]
     assert grey(b"P2 2 1 255\n1 2 3 4").tolist() == [[1, 2]]
 
@@ -167,7 +167,7 @@ def test_what_follows_the_pixels_is_another_picture() -> None:
         (b"\xff\xd8\xff\xe0", "cut short"),
     ],
 )
-def test_bad_bytes_say_why(data: bytes, reason: str) -> None:
+def test_bad_images_are_refused_with_reason(data: bytes, reason: str) -> None:
     with pytest.raises(UnreadableFile, match=reason):
         grey(data)
 
@@ -193,12 +193,12 @@ def test_ten_gigabytes_in_a_kilobyte_are_refused_before_decoding(data: bytes) ->
         tracemalloc.stop()
 
 
-def test_a_legal_size_that_the_bytes_cannot_hold_is_refused_before_decoding() -> None:
+def test_size_beyond_data_is_refused_before_decoding() -> None:
     with pytest.raises(UnreadableFile, match="too many for its"):
         grey(png(16_000, 16_000, zlib.compress(b"\0" * 10_000)))
 
 
-def test_a_bomb_unfolds_no_further_than_its_declared_size() -> None:
+def test_compressed_bomb_is_inflated_to_declared_size_only() -> None:
     packer = zlib.compressobj(9)
     packed = b"".join([packer.compress(bytes(2**20)) for _ in range(570)] + [packer.flush()])
     assert len(packed) < 600_000
@@ -207,13 +207,13 @@ def test_a_bomb_unfolds_no_further_than_its_declared_size() -> None:
         images.read_grey(png(23_875, 25_000, packed), LIMITS)
 
 
-def test_text_and_profile_bombs_are_left_aside() -> None:
+def test_text_and_profile_bombs_are_skipped() -> None:
     bomb = zlib.compress(bytes(200 * 2**20))
     extra = chunk(b"zTXt", b"a\0\0" + bomb) + chunk(b"iCCP", b"a\0\0" + bomb)
     assert grey(png(1, 1, zlib.compress(b"\0\7"), extra=extra)).tolist() == [[7]]
 
 
-def test_a_jpeg_of_many_scans_is_refused() -> None:
+def test_jpeg_with_many_scans_is_refused() -> None:
     data = pictures()["progressive.jpg"]
     start = data.index(b"\xff\xda")
     scan = data[start : data.index(b"\xff", start + 2)]
@@ -221,7 +221,7 @@ def test_a_jpeg_of_many_scans_is_refused() -> None:
         grey(data[:-2] + scan * 80 + data[-2:])
 
 
-def test_an_unknown_critical_chunk_and_a_late_header_are_refused() -> None:
+def test_unknown_critical_chunk_and_late_header_are_refused() -> None:
     with pytest.raises(UnreadableFile, match="unknown chunk"):
         grey(png(1, 1, zlib.compress(b"\0\7"), extra=chunk(b"ABCD", b"")))
     with pytest.raises(UnreadableFile, match="begin with its header"):
@@ -229,7 +229,7 @@ def test_an_unknown_critical_chunk_and_a_late_header_are_refused() -> None:
 
 
 @pytest.mark.parametrize("name", pictures())
-def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
+def test_truncated_image_is_refused_or_complete(name: str) -> None:
     data = pictures()[name]
     original, opaque = images.read_grey(data, LIMITS).pixels()
     refused = 0
@@ -245,7 +245,7 @@ def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", pictures())
-def test_a_flipped_bit_never_crashes_and_a_png_never_lies(name: str) -> None:
+def test_flipped_bit_never_crashes_or_changes_png_pixels(name: str) -> None:
     data = pictures()[name]
     original = grey(data)
     dice = random.Random(name)
@@ -288,7 +288,7 @@ def test_written_png_reads_back(bands: int, flip: bool, shape: tuple[int, int]) 
     assert (np.asarray(images.read_image(data, LIMITS)) == np.asarray(image)).all()
 
 
-def test_a_table_is_looked_up_while_writing() -> None:
+def test_lookup_table_is_applied_when_writing_png() -> None:
     table = bytes(255 - v for v in range(256))
     data = images.encode_png(SHADES, table=table)
     assert (np.asarray(Image.open(io.BytesIO(data))) == 255 - SHADES).all()
@@ -302,7 +302,7 @@ def test_png_of_cells_has_the_top_row_on_top() -> None:
     assert np.asarray(image).tolist() == [[1, 2, 3], [0, 100, 255]]
 
 
-def test_overlay_is_black_white_and_clear() -> None:
+def test_overlay_png_is_black_white_and_transparent() -> None:
     grid = OccupancyGrid(np.array([[0, 100, 255], [50, 0, 0]], np.uint8), 0.05)
     image = Image.open(io.BytesIO(images.overlay_png(grid))).convert("RGBA")
     assert np.asarray(image).tolist() == [
@@ -311,7 +311,7 @@ def test_overlay_is_black_white_and_clear() -> None:
     ]
 
 
-def test_memory_of_writing_stays_near_the_output() -> None:
+def test_png_writing_memory_stays_near_output_size() -> None:
     cells = np.zeros((4000, 4000), np.uint8)
     cells.flags.writeable = False
     tracemalloc.start()
@@ -323,7 +323,7 @@ def test_memory_of_writing_stays_near_the_output() -> None:
 
 
 @pytest.mark.parametrize("make", [lambda d: d, bytes.lower])
-def test_kind_is_judged_by_content(make: Callable[[bytes], bytes]) -> None:
+def test_image_kind_is_detected_by_content(make: Callable[[bytes], bytes]) -> None:
     kinds = {name: images.detect_kind(data) for name, data in pictures().items()}
     ends = {"png": "png", "pgm": "pgm", "ppm": "pgm", "pbm": "pgm", "bmp": "bmp", "jpg": "jpeg"}
     assert all(kind == ends[name.rpartition(".")[2]] for name, kind in kinds.items())
@@ -332,7 +332,7 @@ def test_kind_is_judged_by_content(make: Callable[[bytes], bytes]) -> None:
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
 @pytest.mark.parametrize("shape", [(37, 53), (3000, 301), (1, 1)])
-def test_a_coloured_png_in_strips_is_what_pillow_decodes_in_one(mode: str, shape: tuple[int, int]) -> None:
+def test_coloured_png_in_strips_matches_pillow(mode: str, shape: tuple[int, int]) -> None:
     dice = np.random.default_rng(3)
     hills = np.add.outer(np.arange(shape[0]), np.arange(shape[1]))[..., None] // 3 + np.arange(len(mode)) * 40
     pixels = (hills + dice.integers(0, 3, hills.shape)).astype(np.uint8)  # so that Pillow takes each of PNG's filters
@@ -343,8 +343,8 @@ def test_a_coloured_png_in_strips_is_what_pillow_decodes_in_one(mode: str, shape
     assert np.array_equal(decoded_pixels, pixels)
 
 
-def test_each_filter_of_a_png_and_many_small_chunks() -> None:
-    """The filters of the PNG specification (RFC 2083, 6), worked out by hand: each row is what the one before gives."""
+def test_png_filters_and_many_small_chunks_are_read() -> None:
+    """Filters of the PNG specification (RFC 2083, 6), computed by hand: each row results from the one before."""
     width, bands = 2, 3
     rows = [
         bytes([0, 1, 2, 3, 4, 5, 6]),
@@ -368,13 +368,13 @@ def test_each_filter_of_a_png_and_many_small_chunks() -> None:
 
 
 @pytest.mark.parametrize("name", ["L.png", "P.png", "1.png", "I;16.png", "RGB clear.png"])
-def test_other_pictures_are_left_to_pillow(name: str) -> None:
+def test_png_kinds_without_own_decoder_are_left_to_pillow(name: str) -> None:
     makers = {"L.png": "L", "P.png": "P", "1.png": "1", "I;16.png": "I;16", "RGB clear.png": "RGB"}
     more = {"transparency": (1, 2, 3)} if "clear" in name else {}
     assert images.png_pixels(saved(Image.new(makers[name], (5, 4)), "png", **more), LIMITS) is None
 
 
-def test_a_coloured_png_that_ends_too_soon_is_refused() -> None:
+def test_truncated_coloured_png_is_refused() -> None:
     short = png(2, 3, zlib.compress(b"\0" * 14), colour=2)  # 21 bytes are three rows
     with pytest.raises(UnreadableFile, match="too few pixels"):
         images.png_pixels(short, LIMITS)
@@ -384,7 +384,7 @@ def test_a_coloured_png_that_ends_too_soon_is_refused() -> None:
         images.png_pixels(png(2, 3, zlib.compress(b"\x09" * 21), colour=2), LIMITS)
 
 
-def test_long_packed_pixels_stand_in_several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_compressed_pixels_span_several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     original = images.encode_png(COLOURS)
     monkeypatch.setattr(images._IdatWriter, "MOST", 1000)
     parted = images.encode_png(COLOURS)
@@ -392,7 +392,7 @@ def test_long_packed_pixels_stand_in_several_chunks(monkeypatch: pytest.MonkeyPa
     assert np.array_equal(np.asarray(Image.open(io.BytesIO(parted))), COLOURS)
 
 
-def test_memory_of_reading_a_coloured_png_stays_near_its_pixels() -> None:
+def test_coloured_png_reading_memory_stays_near_pixel_size() -> None:
     data = saved(Image.fromarray(RANDOM.integers(0, 256, (3000, 2000, 3), np.uint8)), "png")
     tracemalloc.start()
     try:

@@ -1,4 +1,4 @@
-"""KML: every drawing comes back as it was, edits win, and maps of other origin travel whole."""
+"""KML: drawings round-trip, edits are written, and maps of other formats round-trip."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def placemark(inner: str, attributes: str = "") -> bytes:
 
 
 def changed(layers: Layers, place: int, geometry: Any = None, **properties: Any) -> Layers:
-    """The objects with another geometry or other properties at one place."""
+    """Replace the geometry or properties of one object."""
     part = objects(layers)
     shapes = part.geometry.copy()
     if geometry is not None:
@@ -64,7 +64,7 @@ def changed(layers: Layers, place: int, geometry: Any = None, **properties: Any)
 
 
 def equal(a: Layers, b: Layers) -> None:
-    """Same parts, ids, properties to the type, anchors, documents, and coordinates to a nanometre or 1e-12 degrees."""
+    """Compare parts, ids, typed properties, anchors, documents, and coordinates to a nanometre or 1e-12 degrees."""
     assert set(a.parts) == set(b.parts)
     assert a.datum == b.datum
     for key, p in a.parts.items():
@@ -88,7 +88,7 @@ def equal(a: Layers, b: Layers) -> None:
 
 REFUSED = {"kml/libkml/billion.kml"}
 UNCOUNTABLE = {"kml/libkml/all-unknown-input.kml"}
-"""Its LatLonBox holds words, which the independent comparison cannot take."""
+"""Files whose LatLonBox contains words, which the independent comparison cannot read."""
 
 
 @pytest.fixture(scope="session")
@@ -98,7 +98,7 @@ def real(shared: Path, facts_json: dict[str, Any]) -> dict[str, bytes]:
     return files
 
 
-def test_every_real_drawing_comes_back_whole(real, same):
+def test_real_drawing_round_trips(real, same):
     for name, data in real.items():
         if name in REFUSED | UNCOUNTABLE:
             continue
@@ -110,7 +110,7 @@ def test_every_real_drawing_comes_back_whole(real, same):
         assert [p.get("name") for p in objects(again).properties] == [p.get("name") for p in objects(layers).properties]
 
 
-def test_unknown_elements_everywhere_stay_where_they_are(real):
+def test_unknown_elements_round_trip_in_place(real):
     data = real["kml/libkml/all-unknown-input.kml"]
     layers, _ = load(data)
     once = save(layers)
@@ -124,7 +124,7 @@ def test_unknown_elements_everywhere_stay_where_they_are(real):
     assert len(objects(layers)) > 20
 
 
-def test_placemarks_geometries_and_bounds_are_those_counted_by_others(real, facts_json):
+def test_real_drawing_matches_independent_counts(real, facts_json):
     types = {
         "Point": {"Point", "Model"},
         "LineString": {"LineString", "LinearRing", "gx:Track"},
@@ -154,11 +154,11 @@ def test_repeated_names_are_stored_with_one_warning(real):
     name = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/topological/tmap2_autogen.kml"
     layers, context = load(real[name])
     assert len(objects(layers)) == 627
-    assert sum("are called" in w.problem for w in context.warnings) == 1
+    assert sum("have the name" in w.problem for w in context.warnings) == 1
     assert len(context.warnings) < 4
 
 
-def test_odd_coordinates_are_read_as_the_field_reads_them(real):
+def test_irregular_coordinates_read_as_in_google_earth(real):
     layers, context = load(real["kml/libkml/badcoords.kml"])
     assert shapely.get_coordinates(objects(layers).geometry).tolist() == [
         [-55.809700, -60.700099],
@@ -172,7 +172,7 @@ def test_odd_coordinates_are_read_as_the_field_reads_them(real):
     assert shapely.get_coordinates(ring).tolist() == [[19, 37], [19, 41], [13, 41], [13, 37], [19, 37]]
 
 
-def test_an_entity_bomb_is_refused(real):
+def test_entity_bomb_is_refused(real):
     with pytest.raises(UnreadableFile, match="DOCTYPE"):
         load(real["kml/libkml/billion.kml"])
 
@@ -185,7 +185,7 @@ def orchard() -> Layers:
     return load((SAMPLES / "orchard.kml").read_bytes(), "orchard.kml")[0]
 
 
-def test_a_drawing_becomes_objects(orchard):
+def test_drawing_becomes_objects(orchard):
     part = objects(orchard)
     assert list(part.ids) == [
         "gate",
@@ -215,14 +215,14 @@ def test_a_drawing_becomes_objects(orchard):
 
 
 def _up(plan: Any) -> tuple[float, float]:
-    """East and north, in metres' proportion, of an overlay's left side."""
+    """Return east and north of an overlay's left side, scaled to metres."""
     corner = shapely.get_coordinates(plan)
     east, north = corner[3] - corner[0]
     return float(east) * math.cos(math.radians(50.0015)), float(north)
 
 
 @pytest.mark.parametrize("name", ["orchard.kml", "prefixed.kml"])
-def test_samples_come_back_whole(name, same):
+def test_samples_round_trip(name, same):
     data = (SAMPLES / name).read_bytes()
     layers, _ = load(data)
     once = save(layers)
@@ -231,7 +231,7 @@ def test_samples_come_back_whole(name, same):
     assert once == save(layers)
 
 
-def test_an_old_prefixed_file_without_names():
+def test_prefixed_kml_20_file_without_names_is_read():
     layers, _ = load((SAMPLES / "prefixed.kml").read_bytes())
     part = objects(layers)
     assert list(part.ids) == ["Well", "same", "same#2"]
@@ -257,7 +257,7 @@ EDITS = {
 
 
 @pytest.mark.parametrize("edit", EDITS)
-def test_an_edited_place_wins_over_what_was_kept(orchard, edit):
+def test_edited_geometry_replaces_stored_one(orchard, edit):
     place, shape, text = EDITS[edit]
     data = save(changed(orchard, place, shape))
     if text:
@@ -276,7 +276,7 @@ def test_an_edited_place_wins_over_what_was_kept(orchard, edit):
         assert word in data.decode()
 
 
-def test_edited_names_and_values_win(orchard):
+def test_edited_names_and_values_replace_stored_ones(orchard):
     layers = changed(orchard, 1, name="Q <1> & 'co'", oneway="no", trees=12)
     again = objects(load(save(layers))[0]).properties[1]
     assert (again["name"], again["oneway"], again["trees"]) == ("Q <1> & 'co'", "no", "12")
@@ -285,7 +285,7 @@ def test_edited_names_and_values_win(orchard):
     assert "name" not in nameless
 
 
-def test_deleted_and_added_objects(orchard, same):
+def test_drawing_reflects_deleted_and_added_objects(orchard, same):
     part = objects(orchard)
     new = features([("shed", shapely.Point(7.2, 50.2), {"kind": "poi", "name": "Shed", "roof": "tin"})], "wgs84")
     both = concatenate([part.select([0, 3, 9]), new])
@@ -295,13 +295,13 @@ def test_deleted_and_added_objects(orchard, same):
     assert again.properties[0]["kml"]["place"] == 0
 
 
-def test_the_order_of_the_store_does_not_matter(orchard):
+def test_written_drawing_is_independent_of_storage_order(orchard):
     part = objects(orchard)
     shuffled = part.select(np.random.default_rng(1).permutation(len(part)))
     assert save(Layers({OBJECTS: shuffled})) == save(orchard)
 
 
-def test_objects_that_have_lost_their_document_are_still_written(orchard):
+def test_objects_without_document_are_written(orchard):
     part = objects(orchard).with_document({})
     again = objects(load(save(Layers({OBJECTS: part})))[0])
     assert sorted(again.ids) == sorted(part.ids)
@@ -318,7 +318,7 @@ def styled(colour: str, name: str) -> bytes:
     ).encode()
 
 
-def test_several_drawings_in_one_part_keep_their_own_styles(same):
+def test_drawings_in_one_part_keep_their_styles(same):
     files = {"one.kml": styled("ff0000ff", "One"), "two.kml": styled("ff00ff00", "Two")}
     parts = [objects(load(data, name)[0]) for name, data in files.items()]
     together = concatenate(parts)
@@ -343,7 +343,7 @@ def test_several_drawings_in_one_part_keep_their_own_styles(same):
         )
 
 
-def test_ids_and_levels_that_look_like_numbers_come_back_as_they_were():
+def test_numeric_ids_and_levels_round_trip_as_texts():
     part = features([("12", shapely.Point(1, 2), {"kind": "bench"}), ("1e3", shapely.Point(3, 4), {})], "local")
     key = PartKey("objects", "2", "generated")
     again, _ = load(save(Layers({key: part}, Datum(10.0, 20.0), (Level("2", 3.0),))))
@@ -352,7 +352,7 @@ def test_ids_and_levels_that_look_like_numbers_come_back_as_they_were():
 
 
 @pytest.mark.parametrize("ring", ["7,50 8,51 7,50", "7,50,1 8,51,2 7,50,1", "7,50 8,51 8,51 7,50", "7,50 7,50", "7,50"])
-def test_an_edge_drawn_as_an_area_stays_one(ring, same):
+def test_edge_drawn_as_area_round_trips(ring, same):
     area = f"<outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs>"
     data = placemark(f"<Polygon>{area}</Polygon>")
     layers, _ = load(data)
@@ -362,14 +362,14 @@ def test_an_edge_drawn_as_an_area_stays_one(ring, same):
     assert same("kml", {"a.kml": data}, {"b.kml": save(load(save(layers))[0])}) == []
 
 
-def test_placemarks_of_the_oldest_form_are_kept_with_a_warning(real, same):
+def test_schema_placemarks_are_stored_with_warning(real, same):
     data = real["kml/libkml/old_schema_example.kml"]
     layers, context = load(data)
     assert "S_521_525_SSSSS" in context.warnings[0].problem
     assert save(layers).count(b"foo ") == 2
 
 
-def test_what_only_kml_knows_can_be_left_out():
+def test_source_properties_are_skipped_when_not_requested():
     data = (SAMPLES / "orchard.kml").read_bytes()
     complete, short = objects(load(data)[0]), objects(load(data, keep_source_properties=False)[0])
     assert short.ids == complete.ids
@@ -380,7 +380,7 @@ def test_what_only_kml_knows_can_be_left_out():
     assert sorted(objects(load(save(Layers({OBJECTS: short})))[0]).ids) == sorted(complete.ids)
 
 
-def test_documents_are_merged_by_key_at_every_depth():
+def test_documents_merge_by_key_at_every_depth():
     a = {"kml": {"documents": {"a": {"xml": "1"}}, "x": 1}, "only": [1]}
     b = {"kml": {"documents": {"b": {"xml": "2"}}, "x": {"y": 2}}}
     assert merge_documents(a, b) == {
@@ -391,7 +391,7 @@ def test_documents_are_merged_by_key_at_every_depth():
 
 
 @pytest.mark.parametrize("depth", [101, 250])
-def test_deep_folders(depth, same):
+def test_deep_folders_are_read(depth, same):
     data = b"<kml>" + b"<Folder>" * depth + b"<Placemark/>" + b"</Folder>" * depth + b"</kml>"
     layers, _ = load(data)
     assert len(objects(layers)) == 1
@@ -402,7 +402,7 @@ def test_deep_folders(depth, same):
 
 
 def network(n: int = 12) -> Features:
-    """Nodes on a circle of 50 m, edges both ways between neighbours, with everything a robot's map may say."""
+    """Build nodes on a circle of 50 m with edges in both directions between neighbours and all robot properties."""
     angle = np.arange(n) * 2 * np.pi / n
     xy = np.round(np.stack([50 * np.cos(angle), 50 * np.sin(angle)], axis=1), 9)
     rows: list[tuple[str, Any, dict[str, Any]]] = []
@@ -441,7 +441,7 @@ def network(n: int = 12) -> Features:
     return features(rows, "local", {"tmap2": {"name": "ring", "metric_map": "m"}})
 
 
-def test_a_network_travels_whole():
+def test_network_round_trips():
     layers = Layers({TOPOLOGY: network()}, DATUM)
     data = save(layers)
     again, context = load(data)
@@ -453,7 +453,7 @@ def test_a_network_travels_whole():
     assert len(root.findall(".//{*}LineString")) == 24
 
 
-def test_all_vector_layers_travel_whole():
+def test_vector_layers_round_trip():
     fence = shapely.box(6.999, 49.999, 7.001, 50.001)
     datum = {"kind": "fence", "name": "farm", "datum": DATUM.as_dict()}
     rows: list[tuple[str, Any, dict[str, Any]]] = [
@@ -494,7 +494,7 @@ def test_all_vector_layers_travel_whole():
     assert save(again, attribution=("© somebody & co",)) == data
 
 
-def test_a_drawing_and_a_network_share_a_file(orchard, same):
+def test_drawing_and_network_share_file(orchard, same):
     layers = Layers({**orchard.parts, TOPOLOGY: network()}, DATUM)
     data = save(layers)
     again, _ = load(data, "orchard.kml")
@@ -507,17 +507,17 @@ def test_a_drawing_and_a_network_share_a_file(orchard, same):
     assert list(objects(again).ids) == ["Well", "same", "same#2"]
 
 
-def test_a_datum_travels_whole():
+def test_datum_round_trips():
     layers = Layers({}, Datum(-33.456789012345678, 151.2, -5.25, 359.5))
     assert load(save(layers))[0].datum == layers.datum
 
 
-def test_metres_without_a_datum_cannot_be_drawn():
+def test_metres_without_datum_raise_missing_datum():
     with pytest.raises(MissingDatum):
         save(Layers({TOPOLOGY: network()}))
 
 
-def test_what_was_moved_in_the_drawing_moves_in_metres():
+def test_moved_placemark_moves_local_item():
     layers = Layers({TOPOLOGY: network()}, DATUM)
     data = save(layers).decode()
     assert layers.frame is not None
@@ -536,7 +536,7 @@ def test_what_was_moved_in_the_drawing_moves_in_metres():
     assert any("moved" in w.problem for w in context.warnings)
 
 
-def test_a_network_made_from_the_drawing_is_not_drawn_twice(orchard, same):
+def test_network_derived_from_drawing_is_not_written_twice(orchard, same):
     drawn_network = features([("a", shapely.Point(7.0011, 50.0006), {"kind": "node", "drawn_from": "Row"})], "wgs84")
     other = features([("b", shapely.Point(7.0011, 50.0006), {"kind": "node", "drawn_from": "gone"})], "wgs84")
     data = save(Layers({**orchard.parts, TOPOLOGY: drawn_network}))
@@ -547,7 +547,7 @@ def test_a_network_made_from_the_drawing_is_not_drawn_twice(orchard, same):
     assert part.ids == ("b",)
 
 
-def test_a_grid_tells_where_it_lies():
+def test_grid_is_written_as_overlay_with_position():
     cells = np.zeros((40, 100), np.uint8)
     grid = OccupancyGrid(cells, 0.5, (-10.0, 5.0, math.radians(25.0)))
     layers = Layers({PartKey("occupancy", GROUND, MAP): grid}, DATUM)
@@ -591,7 +591,7 @@ VALUES = st.recursive(
 
 @settings(deadline=None, max_examples=200)
 @given(name=TEXTS, properties=st.dictionaries(TEXTS, VALUES, max_size=5))
-def test_any_property_travels_whole(name, properties):
+def test_any_property_round_trips(name, properties):
     node_properties = {"kind": "node", **properties, "name": name}
     part = features([("p", shapely.Point(1.0, 2.0), node_properties)], "local", {"x": {"y": name}})
     layers = Layers({TOPOLOGY: part}, DATUM)
@@ -600,7 +600,7 @@ def test_any_property_travels_whole(name, properties):
 
 @settings(deadline=None, max_examples=100)
 @given(name=TEXTS)
-def test_any_name_can_be_given_to_a_placemark(name):
+def test_any_placemark_name_round_trips(name):
     layers, _ = load(placemark("<name>old</name><Point><coordinates>7,50</coordinates></Point>"))
     again = objects(load(save(changed(layers, 0, name=name)))[0])
     shown = "".join(c if c in "\t\n\r" or (c >= " " and c not in "\ufffe\uffff") else "\ufffd" for c in name).strip()
@@ -626,7 +626,7 @@ def test_any_name_can_be_given_to_a_placemark(name):
         *((odd, None) for odd in ("1e5e5,2", "--1,2", "1-2,3", "7\xa050", "+,1", "1,.")),
     ],
 )
-def test_coordinates_are_plain_or_odd(text, points):
+def test_coordinate_text_is_plain_or_irregular(text, points):
     around = ["1,2,3", text, "4,5 6,7"]
     parsed = parse_coordinates(around)
     assert parsed.odd.tolist() == [False, points is None, False]
@@ -636,7 +636,7 @@ def test_coordinates_are_plain_or_odd(text, points):
 
 @settings(deadline=None, max_examples=200)
 @given(st.lists(st.lists(st.tuples(st.floats(-180, 180), st.floats(-90, 90)), max_size=5), max_size=5))
-def test_coordinates_are_read_to_the_last_bit(lists):
+def test_coordinates_round_trip_exactly(lists):
     texts = [" ".join(f"{x!r},{y!r}" for x, y in points) for points in lists]
     parsed = parse_coordinates(texts) if texts else None
     for k, points in enumerate(lists):
@@ -692,7 +692,7 @@ def test_bad_files_are_refused(case):
     assert caught.value.problems
 
 
-def test_a_bad_coordinate_is_named_with_its_line():
+def test_bad_coordinate_is_reported_with_line():
     data = (
         b"<kml><Document>\n<Placemark>\n<Point>\n<coordinates>200,1</coordinates></Point></Placemark></Document></kml>"
     )
@@ -702,13 +702,13 @@ def test_a_bad_coordinate_is_named_with_its_line():
     assert caught.value.problems[0].file == "a.kml"
 
 
-def test_a_doctype_in_a_description_is_a_text(same):
+def test_doctype_in_description_is_text(same):
     data = placemark("<description><![CDATA[<!DOCTYPE html><html/>]]></description>")
     assert same("kml", {"a.kml": data}, {"b.kml": save(load(data)[0])}) == []
 
 
 @pytest.mark.parametrize("name", ["a\x85b", "\u202eevil", " ", "\u200b", "x" * 3000])
-def test_unprintable_names_make_usable_ids(name):
+def test_unprintable_names_become_printable_ids(name):
     layers, _ = load(placemark(f"<name>{name}</name>"))
     assert objects(layers).ids[0].isprintable()
     assert objects(layers).properties[0].get("name", "") == name.strip()
@@ -723,7 +723,7 @@ def test_truncated_files_are_refused_or_read():
 
 @settings(deadline=None, max_examples=150)
 @given(st.data())
-def test_changed_bytes_never_do_harm(data):
+def test_mutated_files_are_refused_or_read(data):
     body = bytearray((SAMPLES / "orchard.kml").read_bytes())
     for _ in range(data.draw(st.integers(1, 5))):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
@@ -749,11 +749,11 @@ def test_changed_bytes_never_do_harm(data):
         ("a.txt", b"see http://earth.google.com/kml/2.2", False),
     ],
 )
-def test_detection(name, data, answer):
+def test_detect_accepts_kml_only(name, data, answer):
     assert get_format("kml").detect(name, data) is answer
 
 
-def test_another_reader_reads_what_we_write(orchard, tmp_path):
+def test_written_kml_is_read_by_ogr(orchard, tmp_path):
     tool = shutil.which("ogrinfo")
     if tool is None:
         if os.environ.get("CI"):
@@ -769,7 +769,7 @@ def test_another_reader_reads_what_we_write(orchard, tmp_path):
         assert 36 in counts, done.stdout
 
 
-def test_tmap2_to_kml_and_back(shared, same):
+def test_tmap2_round_trips_through_kml(shared, same):
     folder = shared / "data" / "environment_template"
     files = [p for p in sorted(folder.rglob("*.tmap2.yaml")) if p.stat().st_size]
     assert files
@@ -786,8 +786,8 @@ def test_tmap2_to_kml_and_back(shared, same):
             assert same("tmap2", data, over_kml) == [], path.name
 
 
-def test_columns_of_many_items_are_quick_to_write():
-    """No quadratic step: ten times the items take about ten times the time (a generous bound)."""
+def test_many_items_are_written_in_time():
+    """Ten times the items take about ten times the time (a generous limit): no quadratic step."""
     import time
 
     def seconds(n: int) -> float:
@@ -800,7 +800,7 @@ def test_columns_of_many_items_are_quick_to_write():
     assert seconds(10_000) < 40 * max(seconds(1_000), 0.02)
 
 
-def test_unknown_elements_are_named_with_their_number() -> None:
+def test_unknown_elements_are_reported_with_count() -> None:
     placemark = (
         "<Placemark><nam>a</nam><gx:drawOrder>1</gx:drawOrder><x:own/><ExtendedData><free/></ExtendedData>"
         "<description><![CDATA[<b>x</b>]]></description><Point><coordinates>1,2</coordinates></Point></Placemark>"

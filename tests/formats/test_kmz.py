@@ -1,4 +1,4 @@
-"""KMZ: the main document is the first .kml entry, everything else comes back byte for byte, grids travel whole."""
+"""KMZ: the main document is the first .kml entry, other entries round-trip byte for byte, and so do grids."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ REFUSED = {
 }
 
 
-def test_every_real_archive_comes_back_whole(real, same, facts_json):
+def test_real_archive_round_trips(real, same, facts_json):
     for name, data in real.items():
         if name in REFUSED:
             continue
@@ -85,7 +85,7 @@ def test_hostile_and_damaged_archives_are_refused(real):
         assert caught.value.problems
 
 
-def test_our_sample(same):
+def test_sample_round_trips_with_resources(same):
     data = (SAMPLES / "yard.kmz").read_bytes()
     layers = load(data)
     assert sorted(layers.resources()) == ["images/plan.png", "site/more.kml"]
@@ -102,13 +102,13 @@ def test_our_sample(same):
     }
 
 
-def test_the_drawing_of_an_archive_can_be_had_as_kml(same):
+def test_drawing_of_archive_is_exported_as_kml(same):
     layers = load((SAMPLES / "yard.kmz").read_bytes())
     context = WriteContext()
     out = write(get_format("kml"), layers, context)
     original = archives.unpack((SAMPLES / "yard.kmz").read_bytes(), Limits())["site/yard.kml"]
     assert same("kml", {"a.kml": original}, out) == []
-    assert context.dropped == [Dropped("resources", 2, "images and further files of a drawing travel in KMZ only")]
+    assert context.dropped == [Dropped("resources", 2, "only KMZ contains images and further files of a drawing")]
 
 
 def grids() -> Layers:
@@ -119,7 +119,7 @@ def grids() -> Layers:
     return Layers(parts, DATUM)
 
 
-def test_grids_travel_whole():
+def test_grids_round_trip():
     layers = grids()
     data = save(layers)
     assert sorted(archives.unpack(data, Limits())) == ["doc.kml", "map.png", "upper-keep_out.png"]
@@ -134,7 +134,7 @@ def test_grids_travel_whole():
     assert save(again) == data
 
 
-def test_a_grid_beside_a_picture_of_the_same_name():
+def test_grid_and_image_with_same_name_round_trip():
     picture = Resources({"map.png": b"somebody's", "doc.kml.txt": b"x"})
     layers = Layers({**grids().parts, RESOURCES: picture}, DATUM)
     again = load(save(layers))
@@ -142,7 +142,7 @@ def test_a_grid_beside_a_picture_of_the_same_name():
     assert len(again.grids()) == 2
 
 
-def test_a_grid_whose_picture_was_repainted_is_refused():
+def test_grid_with_repainted_image_is_refused():
     files = archives.unpack(save(grids()), Limits())
     from app.syntax import images
 
@@ -151,7 +151,7 @@ def test_a_grid_whose_picture_was_repainted_is_refused():
         load(archives.pack(files, "doc.kml"))
 
 
-def test_the_first_kml_in_the_archive_is_the_main_document():
+def test_first_kml_in_archive_is_main_document():
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr("b.txt", b"1")
@@ -186,11 +186,11 @@ def test_bad_archives_are_refused(data):
         ("a.kml", DOCUMENT, False),
     ],
 )
-def test_detection(name, data, answer):
+def test_detect_accepts_kmz_only(name, data, answer):
     assert get_format("kmz").detect(name, data) is answer
 
 
-def test_another_reader_reads_what_we_write(tmp_path):
+def test_written_kmz_is_read_by_ogr(tmp_path):
     tool = shutil.which("ogrinfo")
     if tool is None:
         if os.environ.get("CI"):
@@ -203,7 +203,7 @@ def test_another_reader_reads_what_we_write(tmp_path):
     assert "Yard" in done.stdout
 
 
-def a_picture(bands: int = 3, **more: Any) -> GeoImage:
+def make_image(bands: int = 3, **more: Any) -> GeoImage:
     pixels = np.random.default_rng(bands).integers(0, 255, (4, 6, bands), np.uint8)
     c, s = 0.5 * math.cos(0.3), 0.5 * math.sin(0.3)
     return GeoImage(pixels, **{"transform": (c, s, 10.0, s, -c, 20.0), **more})
@@ -214,9 +214,9 @@ EARTH = {"crs": "EPSG:32632", "transform": (0.5, 0.0, 356000.0, 0.0, -0.5, 55400
 
 @pytest.mark.parametrize("bands", [1, 2, 3, 4])
 @pytest.mark.parametrize("place", [{}, EARTH], ids=["local", "utm"])
-def test_pictures_come_back_from_kmz_at_the_same_place(bands: int, place: dict[str, Any]) -> None:
+def test_images_round_trip_with_position(bands: int, place: dict[str, Any]) -> None:
     key = PartKey("imagery", "2", "plan")
-    picture = a_picture(bands, properties={"attribution": ["© Somebody"]}, **place)
+    picture = make_image(bands, properties={"attribution": ["© Somebody"]}, **place)
     context = WriteContext()
     data = write(get_format("kmz"), Layers({key: picture}, DATUM, (Level(), Level("2", 3.0))), context)["map.kmz"]
     assert context.dropped == []
@@ -228,8 +228,8 @@ def test_pictures_come_back_from_kmz_at_the_same_place(bands: int, place: dict[s
     assert (image.transform, image.crs, image.properties) == (picture.transform, picture.crs, picture.properties)
 
 
-def test_a_picture_s_overlay_lies_where_pyproj_says() -> None:
-    picture = a_picture(**EARTH)
+def test_image_overlay_corners_match_pyproj() -> None:
+    picture = make_image(**EARTH)
     files = archives.unpack(save(Layers({PartKey("imagery", name="aerial"): picture})), Limits())
     root = etree.fromstring(files["doc.kml"])
     assert root.findtext(".//{*}Icon/{*}href") == "aerial.png"
@@ -247,9 +247,9 @@ def test_a_picture_s_overlay_lies_where_pyproj_says() -> None:
     assert box["rotation"] == pytest.approx(-convergence, abs=1e-4)
 
 
-def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
+def test_images_beside_kml_require_option() -> None:
     fmt, key = get_format("kml"), PartKey("imagery", name="aerial")
-    layers = Layers({key: a_picture(**EARTH)}, DATUM)
+    layers = Layers({key: make_image(**EARTH)}, DATUM)
     bare = WriteContext()
     assert list(write(fmt, layers, bare)) == ["map.kml"]
     assert [(d.subject, d.count) for d in bare.dropped] == [("imagery", 1)]
@@ -266,25 +266,25 @@ def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
 @pytest.mark.parametrize(
     ("picture", "datum", "reason"),
     [
-        (a_picture(), None, "there is no datum"),
-        (a_picture(crs="EPSG:4326", transform=(1.0, 0, 178.0, 0, -1.0, 5.0)), None, "not on earth"),
-        (a_picture(crs="EPSG:32601", transform=(9e4, 0, 1e5, 0, -9e4, 1e5)), None, "antimeridian"),
-        (a_picture(crs="EPSG:4326", transform=(0.1, 0, 1.0, 0, -0.1, 89.0)), None, "beyond ±85"),
-        (a_picture(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "not known"),
+        (make_image(), None, "there is no datum"),
+        (make_image(crs="EPSG:4326", transform=(1.0, 0, 178.0, 0, -1.0, 5.0)), None, "not on earth"),
+        (make_image(crs="EPSG:32601", transform=(9e4, 0, 1e5, 0, -9e4, 1e5)), None, "antimeridian"),
+        (make_image(crs="EPSG:4326", transform=(0.1, 0, 1.0, 0, -0.1, 89.0)), None, "beyond ±85"),
+        (make_image(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "not known"),
     ],
     ids=["no datum", "off earth", "antimeridian", "polar", "no such CRS"],
 )
-def test_pictures_without_a_place_are_dropped_and_told(picture: GeoImage, datum: Datum | None, reason: str) -> None:
+def test_images_without_position_are_reported_as_dropped(picture: GeoImage, datum: Datum | None, reason: str) -> None:
     context = WriteContext()
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), context)["map.kmz"]
     assert list(archives.unpack(data, Limits())) == ["doc.kml"]
     (line,) = context.dropped
     assert (line.subject, line.count) == ("imagery ground/p", 1)
-    assert line.why.startswith("it cannot be placed: ")
+    assert line.why.startswith("no position in KML: ")
     assert reason in line.why
 
 
-def test_values_that_an_overlay_cannot_show_are_told() -> None:
+def test_pixel_values_beyond_8_bit_are_reported_as_dropped() -> None:
     context = WriteContext()
     heights = GeoImage(np.arange(24, dtype=np.float32).reshape(4, 6, 1), **EARTH, properties={"nodata": 3})
     data = write(get_format("kmz"), Layers({PartKey("imagery", name="dem"): heights}), context)["map.kmz"]
@@ -294,7 +294,7 @@ def test_values_that_an_overlay_cannot_show_are_told() -> None:
     assert (image.pixels.shape, image.transform) == ((4, 6, 2), EARTH["transform"])
 
 
-def test_images_beside_a_kml_are_those_of_the_files() -> None:
+def test_images_beside_kml_match_files() -> None:
     room = SAMPLES.parent / "occupancy_grid" / "room"
     files = {p.name: p.read_bytes() for p in room.iterdir()}
     kmz = archives.unpack(offline(files, "kmz", datum=DATUM).files["map.kmz"], Limits())

@@ -1,4 +1,4 @@
-"""lanelet2: real maps come back whole, lanelets are a network, and networks from elsewhere become lanelets."""
+"""lanelet2: real maps round-trip, lanelets become a network, and other networks become lanelets."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def write(layers: Layers, **context: Any) -> tuple[dict[str, bytes], WriteContex
 
 
 def edited(layers: Layers, key: PartKey, change: Callable[[str, dict[str, Any]], dict[str, Any] | None]) -> Layers:
-    """The layers with other properties of one part's items; None takes an item out."""
+    """Replace properties of one part's items; None deletes an item."""
     part = layers.parts[key]
     assert isinstance(part, Features)
     properties = [change(i, dict(p)) for i, p in zip(part.ids, part.properties, strict=True)]
@@ -82,7 +82,7 @@ def items(layers: Layers) -> dict[str, tuple[dict[str, Any], Any]]:
 
 
 def elements(data: bytes) -> dict[tuple[str, int], dict[str, Any]]:
-    """Each element by type and id: attributes as values, tags, nodes and members in order."""
+    """Return each element by type and id: attributes as values, tags, nodes and members in order."""
     out: dict[tuple[str, int], dict[str, Any]] = {}
     for e in etree.fromstring(data):
         if e.tag not in ("node", "way", "relation"):
@@ -114,7 +114,7 @@ def assert_same(a: bytes, b: bytes) -> None:
     assert further(a) == further(b)
 
 
-def test_the_comparator_sees_what_matters() -> None:
+def test_comparator_detects_differences() -> None:
     for old, new in [
         (b"lat='0.00005'", b"lat='0.00006'"),
         (b"k='one_way' v='yes'", b"k='one_way' v='no'"),
@@ -132,7 +132,7 @@ def test_the_comparator_sees_what_matters() -> None:
 
 
 @pytest.mark.parametrize("name", ["fzi_mapping_example/mapping_example.osm", "autoware_mgrs_mini/lanelet2_map.osm"])
-def test_real_maps_come_back_whole(shared: Path, facts_json: dict[str, Any], name: str) -> None:
+def test_real_maps_round_trip(shared: Path, facts_json: dict[str, Any], name: str) -> None:
     path = shared / "data" / "lanelet2" / name
     files = {p.name: p.read_bytes() for p in path.parent.iterdir()}
     back = offline(files, "lanelet2").files
@@ -157,7 +157,7 @@ def test_real_maps_come_back_whole(shared: Path, facts_json: dict[str, Any], nam
     assert (box[2:] <= [east, north]).all()
 
 
-def test_real_lanelets_are_two_way_where_they_say_so(shared: Path) -> None:
+def test_real_lanelets_follow_one_way_tags(shared: Path) -> None:
     data = (shared / "data/lanelet2/fzi_mapping_example/mapping_example.osm").read_bytes()
     stated = {
         i: e["tags"] for (kind, i), e in elements(data).items() if kind == "relation" and e["tags"]["type"] == "lanelet"
@@ -168,8 +168,8 @@ def test_real_lanelets_are_two_way_where_they_say_so(shared: Path) -> None:
         assert times[i] == (2 if tags.get("one_way") in ("no", "false") else 1), tags
 
 
-def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> None:
-    """Worked out a second time, one lanelet after the other, from the XML alone."""
+def test_real_lanelets_connect_as_in_lanelet2(shared: Path) -> None:
+    """Compute the connections independently, lanelet by lanelet, from the XML alone."""
     data = (shared / "data/lanelet2/fzi_mapping_example/mapping_example.osm").read_bytes()
     osm_elements = elements(data)
     rad = math.radians(49.0)
@@ -210,7 +210,7 @@ def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> N
     assert edges.keys() == starts.keys()
     follow = {(a, b) for a in edges for b in edges if ends[a] == starts[b]}
     ours = {(a, b) for a in edges for b in edges if edges[a]["target"] == edges[b]["source"]}
-    assert follow <= ours, "nobody who may go on is kept from it"
+    assert follow <= ours, "every allowed continuation is connected"
     # Beyond Lanelet2's own rule: where a lane for both ways ends, one may turn.
     turning = {p[w] for i, p in edges.items() if i.endswith(":back") for w in ("source", "target")}
     assert {edges[a]["target"] for a, _ in ours - follow} <= turning
@@ -219,7 +219,7 @@ def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> N
 # --- our own samples, with facts worked out by hand ----------------------------------------------------------------
 
 
-def test_facts_of_a_junction() -> None:
+def test_junction_matches_expected_facts() -> None:
     layers, context = read(JUNCTION)
     facts = FACTS["junction.osm"]
     network_items = items(layers)
@@ -248,7 +248,7 @@ def test_facts_of_a_junction() -> None:
     assert_same(JUNCTION, offline({"a.osm": JUNCTION}, "lanelet2").files[MAIN])
 
 
-def test_facts_of_a_map_in_metres() -> None:
+def test_local_map_matches_expected_facts() -> None:
     layers, context = read(AUTOWARE)
     assert not context.warnings
     facts = FACTS["local"]
@@ -268,8 +268,8 @@ def test_facts_of_a_map_in_metres() -> None:
     assert part(alone).local.all(), "and without that file, since no point stands on earth"
 
 
-def test_metres_of_another_frame_are_not_ours() -> None:
-    """An MGRS map stands on earth; its local_x and local_y go with it while its points stay where they are."""
+def test_metres_of_another_frame_are_not_mixed_with_local() -> None:
+    """An MGRS map has positions on earth; its local_x and local_y are stored while its points are unchanged."""
     node = "<node id='{}' lat='{}' lon='{}'><tag k='local_x' v='{}'/><tag k='local_y' v='5'/></node>"
     at = [(1, 0.0001, 0.0, 7), (2, 0.0001, 0.0001, 8), (3, 0.0, 0.0, 9), (4, 0.0, 0.0001, 10)]
     body = "".join(node.format(*row) for row in at) + (
@@ -292,15 +292,13 @@ def test_metres_of_another_frame_are_not_ours() -> None:
     tags = elements(files[MAIN])["node", 2]["tags"]
     assert tags == {}, "metres that are no longer true are left out"
     assert elements(files[MAIN])["node", 1]["tags"] == {"local_x": "7", "local_y": "5"}
-    assert context.dropped == [
-        Dropped("local_x and local_y of moved points", 1, "a Lanelet2 map has no place for them")
-    ]
+    assert context.dropped == [Dropped("local_x and local_y of moved points", 1, "Lanelet2 maps cannot express them")]
 
 
 # --- what is detected ----------------------------------------------------------------------------------------------
 
 
-def test_plain_osm_stays_osm(shared: Path) -> None:
+def test_osm_without_lanelets_is_detected_as_osm(shared: Path) -> None:
     quarter = (SAMPLES.parent / "osm" / "quarter.osm").read_bytes()
     assert not detect("a.osm", quarter)
     for path in sorted((shared / "data/osm").rglob("*.osm")) + sorted((shared / "data/osm").rglob("osm.xml")):
@@ -313,7 +311,7 @@ def test_plain_osm_stays_osm(shared: Path) -> None:
     assert not detect("a.osm", near)
 
 
-def test_lanelets_are_detected_whatever_the_quotes() -> None:
+def test_lanelets_are_detected_with_any_quotes() -> None:
     for data in (JUNCTION, JUNCTION.replace(b"k='type' v='lanelet'", b'v = "lanelet"\n k = "type"')):
         fmt = formats.detect("map.osm", data)
         assert fmt is not None
@@ -342,7 +340,7 @@ def test_lanelets_are_detected_whatever_the_quotes() -> None:
         (None, None),
     ],
 )
-def test_speeds(text: str | None, speed: float | None) -> None:
+def test_speed_texts_are_parsed(text: str | None, speed: float | None) -> None:
     assert parse_speed(text) == (None if speed is None else pytest.approx(speed, abs=1e-9))
 
 
@@ -363,14 +361,14 @@ def test_speeds(text: str | None, speed: float | None) -> None:
         ({"subtype": "shared_walkway"}, False),
     ],
 )
-def test_which_lanelets_go_both_ways(tags: dict[str, str], both: bool) -> None:
+def test_lanelet_direction_follows_tags(tags: dict[str, str], both: bool) -> None:
     assert is_two_way(tags) is both
 
 
 # --- edits ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_speed_of_the_network_reaches_the_lanelet() -> None:
+def test_edge_speed_is_written_to_lanelet() -> None:
     layers, _ = read(JUNCTION)
     new = edited(layers, NETWORK, lambda i, p: {**p, "speed_limit": 0.55, "name": "A"} if i == "l101" else p)
     files, _ = write(new)
@@ -381,7 +379,7 @@ def test_a_speed_of_the_network_reaches_the_lanelet() -> None:
 
 
 @pytest.mark.parametrize(("gone", "turned"), [("l103:back", False), ("l103", True)])
-def test_a_direction_that_is_gone_makes_the_lanelet_one_way(gone: str, turned: bool) -> None:
+def test_deleted_direction_makes_lanelet_one_way(gone: str, turned: bool) -> None:
     layers, _ = read(JUNCTION)
     files, context = write(edited(layers, NETWORK, lambda i, p: None if i == gone else p))
     lanelet = elements(files[MAIN])["relation", 103]
@@ -400,17 +398,17 @@ def test_a_direction_that_is_gone_makes_the_lanelet_one_way(gone: str, turned: b
     assert not context.warnings
 
 
-def test_a_lanelet_without_edges_goes_and_its_bounds_stay() -> None:
+def test_lanelet_without_edges_is_dropped_but_bounds_stay() -> None:
     layers, _ = read(JUNCTION)
     files, context = write(edited(layers, NETWORK, lambda i, p: None if i == "l102" else p))
     osm_elements = elements(files[MAIN])
     assert ("relation", 102) not in osm_elements
     assert {("way", 23), ("way", 24)} <= osm_elements.keys()
-    why = "a Lanelet2 map has no place for them"
+    why = "Lanelet2 maps cannot express them"
     assert context.dropped == [Dropped("lanelets whose edges are no longer in the network", 1, why)]
 
 
-def test_a_redrawn_bound_stays_with_its_lanelet() -> None:
+def test_redrawn_bound_is_written_with_lanelet() -> None:
     layers, _ = read(JUNCTION)
     objects = part(layers, OBJECTS)
     shapes = objects.geometry.copy()
@@ -426,7 +424,7 @@ def test_a_redrawn_bound_stays_with_its_lanelet() -> None:
     assert len(items(again)["l101"][1].coords) == 3
 
 
-def test_a_new_edge_joins_the_lanelets_that_are_there() -> None:
+def test_new_edge_connects_to_existing_lanelets() -> None:
     layers, _ = read(JUNCTION)
     net = part(layers)
     line = shapely.LineString([(0.0002, 0.000015, 3.0), (0.0003, 0.000015, 3.0)])
@@ -464,7 +462,7 @@ def net(edges: list[tuple[str, str]], places: dict[str, tuple[float, ...]], **ed
 
 
 def lanelets(data: bytes) -> dict[str, tuple[dict[str, str], dict[str, list[int]], dict[int, tuple[float, float]]]]:
-    """By edge: tags, refs by role, and the metres that each point says."""
+    """Return lanelets by edge: tags, refs by role, and the metres of each point."""
     osm_elements = elements(data)
     metres = {
         i: (float(e["tags"]["local_x"]), float(e["tags"]["local_y"]))
@@ -479,7 +477,7 @@ def lanelets(data: bytes) -> dict[str, tuple[dict[str, str], dict[str, list[int]
 
 
 def valid(data: bytes) -> None:
-    """Lanelet2's rules: bounds of two and more points, the left one on the left, neither crossing."""
+    """Check Lanelet2's rules: bounds of at least two points, the left one on the left, neither crossing."""
     for name, (tags, sides, at) in lanelets(data).items():
         left, right = ([at[r] for r in sides[w]] for w in ("left", "right"))
         assert min(len(left), len(right)) > 1
@@ -488,7 +486,7 @@ def valid(data: bytes) -> None:
         assert tags["one_way"] in ("yes", "no")
 
 
-def test_a_straight_road_is_worked_out_by_hand() -> None:
+def test_straight_road_matches_hand_computed_bounds() -> None:
     places = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (20.0, 10.0)}
     two = net([("a", "b"), ("b", "a"), ("b", "c")], places, width=2.0, speed_limit=1.5)
     files, context = write(Layers({NETWORK: two}, HERE))
@@ -521,7 +519,7 @@ def test_a_straight_road_is_worked_out_by_hand() -> None:
 
 
 @pytest.mark.parametrize("arms", [3, 4, 5, 6])
-def test_a_crossing_connects_what_it_can_and_says_what_not(arms: int) -> None:
+def test_crossing_reports_connections_it_cannot_make(arms: int) -> None:
     places = {"m": (0.0, 0.0)}
     for k in range(arms):
         places[f"p{k}"] = (20 * math.cos(k * math.tau / arms), 20 * math.sin(k * math.tau / arms))
@@ -538,14 +536,14 @@ def test_a_crossing_connects_what_it_can_and_says_what_not(arms: int) -> None:
     connected = sum(a == b[::-1] for a in ends for b in ends)
     warning = next(w.problem for w in context.warnings)
     possible = arms * (arms - 1)
-    assert warning.startswith(f"{possible - connected} of {possible} ways")
+    assert warning.startswith(f"{possible - connected} of {possible} pairs")
     assert connected >= possible / 2
     again, _ = read(files[MAIN])
     assert {(p["source"], p["target"]) for p, _ in items(again).values() if p["kind"] == "edge"} == set(edges)
 
 
 @pytest.mark.parametrize("to", ["tmap2", "osm"])
-def test_real_networks_become_valid_lanelets_and_come_back(shared: Path, tmp_path: Path, to: str) -> None:
+def test_real_networks_become_valid_lanelets_and_round_trip(shared: Path, tmp_path: Path, to: str) -> None:
     farm = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/topological"
     name = {
         "tmap2": f"{farm}/network.tmap2.yaml",
@@ -580,7 +578,7 @@ def test_real_networks_become_valid_lanelets_and_come_back(shared: Path, tmp_pat
 
 
 @pytest.mark.skipif(not shutil.which("osmium"), reason="osmium is not installed")
-def test_osmium_reads_what_is_written(shared: Path, facts_json: dict[str, Any], tmp_path: Path) -> None:
+def test_written_map_is_read_by_osmium(shared: Path, facts_json: dict[str, Any], tmp_path: Path) -> None:
     name = "lanelet2/fzi_mapping_example/mapping_example.osm"
     content = offline({"a.osm": (shared / "data" / name).read_bytes()}, "lanelet2").files[MAIN]
     (tmp_path / MAIN).write_bytes(content)
@@ -596,7 +594,7 @@ def test_osmium_reads_what_is_written(shared: Path, facts_json: dict[str, Any], 
     assert data["objects_ordered"]
 
 
-def test_options_are_heeded() -> None:
+def test_write_options_are_applied() -> None:
     one = net([("a", "b")], {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 2.0)})
     options = WriteOptions(width=3.0, subtype="walkway", location="nonurban", bounds="curbstone", projector_info=True)
     files, context = write(Layers({NETWORK: one}, HERE), options=options)
@@ -604,7 +602,7 @@ def test_options_are_heeded() -> None:
     assert (tags["subtype"], tags["location"], "width" in tags) == ("walkway", "nonurban", False)
     assert {at[r][1] for r in sides["left"]} == {1.5}
     assert files[PROJECTOR].startswith(b"projector_type: Local")
-    assert Filled("width of lanes", 3.0, "1 edges say none", "width") in context.template
+    assert Filled("width of lanes", 3.0, "1 edges have no width", "width") in context.template
     assert [e["tags"]["type"] for (kind, _), e in elements(files[MAIN]).items() if kind == "way"].count(
         "curbstone"
     ) == 2
@@ -614,7 +612,7 @@ def test_options_are_heeded() -> None:
     assert "width" not in items(layers)["a_b"][0], "what was filled in is no information"
 
 
-def test_sharp_bends_and_narrow_places_stay_sound() -> None:
+def test_sharp_bends_and_narrow_lanes_give_valid_bounds() -> None:
     points = [(0, 0), (4, 0), (4.2, 0.3), (0, 0.6), (0, 5)]
     line = shapely.LineString(points)
     rows: list[tuple[str, Any, dict[str, Any]]] = [
@@ -636,7 +634,7 @@ def test_sharp_bends_and_narrow_places_stay_sound() -> None:
     assert {"edges without length", "edges from a node to itself"} <= {d.subject for d in context.dropped}
 
 
-def test_without_a_datum_it_says_what_to_supply() -> None:
+def test_write_without_datum_reports_what_to_supply() -> None:
     one = net([("a", "b")], {"a": (0.0, 0.0), "b": (10.0, 0.0)})
     with pytest.raises(MissingDatum, match="datum"):
         write(Layers({NETWORK: one}))
@@ -646,22 +644,22 @@ def test_without_a_datum_it_says_what_to_supply() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "reason"),
     [
-        (b"lat='0.00003' lon='0.0'", b"lat='91' lon='0.0'", "no place on earth"),
-        (b"<nd ref='1' />", b"<nd ref='x' />", "whole number"),
+        (b"lat='0.00003' lon='0.0'", b"lat='91' lon='0.0'", "invalid position"),
+        (b"<nd ref='1' />", b"<nd ref='x' />", "integer"),
         (b"<osm ", b"<!DOCTYPE osm><osm ", "DOCTYPE"),
-        (b"lon='0.0002'", b"lon='170'", "too far|too much"),
+        (b"lon='0.0002'", b"lon='170'", "too far|too large"),
     ],
 )
-def test_bad_files_are_refused_with_the_reason(old: bytes, new: bytes, said: str) -> None:
+def test_bad_files_are_refused_with_the_reason(old: bytes, new: bytes, reason: str) -> None:
     assert old in JUNCTION
-    with pytest.raises(BadUpload, match=said) as caught:
+    with pytest.raises(BadUpload, match=reason) as caught:
         read(JUNCTION.replace(old, new, 1))
     assert caught.value.problems[0].file == "map.osm"
 
 
-def test_limits_hold() -> None:
+def test_read_enforces_limits() -> None:
     with pytest.raises(TooLarge):
         read(JUNCTION, limits=Limits(features=20))
     with pytest.raises(TooLarge):
@@ -680,7 +678,7 @@ def test_limits_hold() -> None:
         (b"<member type='way' ref='23' role='left' />", b""),
     ],
 )
-def test_broken_lanelets_are_kept_and_told(old: bytes, new: bytes) -> None:
+def test_broken_lanelets_are_stored_with_warning(old: bytes, new: bytes) -> None:
     data = JUNCTION.replace(old, new, 1)
     assert data != JUNCTION
     layers, context = read(data)
@@ -690,7 +688,7 @@ def test_broken_lanelets_are_kept_and_told(old: bytes, new: bytes) -> None:
     assert_same(data, files[MAIN])
 
 
-def test_odd_values_of_stored_words_do_no_harm() -> None:
+def test_invalid_stored_values_are_written_safely() -> None:
     layers, _ = read(JUNCTION)
     odd: list[Any] = [
         None,
@@ -708,8 +706,8 @@ def test_odd_values_of_stored_words_do_no_harm() -> None:
             etree.fromstring(files[MAIN])
 
 
-def test_members_as_autoware_writes_them_are_read_the_quick_way() -> None:
-    """type, role, ref: whichever order an editor has, the scan takes it and tells the same as the XML parser."""
+def test_autoware_member_order_uses_fast_parser() -> None:
+    """Members with type, role, ref in any order: the fast parser reads them as the strict parser does."""
     head = '<?xml version="1.0"?>\n<osm version="0.6">\n  <node id="1" lat="35.2" lon="138.8"/>\n'
     rows = [
         'type="way" role="left" ref="-5"',

@@ -1,4 +1,4 @@
-"""nav2_route: real graphs come back the same, the loader's rules hold, numbers stay, bad files are named."""
+"""nav2_route: real graphs round-trip, the loader's rules hold, numbers are stable, errors name their location."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ def warnings(context: ReadContext | WriteContext) -> str:
 
 
 class Unsigned(int):
-    """An integer as nlohmann's JSON stores one without a sign: getValue<float> of it throws."""
+    """An integer as nlohmann's JSON stores one without a sign: getValue<float> throws."""
 
 
 class RouteServer:
-    """What geojson_graph_file_loader.cpp takes, and what it throws at."""
+    """Loader with the rules of geojson_graph_file_loader.cpp, including its exceptions."""
 
     def __init__(self, data: bytes) -> None:
         top = json.loads(data)
@@ -119,7 +119,7 @@ def real(shared: Path) -> list[Path]:
     return sorted((shared / "data" / "nav2_route_graph").rglob("*.geojson"))
 
 
-def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+def test_real_files_round_trip(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
     assert len(real(shared)) == sum(f.get("kind") == "nav2_route_graph" for f in facts_json.values()) == 4
     for path in real(shared):
         data = path.read_bytes()
@@ -136,7 +136,7 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
             assert json.loads(served).get(word) == json.loads(data).get(word)
 
 
-def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_real_files_match_counted_facts(shared: Path, facts_json: dict[str, Any]) -> None:
     for path in real(shared):
         fact = facts_json[str(path.relative_to(shared / "data"))]["facts"]
         part, _ = read(path.read_bytes())
@@ -153,7 +153,7 @@ def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_js
 # --- our sample ------------------------------------------------------------------------------------------------------
 
 
-def test_facts_of_the_sample() -> None:
+def test_sample_matches_expected_facts() -> None:
     fact = FACTS["hall.geojson"]
     part, context = read((SAMPLES / "hall.geojson").read_bytes())
     kinds = [p["kind"] for p in part.properties]
@@ -166,7 +166,7 @@ def test_facts_of_the_sample() -> None:
     assert "neither a point nor a line" in warnings(context)
 
 
-def test_the_sample_in_full(same: Same) -> None:
+def test_sample_is_written_as_expected(same: Same) -> None:
     data = (SAMPLES / "hall.geojson").read_bytes()
     part, _ = read(data)
     assert part.ids == ("0", "1", "70000", "7", "1#2", "8", "9")
@@ -199,7 +199,7 @@ def test_the_sample_in_full(same: Same) -> None:
     assert len(shapes[8]["coordinates"]) == 2
 
 
-def test_our_geojson_of_it_is_not_taken_for_a_route_graph() -> None:
+def test_geojson_export_is_not_detected_as_route_graph() -> None:
     data = (SAMPLES / "hall.geojson").read_bytes()
     geojson_data = offline({"hall.geojson": data}, "geojson").files["map.geojson"]
     assert formats.detect("map.geojson", geojson_data) is get_format("geojson")
@@ -211,7 +211,7 @@ def test_our_geojson_of_it_is_not_taken_for_a_route_graph() -> None:
 
 
 def street(names: list[str], **more: Any) -> Features:
-    """A chain of nodes, both ways."""
+    """Build a chain of nodes, connected in both directions."""
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         (i, shapely.Point(k, 0), {"kind": "node", "name": i}) for k, i in enumerate(names)
     ]
@@ -227,7 +227,7 @@ def numbers(data: bytes) -> dict[str, int]:
     return {p["metadata"]["name"]: p["id"] for p in properties if "startid" not in p and "metadata" in p}
 
 
-def test_numbers_follow_from_ids_and_stay_when_others_come_and_go() -> None:
+def test_numbers_depend_on_own_id_only() -> None:
     names = [f"WayPoint{k}" for k in range(60)]
     first = numbers(write(street(names))[0])
     assert first == numbers(write(street(list(reversed(names))))[0])
@@ -240,7 +240,7 @@ def test_numbers_follow_from_ids_and_stay_when_others_come_and_go() -> None:
     assert len(server.nodes.keys() | server.edges.keys()) == 60 + 118
 
 
-def test_own_numbers_come_back_and_new_items_do_not_take_them() -> None:
+def test_source_numbers_round_trip_and_are_not_reused() -> None:
     part, _ = read((SAMPLES / "hall.geojson").read_bytes())
     added = features(
         [
@@ -262,7 +262,7 @@ def test_own_numbers_come_back_and_new_items_do_not_take_them() -> None:
     assert set(server.edges) == {7, 1, 8, 9}
 
 
-def test_repeated_numbers_are_made_distinct() -> None:
+def test_duplicate_numbers_become_distinct() -> None:
     data = json.loads((SAMPLES / "hall.geojson").read_bytes())
     data["features"].append(
         {"type": "Feature", "properties": {"id": 1}, "geometry": {"type": "Point", "coordinates": [7, 7]}}
@@ -271,14 +271,14 @@ def test_repeated_numbers_are_made_distinct() -> None:
     assert "share an id" in warnings(context)
     assert part.properties[part.ids.index("7")]["target"] == "1#2"  # the last one, as Nav2 does
     served, write_context = write(part)
-    assert "mix up" in warnings(write_context)
+    assert "confuse" in warnings(write_context)
     server = RouteServer(served)
     assert len(server.nodes) == 4
     _, end = server.edges[7]
     assert server.nodes[end] == (7.0, 7.0)
 
 
-def test_many_items_get_more_than_16_bit_with_a_warning() -> None:
+def test_many_items_get_ids_over_16_bit_with_warning() -> None:
     served, context = write(street([f"n{k}" for k in range(33_000)]))
     RouteServer(served)
     assert "ComputeRoute" in warnings(context)
@@ -288,7 +288,7 @@ def test_many_items_get_more_than_16_bit_with_a_warning() -> None:
 # --- from other formats ----------------------------------------------------------------------------------------------
 
 
-def test_a_network_of_another_format() -> None:
+def test_network_of_another_format_is_written() -> None:
     part = street(["A", "B", "C"], speed_limit=2, action="row_traversal", tmap2={"fail_policy": "fail"})
     served, write_context = write(part, title="farm", attribution=("© somebody",))
     top = json.loads(served)
@@ -308,7 +308,7 @@ def test_a_network_of_another_format() -> None:
     }
     assert {t.option for t in context.template if t.option} == {"graph_name", "frame_id"}
     assert [(d.subject, d.count) for d in write_context.dropped] == [
-        ("items with attributes that Nav2 has no word for", 4)
+        ("items with attributes that Nav2 cannot express", 4)
     ]
     back, _ = read(served)
     assert {p["name"] for p in back.properties if p["kind"] == "node"} == {"A", "B", "C"}
@@ -317,7 +317,7 @@ def test_a_network_of_another_format() -> None:
     assert write(back)[0] == served
 
 
-def test_tmap2_to_route_graph_and_back(shared: Path) -> None:
+def test_tmap2_round_trips_through_route_graph(shared: Path) -> None:
     farm = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard" / "config" / "topological"
     data = (farm / "network.tmap2.yaml").read_bytes()
     server = RouteServer(offline({"network.tmap2.yaml": data}, "nav2_route").files["graph.geojson"])
@@ -335,12 +335,12 @@ def test_tmap2_to_route_graph_and_back(shared: Path) -> None:
     }
 
 
-def test_a_network_without_edges_is_refused_with_a_way_out() -> None:
+def test_network_without_edges_is_refused_with_advice() -> None:
     with pytest.raises(CannotConvert, match="supply"):
         write(street(["A"]))
 
 
-def test_places_on_earth_need_a_datum_and_levels_are_joined() -> None:
+def test_wgs84_positions_need_datum_and_levels_are_joined() -> None:
     line = [(-0.5, 53.0), (-0.5, 53.001)]
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(line[0]), {"kind": "node"}),
@@ -362,7 +362,7 @@ def test_far_coordinates_are_warned_about() -> None:
         ("b", shapely.Point(0, 0), {"kind": "node"}),
         ("a_b", shapely.LineString([(1e5, 0), (0, 0)]), {"kind": "edge", "source": "a", "target": "b"}),
     ]
-    assert "32 bit floats" in warnings(write(features(rows, "local"))[1])
+    assert "32-bit floats" in warnings(write(features(rows, "local"))[1])
 
 
 # --- bad and doubtful files ------------------------------------------------------------------------------------------
@@ -392,22 +392,22 @@ def node(**properties: Any) -> dict[str, Any]:
         (graph(5), "features[3]", "feature"),  # type: ignore[arg-type]
         (graph({"type": "Feature", "properties": {}, "geometry": []}), "features[3]", "geometry"),
         (graph(node()), "features[3].properties.id", "missing"),
-        (graph(node(id="7")), "features[3].properties.id", "whole number"),
-        (graph(node(id=-1)), "features[3].properties.id", "whole number"),
-        (graph(node(id=1.5)), "features[3].properties.id", "whole number"),
-        (graph(node(id=2**32)), "features[3].properties.id", "whole number"),
-        (graph(node(id=True)), "features[3].properties.id", "whole number"),
+        (graph(node(id="7")), "features[3].properties.id", "an integer"),
+        (graph(node(id=-1)), "features[3].properties.id", "an integer"),
+        (graph(node(id=1.5)), "features[3].properties.id", "an integer"),
+        (graph(node(id=2**32)), "features[3].properties.id", "an integer"),
+        (graph(node(id=True)), "features[3].properties.id", "an integer"),
         (graph({**node(), "properties": None}), "features[3]", "properties"),
         (graph({**node(id=5), "geometry": {"type": "Point"}}), "features[3].geometry.coordinates", "two"),
         (graph({**node(id=5), "geometry": {"type": "Point", "coordinates": [1, "x"]}}),
          "features[3].geometry.coordinates", "not a number"),
-        (graph(startid="1"), "features[2].properties.startid", "whole number"),
+        (graph(startid="1"), "features[2].properties.startid", "an integer"),
         (graph(endid=None), "features[2].properties.endid", "missing"),
         ({"features": graph()["features"][:2]}, "features", "no line"),
         ({"features": graph()["features"][2:]}, "features", "no point"),
     ],
 )  # fmt: skip
-def test_bad_files_are_named(data: Any, where: str, reason: str) -> None:
+def test_bad_files_are_refused_with_location(data: Any, where: str, reason: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(data)
     problem = caught.value.problems[0]
@@ -420,13 +420,13 @@ def test_bad_files_are_named(data: Any, where: str, reason: str) -> None:
     ("data", "line"),
     [(b'{"features": [\n1,\n}', 3), (b'{"features": [NaN]}', 1), (b'{"features": [1e999]}', 1)],
 )
-def test_what_is_not_json_is_refused_with_its_line(data: bytes, line: int) -> None:
+def test_invalid_json_is_refused_with_line(data: bytes, line: int) -> None:
     with pytest.raises(UnreadableFile, match="JSON") as caught:
         read(data)
     assert caught.value.problems[0].line == line
 
 
-def test_limits() -> None:
+def test_read_enforces_limits() -> None:
     with pytest.raises(UnreadableFile, match="deeper"):
         read(b'{"features":' + b"[" * 200 + b"]" * 200 + b"}")
     with pytest.raises(TooLarge):
@@ -440,12 +440,12 @@ def test_limits() -> None:
 @pytest.mark.parametrize(
     ("data", "warning"),
     [
-        (graph(startid=9), "is no node"),
-        (graph(startid=9, endid=8), "is no node"),
+        (graph(startid=9), "missing node"),
+        (graph(startid=9, endid=8), "missing node"),
         (graph(endid=1), "to itself"),
         (graph(node(id=4, frame="odom")), "frame is 'odom'"),
-        (graph(metadata={"a": None}), "numbers, texts, booleans"),
-        (graph(metadata={"a": {"b": [[1]]}}), "numbers, texts, booleans"),
+        (graph(metadata={"a": None}), "numbers, strings, booleans"),
+        (graph(metadata={"a": {"b": [[1]]}}), "numbers, strings, booleans"),
         (graph(metadata=5), "must be an object"),
         (graph(operations={"x": {"type": "stop", "trigger": "NEVER"}}), "trigger"),
         (graph(operations={"x": {"type": "a", "trigger": "NODE", "metadata": {"y": None}}}), "operation 'x'"),
@@ -453,10 +453,10 @@ def test_limits() -> None:
         (graph(cost="high"), "cost must be"),
         (graph(overridable=1), "overridable must be"),
         (graph(node(id=4, frame=7)), "frame must be"),
-        (graph(metadata={"speed_limit": 85}), "served as floats"),
+        (graph(metadata={"speed_limit": 85}), "exported as floats"),
     ],
 )  # fmt: skip
-def test_what_is_doubtful_is_taken_with_a_warning(data: dict[str, Any], warning: str) -> None:
+def test_doubtful_content_is_read_with_warning(data: dict[str, Any], warning: str) -> None:
     # A file with an edge to nowhere needs another edge to be one.
     extra = {"type": "Feature", "geometry": {"type": "MultiLineString", "coordinates": "?"}}
     data["features"].append({**extra, "properties": {"id": 90, "startid": 2, "endid": 1}})
@@ -468,7 +468,7 @@ def test_what_is_doubtful_is_taken_with_a_warning(data: dict[str, Any], warning:
         assert warning in warnings(write_context)
 
 
-def test_edges_to_nowhere_are_kept_but_not_served() -> None:
+def test_dangling_edges_are_stored_but_not_exported() -> None:
     line = {"type": "Feature", "geometry": {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}}
     part, _ = read(
         graph(
@@ -480,10 +480,10 @@ def test_edges_to_nowhere_are_kept_but_not_served() -> None:
     assert part.document["nav2_route"]["dangling"] == [{"id": 12, "from": 98, "to": 99, "properties": {}}]
     served, context = write(part)
     assert set(RouteServer(served).edges) == {3}
-    assert [(d.subject, d.count) for d in context.dropped] == [("edges to nowhere", 2)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("edges without both end nodes", 2)]
 
 
-def test_words_of_other_types_stay_where_they_are() -> None:
+def test_metadata_of_other_types_stays_in_metadata() -> None:
     metadata = {"name": "", "action": 5, "width": "wide", "abs_speed_limit": True}
     part, _ = read(graph(node(id=4, metadata={"name": "4"}), metadata=metadata))
     assert part.properties[-1]["nav2_route"]["properties"]["metadata"] == metadata
@@ -495,12 +495,12 @@ def test_words_of_other_types_stay_where_they_are() -> None:
     ]
 
 
-def test_nothing_is_read_that_nobody_wants() -> None:
+def test_read_skips_unrequested_layers() -> None:
     context = ReadContext(main="g.json", requested_layers=frozenset({"voxels"}))
     assert formats.read(FileGroup(FORMAT, "g.json", {"g.json": b"{}"}), context).parts == {}
 
 
-def test_detection() -> None:
+def test_detect_accepts_route_graphs_only() -> None:
     data = json.dumps(graph()).encode()
     assert FORMAT.detect("a.json", data)
     assert FORMAT.detect("b.geojson", b"\xef\xbb\xbf\n" + data)
@@ -508,7 +508,7 @@ def test_detection() -> None:
     assert not FORMAT.detect("b.geojson", b'{"type":"FeatureCollection","features":[]}')
 
 
-def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
+def test_invalid_property_values_are_written_safely() -> None:
     odd: list[Any] = [5, "x", [1], {"a": 1}, None, [[1]], True, {"id": -1}]
     for value in odd:
         source_properties = dict.fromkeys(("id", "properties", "members", "geometry", "dangling", "line"), value)

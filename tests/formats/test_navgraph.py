@@ -1,4 +1,4 @@
-"""navgraph: real graphs come back the same, facts hold, Fawkes' rules are kept or warned about, bad files are named."""
+"""navgraph: real graphs round-trip, independently counted facts, Fawkes' rules, errors name their location."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def warnings(context: ReadContext | WriteContext) -> str:
 
 
 class Fawkes:
-    """What yaml_navgraph.cpp makes of a file: every scalar is a text; connections are added one after the other."""
+    """Loader with the rules of yaml_navgraph.cpp: every scalar is a text; connections are added in sequence."""
 
     def __init__(self, text: str) -> None:
         assert text.startswith(HEAD)
@@ -131,7 +131,7 @@ class Fawkes:
 # --- real files ------------------------------------------------------------------------------------------------------
 
 
-def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+def test_real_files_round_trip(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
     paths = sorted((shared / "data" / "navgraph").rglob("*.yaml"))
     assert len(paths) == sum(f.get("kind") == "fawkes_navgraph" for f in facts_json.values()) == 3
     for path in paths:
@@ -143,7 +143,7 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         assert write(read(served)[0])[0] == served
 
 
-def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_real_files_match_counted_facts(shared: Path, facts_json: dict[str, Any]) -> None:
     for path in sorted((shared / "data" / "navgraph").rglob("*.yaml")):
         fact = facts_json[str(path.relative_to(shared / "data"))]["facts"]
         part, context = read(path.read_bytes())
@@ -161,13 +161,13 @@ def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_js
         assert sum("orientation" in p for p in nodes) == fact["node_property_keys"].get("orientation", 0)
         assert part.document["navgraph"]["top"]["graph-name"] == fact["graph_name"]
         assert part.document["navgraph"]["defaults"] == fact["default_properties"]
-        assert ("is no node" in warnings(context)) == (fact["root_is_a_node"] is False)
+        assert ("is not a node" in warnings(context)) == (fact["root_is_a_node"] is False)
         points = part.geometry[: len(nodes)]
         assert shapely.total_bounds(points) == pytest.approx([*fact["bounds"][0], *fact["bounds"][1]], abs=1e-6)
         assert bool(part.local.all())
 
 
-def test_fawkes_takes_real_graphs_as_we_serve_them(shared: Path) -> None:
+def test_exported_real_graphs_load_in_fawkes(shared: Path) -> None:
     for path in sorted((shared / "data" / "navgraph").rglob("*.yaml")):
         before, after = Fawkes(path.read_text()), Fawkes(write(read(path.read_bytes())[0])[0])
         assert before.nodes.keys() == after.nodes.keys()
@@ -178,7 +178,7 @@ def test_fawkes_takes_real_graphs_as_we_serve_them(shared: Path) -> None:
 # --- our sample ------------------------------------------------------------------------------------------------------
 
 
-def test_facts_of_the_sample() -> None:
+def test_sample_matches_expected_facts() -> None:
     fact = FACTS["depot.yaml"]
     part, context = read((SAMPLES / "depot.yaml").read_bytes())
     nodes = {i: p for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "node"}
@@ -191,7 +191,7 @@ def test_facts_of_the_sample() -> None:
     assert [*zip(*[iter(shapely.total_bounds(part.geometry).tolist())] * 2, strict=True)] == [
         tuple(b) for b in fact["bounds"]
     ]
-    assert "no node" in warnings(context)
+    assert "is not a node" in warnings(context)
     dock = nodes["Dock"]
     assert dock["name"] == "Charging dock"
     assert dock["orientation"] == pytest.approx([0, 0, math.sin(4.71 / 2), math.cos(4.71 / 2)])
@@ -204,7 +204,7 @@ def test_facts_of_the_sample() -> None:
     assert nodes["A"]["navgraph"]["more"] == {"floor": {"colour": "grey", "tiles": [1, 2]}}
 
 
-def test_the_sample_in_full(same: Same) -> None:
+def test_sample_is_written_as_expected(same: Same) -> None:
     data = (SAMPLES / "depot.yaml").read_bytes()
     part, _ = read(data)
     served, context = write(part)
@@ -220,7 +220,7 @@ def test_the_sample_in_full(same: Same) -> None:
     ]  # fmt: skip
 
 
-def test_what_an_edit_changes_is_served() -> None:
+def test_edited_properties_are_exported() -> None:
     part, _ = read((SAMPLES / "depot.yaml").read_bytes())
     place = part.index()
     properties = [dict(p) for p in part.properties]
@@ -240,7 +240,7 @@ def test_what_an_edit_changes_is_served() -> None:
 
 
 def cross(**more: Any) -> Features:
-    """Two streets that cross on a bridge, a one-way street, a parallel edge, a lone node."""
+    """Two streets that cross on a bridge, a one-way street, a parallel edge, an isolated node."""
     at = {"W": (-5.0, 0.0), "E": (5.0, 0.0), "S": (0.0, -5.0), "N": (0.0, 5.0), "alone": (9.0, 9.0)}
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         (i, shapely.Point(p), {"kind": "node", "name": i}) for i, p in at.items()
@@ -255,7 +255,7 @@ def cross(**more: Any) -> Features:
     return features(rows, "local")
 
 
-def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
+def test_network_of_another_format_loads_in_fawkes() -> None:
     served, context = write(cross(), title="quarter")
     graph = Fawkes(served)
     assert graph.name == "quarter"
@@ -274,7 +274,7 @@ def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
         "altitudes of nodes": 1,
         "ids of edges": 9,
         "edges with attributes (action, speed limit …)": 7,
-        "attributes of nodes that are no scalars": 1,
+        "attributes of nodes that are not scalars": 1,
     }
     assert {t.subject for t in context.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
     assert next(t.option for t in context.template if t.subject == "graph-name") == "graph_name"
@@ -293,7 +293,7 @@ def one_way(*pairs: str) -> Features:
     return features(rows, "local")
 
 
-def test_the_first_node_is_one_that_reaches_all() -> None:
+def test_first_node_reaches_all_others() -> None:
     served, context = write(one_way("DC", "CB", "BA"))
     assert next(iter(Fawkes(served).nodes)) == "D"
     assert context.warnings == []
@@ -310,7 +310,7 @@ def test_one_way_crossings_are_warned_about() -> None:
         Fawkes(served)
 
 
-def test_places_on_earth_need_a_datum() -> None:
+def test_wgs84_positions_need_datum() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(-0.5, 53.0), {"kind": "node"}),
         ("b", shapely.Point(-0.5, 53.001), {"kind": "node"}),
@@ -330,10 +330,10 @@ def test_levels_are_joined_with_distinct_names() -> None:
     served, context = write(layers)
     assert "name: A#2" in served or "name: 'A#2'" in served
     assert {d.subject for d in context.dropped} >= {"levels of nodes"}
-    assert "got a number" in warnings(context)
+    assert "a numeric suffix" in warnings(context)
 
 
-def test_from_tmap2_and_from_a_drawing(shared: Path) -> None:
+def test_tmap2_and_drawing_are_exported(shared: Path) -> None:
     farm = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard" / "config" / "topological"
     data = (farm / "network.tmap2.yaml").read_bytes()
     navgraph_data = offline({"network.tmap2.yaml": data}, "navgraph").files["navgraph.yaml"]
@@ -352,13 +352,13 @@ def test_from_tmap2_and_from_a_drawing(shared: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "said",
+    "scalar",
     ["no", "'yes'", "010", "1.50", "~", "0x1F", "12:30", "'a: b'", "'a, b'", "'[x]'", "'!dir'", "Größe", '"tab \\x41"',
      "null", "'#1'", "a.b", "'-'", "2022-01-01", "'{'"],
 )  # fmt: skip
-def test_any_name_comes_back_as_fawkes_reads_it(said: str) -> None:
-    text = f"{HEAD}graph-name: G\nnodes:\n- {{name: {said}, pos: [1, 2]}}\n- {{name: B, pos: [3, 4]}}\n"
-    text += f"connections:\n- [{said}, B]\n"
+def test_any_name_round_trips_as_fawkes_reads_it(scalar: str) -> None:
+    text = f"{HEAD}graph-name: G\nnodes:\n- {{name: {scalar}, pos: [1, 2]}}\n- {{name: B, pos: [3, 4]}}\n"
+    text += f"connections:\n- [{scalar}, B]\n"
     before = Fawkes(text)
     after = Fawkes(write(read(text)[0])[0])
     assert before.nodes == after.nodes
@@ -378,7 +378,7 @@ def graph(nodes: str = "", connections: str = "", head: str = HEAD) -> str:
         (graph("- name: C\n  pos: [1, 2, 3]\n"), "C.pos", "[x, y]"),
         (graph("- name: C\n  pos: [1, .nan]\n"), "C.pos", "finite"),
         (graph("- name: C\n  pos: [1, x]\n"), "C.pos", "not a number"),
-        (graph("- name: [C]\n  pos: [1, 2]\n"), "nodes[2].name", "text"),
+        (graph("- name: [C]\n  pos: [1, 2]\n"), "nodes[2].name", "string"),
         (graph("- name: ''\n  pos: [1, 2]\n"), "nodes[2].name", "characters"),
         (graph('- name: "a\\nb"\n  pos: [1, 2]\n'), "nodes[2].name", "control"),
         (graph("- [C, 1, 2]\n"), "nodes[2]", "mapping"),
@@ -389,13 +389,13 @@ def graph(nodes: str = "", connections: str = "", head: str = HEAD) -> str:
         (graph("- name: C\n  pos: [1, 2]\n  properties: [{a: !dir [1]}]\n"), "C.properties.a", "tag"),
         (graph(connections="- [A]\n"), "connections[1]", "pair"),
         (graph(connections="- {A: B}\n"), "connections[1]", "pair"),
-        (graph(connections="- [A, [B]]\n"), "connections[1]", "text"),
+        (graph(connections="- [A, [B]]\n"), "connections[1]", "string"),
         (graph(connections="- !a%20b [A, B]\n"), "connections[1]", "tag"),
         (f"{HEAD}graph-name: G\nnodes: 5\n", "nodes", "list"),
         (f"{HEAD}[]\n", "nodes", "list"),
     ],
 )
-def test_bad_files_are_named(text: str, where: str, reason: str) -> None:
+def test_bad_files_are_refused_with_location(text: str, where: str, reason: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(text)
     problem = caught.value.problems[0]
@@ -414,7 +414,7 @@ def test_bad_files_are_named(text: str, where: str, reason: str) -> None:
         graph("&n - name: C\n"),
     ],
 )
-def test_other_tags_are_refused_with_their_line(text: str) -> None:
+def test_unknown_yaml_tags_are_refused_with_line(text: str) -> None:
     with pytest.raises(BadUpload) as caught:
         read(text)
     assert caught.value.problems[0].line
@@ -423,47 +423,47 @@ def test_other_tags_are_refused_with_their_line(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "warning"),
     [
-        (graph(connections="- [A, X]\n"), "no node 'X'"),
-        (graph(connections="- [X, Y]\n"), "no node 'X'"),
-        (graph(connections="- [B, A]\n"), "stands twice"),
-        (graph(connections="- !dir [B, B]\n"), "with itself"),
-        (graph(connections="- !fast [A, B]\n"), "does not know the tag !fast"),
-        (graph("- name: A\n  pos: [5, 5]\n"), "stand twice"),
-        (graph("- !parked\n  name: C\n  pos: [5, 5]\n"), "does not know the tag !parked"),
+        (graph(connections="- [A, X]\n"), "unknown node 'X'"),
+        (graph(connections="- [X, Y]\n"), "unknown node 'X'"),
+        (graph(connections="- [B, A]\n"), "duplicate connection"),
+        (graph(connections="- !dir [B, B]\n"), "to itself"),
+        (graph(connections="- !fast [A, B]\n"), "does not support the tag !fast"),
+        (graph("- name: A\n  pos: [5, 5]\n"), "duplicate node names"),
+        (graph("- !parked\n  name: C\n  pos: [5, 5]\n"), "does not support the tag !parked"),
         (graph("- name: C\n  pos: [5, 5]\n  properties: {a: 1}\n"), "must be a list"),
-        (graph("- name: C\n  pos: [5, 5]\n  properties: [a: 1, a: 2]\n"), "the last value counts"),
-        (graph("- name: C\n  pos: [5, 5]\n  properties: [a: [1]]\n"), "no scalar"),
-        (graph(connections="- !dir [A, B]\n", head=""), "needs the line"),
-        (f"{HEAD}nodes: []\n", "is missing"),
+        (graph("- name: C\n  pos: [5, 5]\n  properties: [a: 1, a: 2]\n"), "the last value is used"),
+        (graph("- name: C\n  pos: [5, 5]\n  properties: [a: [1]]\n"), "not a scalar"),
+        (graph(connections="- !dir [A, B]\n", head=""), "without the line"),
+        (f"{HEAD}nodes: []\n", "missing"),
     ],
 )
-def test_what_is_doubtful_is_taken_with_a_warning(text: str, warning: str) -> None:
+def test_doubtful_content_is_read_with_warning(text: str, warning: str) -> None:
     part, context = read(text)
     assert warning in warnings(context)
     served, _ = write(part)
     assert write(read(served)[0])[0] == served
 
 
-def test_connections_to_nowhere_are_kept_but_not_served() -> None:
+def test_dangling_connections_are_stored_but_not_exported() -> None:
     part, _ = read(graph(connections="- !dir [A, X]\n- [Y, B]\n- [X, Y]\n"))
     assert part.properties[0]["navgraph"]["dangling"] == [{"tag": "dir", "ends": ["A", "X"]}]
     assert part.properties[1]["navgraph"]["dangling"] == [{"ends": ["Y", "B"]}]
     assert part.document["navgraph"]["dangling"] == [{"ends": ["X", "Y"]}]
     served, context = write(part)
     assert len(Fawkes(served).edges) == 1
-    assert [(d.subject, d.count) for d in context.dropped] == [("connections to nowhere", 3)]
+    assert [(d.subject, d.count) for d in context.dropped] == [("connections without both end nodes", 3)]
 
 
-def test_a_repeated_name_is_served_as_it_was() -> None:
+def test_duplicate_name_is_exported_unchanged() -> None:
     part, _ = read(graph("- name: A\n  pos: [5, 5]\n"))
     assert part.ids[:3] == ("A", "B", "A#2")
     assert part.properties[2]["name"] == "A"
     served, context = write(part)
     assert served.count("name: A\n") == 2
-    assert "Fawkes refuses" in warnings(context)
+    assert "Fawkes rejects" in warnings(context)
 
 
-def test_nothing_is_read_that_nobody_wants() -> None:
+def test_read_skips_unrequested_layers() -> None:
     context = ReadContext(main="n.yaml", requested_layers=frozenset({"occupancy"}))
     assert formats.read(FileGroup(FORMAT, "n.yaml", {"n.yaml": graph().encode()}), context).parts == {}
 
@@ -478,11 +478,11 @@ def test_nothing_is_read_that_nobody_wants() -> None:
         ("a.yaml", "nodes:\n- graph-name: x\n", False),
     ],
 )
-def test_detection(name: str, text: str, is_one: bool) -> None:
+def test_detect_accepts_navgraphs_only(name: str, text: str, is_one: bool) -> None:
     assert FORMAT.detect(name, text.encode()) is is_one
 
 
-def test_large_graphs_are_quick_and_scribbles_end() -> None:
+def test_large_and_dense_graphs_are_written_in_time() -> None:
     n = 120
     at = np.stack([np.cos(np.arange(n)), np.sin(np.arange(n))], axis=1) * 100
     rows: list[tuple[str, Any, dict[str, Any]]] = [
@@ -497,7 +497,7 @@ def test_large_graphs_are_quick_and_scribbles_end() -> None:
     assert served.count("!allow-intersection") > 4_000
 
 
-def test_yaml_tags_are_for_formats_that_name_them() -> None:
+def test_yaml_tags_are_read_only_for_formats_that_declare_them() -> None:
     limits = Limits()
     data = b"%TAG ! tag:x,2024:\n---\na: !t [1, no]\n"
     with pytest.raises(UnreadableFile):
@@ -515,7 +515,7 @@ def test_hints_name_the_format() -> None:
     assert b"pos: [1.0, 2.0]" in offline(files, "navgraph", hints=UploadHints("navgraph")).files["navgraph.yaml"]
 
 
-def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
+def test_invalid_property_values_are_written_safely() -> None:
     odd: list[Any] = [5, "x", [1], {"a": 1}, None, [[1]], True]
     for value in odd:
         source_properties = dict.fromkeys(

@@ -1,4 +1,4 @@
-"""OpenStreetMap in and out: facts counted by others, round trips, edits, oddities of real extracts, hostile bytes."""
+"""OpenStreetMap: independently counted facts, round trips, edits, irregular extracts, hostile bytes."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def xml(body: str, root: str = '<osm version="0.6">') -> bytes:
 
 
 def elements(data: bytes) -> dict[str, Any]:
-    """type + id -> (attributes, refs or members, tags)."""
+    """Return elements as type + id -> (attributes, refs or members, tags)."""
     root = etree.fromstring(data)
     out = {}
     for e in root.iterchildren("node", "way", "relation"):
@@ -102,7 +102,7 @@ def check_with_osmium(data: bytes, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_real_extracts_agree_with_counted_facts(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
+def test_real_extracts_match_counted_facts(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
     path = f"osm/{name}/osm.xml"
     facts = facts_json[path]["facts"]
     layers = read((shared / "data" / path).read_bytes())
@@ -127,13 +127,13 @@ def test_real_extracts_agree_with_counted_facts(name: str, shared: Path, facts_j
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_committed_datums_are_the_corner_of_the_bounds(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
+def test_committed_datums_equal_corner_of_bounds(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
     facts = facts_json[f"osm/{name}/datum_autogen.yaml"]["facts"]
     west, south, _, _ = part(read((shared / "data/osm" / name / "osm.xml").read_bytes()), TOPOLOGY).document["bounds"]
     assert [south, west] == [facts["datum_latitude"], facts["datum_longitude"]]
 
 
-def test_the_datasets_own_network_has_our_nodes_and_edges(shared: Path, facts: Any) -> None:
+def test_dataset_network_matches_nodes_and_edges(shared: Path, facts: Any) -> None:
     folder = shared / "data/osm/urban-usa-mn-minnesota-zoo"
     theirs = facts.tmap2_nodes(facts.tmap2((folder / "network_autogen.tmap2.yaml").read_bytes()))
     graph = network(read((folder / "osm.xml").read_bytes(), requested_layers=frozenset({"topology"})))
@@ -145,7 +145,7 @@ def test_the_datasets_own_network_has_our_nodes_and_edges(shared: Path, facts: A
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_real_extracts_come_back(name: str, shared: Path, same: Callable[..., list[str]], tmp_path: Path) -> None:
+def test_real_extracts_round_trip(name: str, shared: Path, same: Callable[..., list[str]], tmp_path: Path) -> None:
     data = (shared / "data/osm" / name / "osm.xml").read_bytes()
     layers = read(data)
     context = WriteContext()
@@ -163,7 +163,7 @@ def test_real_extracts_come_back(name: str, shared: Path, same: Callable[..., li
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Path) -> None:
+def test_fast_and_strict_parsers_agree_and_skip_unrequested_content(name: str, shared: Path) -> None:
     data = (shared / "data/osm" / name / "osm.xml").read_bytes()
     quick, careful = scan(data, Limits(), False), read_events(data, Limits())
     assert quick is not None, "a file as the OSM server writes it is regular"
@@ -180,13 +180,13 @@ def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Pa
 
 
 def contents(data: Data) -> Any:
-    """All that was read, to be compared."""
+    """Return all parsed content in comparable form."""
     nodes = [(i, at, data.tags.get(k), data.attributes(k)) for k, (i, at) in enumerate(zip(data.ids, data.lonlat.tolist(), strict=True))]  # fmt: skip  # noqa: E501
     return nodes, data.ways, data.relations, data.root, data.bounds
 
 
 @pytest.mark.parametrize("piece", [1, 50, 300, 1000])
-def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_are_scanned_in_pieces(piece: int, monkeypatch: pytest.MonkeyPatch) -> None:
     tag = '<tag k="natural" v="tree"/>'
     nodes = [
         f' <node id="{k}" version="{k % 3}" lat="{k / 7:.7f}" lon="-{k}"' + (f">{tag}</node>" if k % 4 == 0 else "/>")
@@ -203,7 +203,7 @@ def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.Monkey
     assert contents(pieces) == contents(reference)
 
 
-def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attributes_of_many_name_lists_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scanning, "PATTERNS", 3)
     monkeypatch.setattr(scanning, "MAX_CACHED_TEXTS", 2)
     names = ["version", "__class__", "__dict__", "user", "uid", "changeset", "x:y", "a.b-c"]
@@ -217,7 +217,7 @@ def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(mo
     assert [content.attributes(k) for k in range(len(names))] == expected
 
 
-def test_defective_files_as_their_authors_mean_them(shared: Path, same: Callable[..., list[str]]) -> None:
+def test_defective_files_are_read_as_intended(shared: Path, same: Callable[..., list[str]]) -> None:
     folder = shared / "data/osm/osm-testdata-xml"
     for case in sorted(folder.iterdir()):
         data = (case / "data.osm").read_bytes()
@@ -231,7 +231,7 @@ def test_defective_files_as_their_authors_mean_them(shared: Path, same: Callable
             assert same("osm", {"a.osm": data}, {"b.osm": write(read(data))}) == [], case.name
 
 
-def test_odd_files_come_back(shared: Path, same: Callable[..., list[str]], tmp_path: Path) -> None:
+def test_irregular_files_round_trip(shared: Path, same: Callable[..., list[str]], tmp_path: Path) -> None:
     paths = [*sorted((shared / "data/osm/osm-testdata-grid").rglob("data.osm")), SAMPLE]
     paths += sorted((shared / "data/lanelet2").rglob("*.osm"))
     assert len(paths) > 10
@@ -245,7 +245,7 @@ def test_odd_files_come_back(shared: Path, same: Callable[..., list[str]], tmp_p
 # --- a small extract with every oddity ---------------------------------------------------------------------------
 
 
-def test_the_samples_network() -> None:
+def test_sample_network_matches_expected() -> None:
     context = ReadContext()
     layers = read(SAMPLE.read_bytes(), context)
     graph = network(layers)
@@ -261,14 +261,14 @@ def test_the_samples_network() -> None:
     assert properties["n3"]["osm"]["attributes"]["user"] == 'Zoë & "Co"'
     assert properties["w100:1-2"]["osm"] == {"way": 100, "tags": {"highway": "residential", "name": "Straße"}}
     texts = " ".join(f"{p.where} {p.problem}" for p in context.warnings)
-    for expected in ("way 103 the way goes from a node to itself", "way 106 the way is marked as deleted"):
+    for expected in ("way 103 the way repeats a node directly", "way 106 the way is marked as deleted"):
         assert expected in texts
-    assert "2 nodes that have no place" in texts
-    assert "node 7 the node has no place" in texts
+    assert "2 nodes that have no position" in texts
+    assert "node 7 the node has no position" in texts
     assert "way 105 the way has no nodes" in texts
 
 
-def test_the_samples_objects() -> None:
+def test_sample_objects_match_expected() -> None:
     objects = {f.id: f for f in part(read(SAMPLE.read_bytes()), OBJECTS)}
     assert set(objects) == {"n-3", "n7", "n22", *(f"w{i}" for i in (*range(100, 107), 200, 201)), "r300"}
     barn = objects["w200"]
@@ -299,12 +299,12 @@ def test_the_samples_objects() -> None:
         ({"highway": "trunk"}, "both"),
     ],
 )
-def test_direction(tags: dict[str, str], expected: str) -> None:
+def test_direction_follows_oneway_tags(tags: dict[str, str], expected: str) -> None:
     assert direction(tags) == expected
 
 
 @pytest.mark.parametrize("pack", [gzip.compress, bz2.compress], ids=["gz", "bz2"])
-def test_compressed(pack: Callable[[bytes], bytes]) -> None:
+def test_compressed_files_are_read(pack: Callable[[bytes], bytes]) -> None:
     data = pack(SAMPLE.read_bytes())
     assert osm.detect("map.osm.gz", data)
     assert write(read(data)) == write(read(SAMPLE.read_bytes()))
@@ -318,7 +318,7 @@ def test_compressed(pack: Callable[[bytes], bytes]) -> None:
         read(bomb)
 
 
-def test_pbf_says_the_same_as_xml(tmp_path: Path) -> None:
+def test_pbf_reads_equal_to_xml(tmp_path: Path) -> None:
     import osmium
 
     body = """<bounds minlat="50" minlon="7" maxlat="50.01" maxlon="7.01"/>
@@ -367,7 +367,7 @@ def edited(layers: Layers, change: Callable[[list[Any]], list[Any]]) -> Layers:
     return Layers({**layers.parts, TOPOLOGY: features(change(rows), "wgs84")}, layers.datum, layers.levels)
 
 
-def test_a_moved_node_is_written_where_it_is() -> None:
+def test_moved_node_is_written_at_new_position() -> None:
     layers = read(SAMPLE.read_bytes())
     place = shapely.Point(7.5, 50.5)
     moved = edited(layers, lambda rows: [(i, place if i == "n2" else g, p) for i, g, p in rows])
@@ -376,7 +376,7 @@ def test_a_moved_node_is_written_where_it_is() -> None:
     assert out["w100"] == elements(write(layers))["w100"]
 
 
-def test_a_deleted_edge_splits_its_way(tmp_path: Path) -> None:
+def test_deleted_edge_splits_way(tmp_path: Path) -> None:
     body = "".join(f'<node id="{i}" lat="50" lon="7.{i}"/>' for i in range(1, 6))
     body += '<way id="9" version="2">' + "".join(f'<nd ref="{i}"/>' for i in range(1, 6))
     body += '<tag k="highway" v="path"/></way><relation id="1"><member type="way" ref="9" role="r"/></relation>'
@@ -395,7 +395,7 @@ def test_a_deleted_edge_splits_its_way(tmp_path: Path) -> None:
     check_with_osmium(served, tmp_path)
 
 
-def test_a_deleted_node_goes_and_one_that_bends_a_fence_stays() -> None:
+def test_deleted_node_is_removed_unless_bend_of_way() -> None:
     layers = read(SAMPLE.read_bytes())
     touched = {
         "n1",
@@ -407,7 +407,7 @@ def test_a_deleted_node_goes_and_one_that_bends_a_fence_stays() -> None:
     assert float(elements(served)["n1"][0]["lat"]) == 50.0
 
 
-def test_added_edges_become_a_way_and_other_tags_count(tmp_path: Path) -> None:
+def test_added_edges_become_way_with_changed_tags(tmp_path: Path) -> None:
     layers = read(SAMPLE.read_bytes())
 
     def change(rows: list[Any]) -> list[Any]:
@@ -441,7 +441,7 @@ def test_added_edges_become_a_way_and_other_tags_count(tmp_path: Path) -> None:
     assert out["w102"][2] == {"highway": "service", "oneway": "-1", "surface": "mud"}
 
 
-def test_another_network_replaces_the_streets_and_keeps_the_rest(tmp_path: Path) -> None:
+def test_new_network_replaces_highways_only(tmp_path: Path) -> None:
     layers = read(SAMPLE.read_bytes())
     rows = [
         ("n1", shapely.Point(0, 0), {"kind": "node"}),
@@ -466,7 +466,7 @@ def test_another_network_replaces_the_streets_and_keeps_the_rest(tmp_path: Path)
         write(Layers(other.parts))
 
 
-def test_a_redrawn_building_gets_new_corners() -> None:
+def test_redrawn_building_gets_new_nodes() -> None:
     layers = read(SAMPLE.read_bytes())
     objects = part(layers, OBJECTS)
     shape = shapely.Polygon([(7.003, 50.003), (7.0031, 50.003), (7.0031, 50.0031), (7.0035, 50.004), (7.003, 50.0031)])
@@ -520,13 +520,13 @@ def test_items_of_other_formats_get_tags() -> None:
     assert {"name": "tree", "kind": "poi", "height": "3.5", "alive": "yes"} in tags
     assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in tags
     assert {"name": "up", "kind": "path", "level": "L2"} in tags
-    assert not any(t.get("name") == "drawn" for t in tags), "the network made from it stands there already"
+    assert not any(t.get("name") == "drawn" for t in tags), "the network derived from it is written already"
     lost = {d.subject for d in context.dropped}
     assert {"GNSS fence", "datum", "items without a geometry"} <= lost
     assert any("nested" in item for item in lost)
 
 
-def test_two_levels_with_the_same_ids_do_not_melt() -> None:
+def test_levels_with_same_ids_stay_separate() -> None:
     ground, upper = read(SAMPLE.read_bytes()), read(SAMPLE.read_bytes(), level="L2")
     shifted = Layers(
         {
@@ -544,7 +544,7 @@ def test_two_levels_with_the_same_ids_do_not_melt() -> None:
     assert networkx.number_weakly_connected_components(graph) == 2 * networkx.number_weakly_connected_components(single)
 
 
-def test_properties_that_anybody_edited_do_no_harm() -> None:
+def test_arbitrary_edited_properties_are_written_safely() -> None:
     source_properties: list[dict[str, Any]] = [
         {"refs": "1,2", "tags": {"a": 1}},
         {"refs": [1.5, None], "tags": []},
@@ -577,9 +577,9 @@ def test_properties_that_anybody_edited_do_no_harm() -> None:
     [
         ('<node id="1" lat="NaN" lon="1"/>', "finite"),
         ('<node id="1" lat="inf" lon="1"/>', "finite"),
-        ('<node id="1" lat="1e999" lon="1"/>', "no place on earth"),
-        ('<node id="1" lat="90.1" lon="1"/>', "no place on earth"),
-        ('<node id="1" lat="1" lon="-180.5"/>', "no place on earth"),
+        ('<node id="1" lat="1e999" lon="1"/>', "invalid position"),
+        ('<node id="1" lat="90.1" lon="1"/>', "invalid position"),
+        ('<node id="1" lat="1" lon="-180.5"/>', "invalid position"),
         ('<node id="1" lat="1_0" lon="1"/>', "finite"),
         ('<node id="1" lat="١" lon="1"/>', "finite"),
         ('<node lat="1" lon="1"/>', "id"),
@@ -591,9 +591,9 @@ def test_properties_that_anybody_edited_do_no_harm() -> None:
         ('<relation id="1"><member type="area" ref="1" role=""/></relation>', "member"),
         ('<bounds minlat="5" minlon="1" maxlat="4" maxlon="2"/>', "bounds"),
         ('<bounds minlat="nan" minlon="1" maxlat="4" maxlon="2"/>', "bounds"),
-        ('<way id="1"><way id="2"><nd ref="1"/></way></way>', "no part"),
+        ('<way id="1"><way id="2"><nd ref="1"/></way></way>', "not allowed"),
         ('<node id="1" lat="1" lon="1" user="' + "x" * 70_000 + '"/>', "longer"),
-        ("<a>" * 300 + "</a>" * 300, "no element"),
+        ("<a>" * 300 + "</a>" * 300, "not an element"),
         ('<node id="1" lat="1" lon="1">&bomb;</node>', ""),
         ('<node id="1" lat="1" lon="1" id="2"/>', ""),
         ("<node id='1' lat='1' lon='1'/>\x00", ""),
@@ -607,7 +607,7 @@ def test_bad_content_is_refused_with_a_reason(body: str, reason: str) -> None:
 
 
 @pytest.mark.parametrize("quote", ['"', "'"])
-def test_a_bad_place_is_named_with_its_line(quote: str) -> None:
+def test_bad_position_is_reported_with_line(quote: str) -> None:
     lines = "\n".join(f'<node id="{k}" lat="{89 + k}" lon="1"/>' for k in range(4)).replace('"', quote)
     with pytest.raises(UnreadableFile) as refused:
         read(xml(lines))
@@ -643,7 +643,7 @@ def test_other_encodings_and_layouts_are_read() -> None:
         assert osm.detect("x", data)
 
 
-def test_what_is_detected() -> None:
+def test_detect_accepts_osm_only() -> None:
     assert osm.detect("a", SAMPLE.read_bytes())
     assert osm.detect("a", b'<!DOCTYPE osm [<!ENTITY a "b">]><osm/>'), "so that the reader can say what is wrong"
     assert not osm.detect("a", b"<!---->" * 500)
@@ -694,14 +694,14 @@ def test_memory_stays_within_ten_times_the_input() -> None:
 
 
 @pytest.mark.parametrize("quote", ["'", '"'])
-def test_a_node_inside_a_node_belongs_to_it_and_is_told(quote: str) -> None:
+def test_nested_node_is_reported(quote: str) -> None:
     body = "<node id='2' lat='1' lon='1'><node id='3' lat='2' lon='2'/></node><node id='4' lat='1' lon='2'/>"
     context = ReadContext()
     read(xml(body.replace("'", quote)), context)
     assert any("<node> inside <node>" in w.problem for w in context.warnings)
 
 
-def test_more_attributes_than_any_element_has() -> None:
+def test_many_attributes_are_read() -> None:
     many = " ".join(f"a{k}='x'" for k in range(50_000))
     with pytest.raises(UnreadableFile, match="50001 attributes"):
         read(f"<osm version='0.6' {many}></osm>".encode())
@@ -726,7 +726,7 @@ TOWN = """<node id="1" lat="50" lon="7.0"/><node id="2" lat="50" lon="7.1"/><nod
 <way id="7"><nd ref="11"/><nd ref="13"/><tag k="waterway" v="dam"/></way>"""
 
 
-def test_tags_in_canonical_words() -> None:
+def test_tags_become_canonical_properties() -> None:
     layers = read(xml(TOWN))
     properties = {f.id: {k: v for k, v in f.properties.items() if k != "osm"} for f in part(layers, OBJECTS)}
     assert properties["n6"] == {"kind": "tree", "height": 12.0, "width": pytest.approx(0.49974652)}
@@ -734,7 +734,7 @@ def test_tags_in_canonical_words() -> None:
     assert properties["w5"] == {"kind": "water", "width": 2.0}
     assert properties["w6"] == {"kind": "barrier", "height": 1.5}
     assert properties["w7"] == {"kind": "waterway"}
-    assert properties["w1"] == {"kind": "highway"}, "what a road measures is said of its edges"
+    assert properties["w1"] == {"kind": "highway"}, "sizes of a highway belong to its edges"
     edges = {f.id: f.properties for f in part(layers, TOPOLOGY) if f.properties["kind"] == "edge"}
     road = {"width": 6.0, "surface": "asphalt"}
     for i, limit in (("w1:1-2", 13.4112), ("w1:2-1", 1.666666667)):
@@ -749,7 +749,7 @@ def test_tags_in_canonical_words() -> None:
     assert write(read(write(layers))) == write(layers)
 
 
-def test_edited_words_change_their_tags() -> None:
+def test_edited_properties_change_tags() -> None:
     layers = read(xml(TOWN))
     objects = part(layers, OBJECTS)
     new = {"w4": {"height": 15.0, "name": "Mill"}, "n6": {"width": 0.49974652}, "w6": {"height": None}}
@@ -765,7 +765,7 @@ def test_edited_words_change_their_tags() -> None:
     out = {k: v[2] for k, v in elements(served).items()}
     assert out["w4"] == {"building": "yes", "building:levels": "4", "min_height": "3 m", "height": "15", "name": "Mill"}
     assert out["n6"] == elements(write(read(xml(TOWN))))["n6"][2]
-    assert out["w6"] == {"barrier": "hedge", "height": "150 cm"}, "what is not said stays as the tags have it"
+    assert out["w6"] == {"barrier": "hedge", "height": "150 cm"}, "unspecified values keep their tags"
     first = {"maxspeed": "30 mph", "maxspeed:backward": "walk", "maxspeed:forward": "18", "surface": "gravel"}
     assert out["w1"] == {"highway": "residential", "lanes": "2", **first}
     assert out["w-1"] == {"highway": "residential", "lanes": "2", "maxspeed": "9", "surface": "gravel"}
@@ -782,7 +782,7 @@ def test_edited_words_change_their_tags() -> None:
     assert sorted(t["maxspeed"] for t in tags if t["highway"] == "residential") == ["18", "6", "9"]
 
 
-def test_hostile_words_are_no_tags() -> None:
+def test_hostile_property_values_are_not_written_as_tags() -> None:
     layers = read(xml(TOWN))
     objects = part(layers, OBJECTS)
     bad: list[Any] = [[1], {"a": 1}, True, -1, 0, "", None]
@@ -829,7 +829,7 @@ FURTHER = """\
  </relation>"""
 
 
-def test_elements_that_osm_does_not_know_come_back() -> None:
+def test_undefined_elements_round_trip() -> None:
     data = xml(FURTHER, '<osm version="0.6" generator="JOSM" upload="false">')
     read_context, write_context = ReadContext(), WriteContext()
     layers = read(data, read_context)
@@ -846,7 +846,7 @@ def test_elements_that_osm_does_not_know_come_back() -> None:
 
 
 @pytest.mark.parametrize("source", ["tmap2", "geojson"])
-def test_an_edge_from_a_node_to_itself_survives(source: str) -> None:
+def test_edge_from_node_to_itself_round_trips(source: str) -> None:
     datum = Datum(53.0, -0.5)
     start, end = shapely.Point(0, 0), shapely.Point(5, 0)
 
@@ -871,17 +871,17 @@ def test_an_edge_from_a_node_to_itself_survives(source: str) -> None:
     assert write(read(served)) == served
 
 
-def test_a_node_twice_within_a_way_is_no_edge() -> None:
+def test_repeated_node_within_way_is_not_edge() -> None:
     nodes = "".join(f'<node id="{k}" lat="1.{k}" lon="1"/>' for k in (1, 2))
     refs = "".join(f'<nd ref="{k}"/>' for k in (1, 1, 2))
     context = ReadContext()
     twice = '<way id="4"><nd ref="2"/><nd ref="2"/><tag k="highway" v="path"/></way>'
     graph = network(read(xml(f'{nodes}<way id="3">{refs}<tag k="highway" v="path"/></way>{twice}'), context))
     assert sorted(graph.edges()) == [("n1", "n2"), ("n2", "n1")]
-    assert ["that segment is no edge" in p.problem for p in context.warnings] == [True, True]
+    assert ["that segment is skipped" in p.problem for p in context.warnings] == [True, True]
 
 
-def test_values_that_are_not_understood_are_named_with_their_number() -> None:
+def test_invalid_tag_values_are_reported_with_count() -> None:
     nodes = "".join(f'<node id="{k}" lat="50.00{k}" lon="7.0"/>' for k in range(1, 4))
     tree = '<node id="9" lat="50.1" lon="7.0"><tag k="natural" v="tree"/><tag k="height" v="tall"/></node>'
     ways = ""

@@ -1,4 +1,4 @@
-"""prm: pixels of a map's picture are places in metres and back, edges of both directions, nothing lost."""
+"""prm: pixels of a map's image become metres and back, edges of both directions, lossless round trips."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def edges(part: Features) -> Edges:
     return {(p["source"], p["target"]) for p in part.properties if p["kind"] == "edge"}
 
 
-def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
-    """What metric_to_prm.generate_prm dumps: integer pixels, an undirected graph, PyYAML's block style."""
+def reference_output(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
+    """Output of metric_to_prm.generate_prm: integer pixels, an undirected graph, PyYAML's block style."""
     dice = np.random.default_rng(3)
     at = [(int(dice.integers(picture[0])), int(dice.integers(picture[1]))) for _ in range(count)]
     node_rows = [{"id": k, "x": x, "y": y} for k, (x, y) in enumerate(at)]
@@ -67,7 +67,7 @@ def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[st
     return yaml.dump({"nodes": node_rows, "edges": graph}, sort_keys=False).encode(), node_rows, graph
 
 
-def test_facts_of_our_sample() -> None:
+def test_sample_matches_expected_facts() -> None:
     fact = json.loads((SAMPLE / "facts.json").read_text())["meadow"]
     part, bundle = read(MEADOW)
     assert nodes(part) == fact["nodes"]
@@ -75,14 +75,14 @@ def test_facts_of_our_sample() -> None:
     assert edges(part) == {("0", "1"), ("1", "0"), ("0", "2"), ("2", "0"), ("1", "2"), ("2", "1")}
     warnings = "\n".join(w.problem for w in bundle.warnings)
     assert "'77'" in warnings
-    assert "no lines: 10" in warnings
+    assert "without lines: 10" in warnings
     assert {k.layer for k in bundle.parts} == {"topology", "occupancy"}
     assert bundle.files["map.pgm"].format == "occupancy_grid"
     assert bundle.origin[NETWORK] == (("prm.yaml",), "prm")
 
 
-def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
-    data, node_rows, graph = seeds_own((200, 120), 300)
+def test_file_of_reference_writer_round_trips() -> None:
+    data, node_rows, graph = reference_output((200, 120), 300)
     assert formats.detect("prm_autogen.yaml", data) is FORMAT
     files = {
         "config/topological/prm_autogen.yaml": data,
@@ -105,7 +105,7 @@ def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
     assert offline({"prm.yaml": served}, "prm").files["prm.yaml"] == served, "it stands for itself now"
 
 
-def test_everything_that_a_file_says_comes_back() -> None:
+def test_every_key_round_trips() -> None:
     data = b"""seed: 7
 nodes:
 - {id: b-1, x: 1, y: 2, name: Dock}
@@ -135,13 +135,13 @@ picture: {resolution: 0.1, origin: [0, 0, 0], height: 50}
     }
     key = str
     assert sorted(now["nodes"], key=key) == sorted(once["nodes"], key=key)
-    once["edges"][2]["weight"] = 0.0  # the distance, where none was said
+    once["edges"][2]["weight"] = 0.0  # the distance, if the file has none
     assert sorted((sorted(e.items()) for e in now["edges"]), key=key) == sorted(
         (sorted(e.items()) for e in once["edges"]), key=key
     )
 
 
-def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
+def test_network_of_another_format_gets_pixels_of_stored_map() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("gate", shapely.Point(1.01, 2.0), {"kind": "node", "orientation": [0, 0, 0, 1]}),
         ("0", shapely.Point(3.0, 4.0), {"kind": "node", "name": "Barn"}),
@@ -156,9 +156,9 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
         {"id": 1, "x": 20, "y": 59, "name": "gate"},
     ]
     assert roadmap["edges"] == [{"from": 1, "to": 0, "weight": round(math.hypot(20, 20), 9), "oneway": True}]
-    assert any("one way" in w.problem for w in context.warnings)
+    assert any("one-way" in w.problem for w in context.warnings)
     assert {d.subject: d.count for d in context.dropped} == {
-        "places of nodes within their pixels": 2,
+        "positions of nodes within their pixels": 2,
         "attributes of nodes": 1,
     }
     assert [t.subject for t in context.template] == ["edges: weight"]
@@ -173,7 +173,7 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
     assert np.allclose(nodes(again)["0"], [3.0, 4.0], atol=0.05)
 
 
-def test_without_its_map_it_says_what_to_supply() -> None:
+def test_roadmap_without_map_reports_what_to_supply() -> None:
     alone = {"prm.yaml": MEADOW["prm.yaml"]}
     with pytest.raises(UnreadableFile, match=r"add that map.*resolution, origin and height"):
         read(alone)
@@ -183,7 +183,7 @@ def test_without_its_map_it_says_what_to_supply() -> None:
         read(alone, resolution="0.5", height="0")
 
 
-def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
+def test_tmap2_takes_precedence_over_roadmap_in_template() -> None:
     tmap2 = (SAMPLE.parent / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     files = {"config/topological/network.tmap2.yaml": tmap2, "config/topological/prm_autogen.yaml": MEADOW["prm.yaml"]}
     bundle = read_bundle(files, UploadHints(), EnvironmentContext(), Limits())
@@ -207,7 +207,7 @@ def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
         ("nodes:\n- {id: 1, x: 1, y: 1}\nedges: []\npicture: {height: true, origin: [0, 0, 0]}", "picture.height"),
     ],
 )
-def test_what_is_wrong_is_named(text: str, where: str) -> None:
+def test_invalid_values_are_refused_with_location(text: str, where: str) -> None:
     with pytest.raises(BadUpload) as caught:
         formats.read(FileGroup(FORMAT, "prm.yaml", {**MEADOW, "prm.yaml": text.encode()}), ReadContext())
     assert [p.where for p in caught.value.problems] == [where]

@@ -1,4 +1,4 @@
-"""RON: JSON's values from RON, errors with their line, bounds, and what is written reads as the same."""
+"""RON: values equal JSON's, errors name their line, limits hold, and written values read back equal."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def load(text: str, limits: Limits = LIMITS) -> Any:
         ("(r#type: 1)", {"type": 1}),
     ],
 )  # fmt: skip
-def test_ron_says_what_json_would(text: str, value: Any) -> None:
+def test_ron_values_equal_json_values(text: str, value: Any) -> None:
     assert load(text) == value
 
 
@@ -68,14 +68,14 @@ def test_ron_says_what_json_would(text: str, value: Any) -> None:
         ("a(" * 200 + ")" * 200, "nested deeper than"),
     ],
 )
-def test_what_is_no_ron_is_refused_with_its_line(text: str, reason: str) -> None:
+def test_invalid_ron_is_refused_with_line(text: str, reason: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         load(text)
     assert reason in caught.value.detail
     assert caught.value.problems[0].line
 
 
-def test_size_and_values_are_bounded() -> None:
+def test_size_and_value_count_are_limited() -> None:
     with pytest.raises(TooLarge):
         load("[1, 2]", Limits(text_bytes=3))
     with pytest.raises(TooLarge):
@@ -101,5 +101,5 @@ VALUES = st.recursive(
 
 @settings(max_examples=80, deadline=None)
 @given(VALUES)
-def test_what_is_written_reads_as_the_same(value: Any) -> None:
+def test_written_ron_reads_back_equal(value: Any) -> None:
     assert ron.load(ron.dump(value, vocabulary.SHAPE), LIMITS) == value

@@ -36,13 +36,13 @@ Found = set[tuple[str | None, str | None]]
 
 
 def findings_of(name: str, files: dict[str, bytes]) -> Found:
-    """(level, place) of each finding."""
+    """Return (level, location) of each finding."""
     return {(p.level, p.where) for p in formats.check(formats.get_format(name), files)}
 
 
 @pytest.mark.parametrize(("name", "files"), CASES)
-def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files: dict[str, bytes]) -> None:
-    """Samples with dangling edges and the like come back with them, and with an error."""
+def test_exported_map_passes_checks_of_its_sample(name: str, files: dict[str, bytes]) -> None:
+    """Samples with dangling edges and the like, which round-trip with an error."""
     served = offline(files, name, hints=UploadHints(name), datum=HERE)
     groups, _ = formats.group(files, name)
     if formats.get_format(name).traits.is_container:  # its parts are checked by their own formats' rules
@@ -58,7 +58,7 @@ def with_check(check: Any) -> Format:
     return Format("x", "X", {"x": "text/plain"}, frozenset(), lambda n, d: True, check=check)
 
 
-def test_a_check_tells_errors_first_each_once_and_how_many_more() -> None:
+def test_check_lists_distinct_errors_first_and_counts_others() -> None:
     def check(files: Files) -> Iterator[Problem]:
         yield Problem("doubt", level="warning")
         yield Problem("doubt", level="warning")
@@ -78,7 +78,7 @@ def test_a_check_tells_errors_first_each_once_and_how_many_more() -> None:
         (UnreadableFile("bad", [Problem("bad here", line=7)]), 7, "bad here"),
     ],
 )
-def test_a_file_that_does_not_parse_is_an_error(raised: Exception, line: int | None, text: str) -> None:
+def test_unparsable_file_is_an_error(raised: Exception, line: int | None, text: str) -> None:
     def check(files: Files) -> Iterator[Problem]:
         yield Problem("before", level="warning")
         raise raised
@@ -89,7 +89,7 @@ def test_a_file_that_does_not_parse_is_an_error(raised: Exception, line: int | N
     assert before.problem == "before"
 
 
-def test_a_mistake_of_ours_in_a_check_is_not_hidden() -> None:
+def test_assertion_error_in_check_is_raised() -> None:
     def check(files: Files) -> Iterator[Problem]:
         raise AssertionError
         yield
@@ -98,15 +98,15 @@ def test_a_mistake_of_ours_in_a_check_is_not_hidden() -> None:
         formats.check(with_check(check), {"main": b""})
 
 
-def test_findings_stand_in_the_report_once_at_their_level() -> None:
+def test_findings_appear_once_in_report() -> None:
     def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.warn("ask for y=1", file="main", where="y")
-        context.warn("told by both", file="main")
+        context.warn("reported by both", file="main")
         return {"main": b"x"}
 
     def check(files: Files) -> Iterator[Problem]:
         yield Problem("y is not 1", "main", None, "y", "error")
-        yield Problem("told by both", "main", None, None, "warning")
+        yield Problem("reported by both", "main", None, None, "warning")
         yield Problem("new", "main", None, None, "warning")
 
     fmt = replace(with_check(check), write=write, needs=LayerRequirements((frozenset(),)))
@@ -114,7 +114,7 @@ def test_findings_stand_in_the_report_once_at_their_level() -> None:
     formats.write(fmt, Layers(), context)
     assert [(p.problem, p.level) for p in context.warnings] == [
         ("ask for y=1", "error"),
-        ("told by both", None),
+        ("reported by both", None),
         ("new", "warning"),
     ]
 
@@ -138,7 +138,7 @@ def grid(members: dict[str, str | None], picture: bytes = PGM, stem: str = "map"
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("keys", "expected"),
     [
         ({}, set()),
         ({"negate": "false", "mode": None}, set()),
@@ -163,17 +163,17 @@ def grid(members: dict[str, str | None], picture: bytes = PGM, stem: str = "map"
         ({"image": "./map.pgm"}, set()),
     ],
 )
-def test_map_server(said: dict[str, str | None], expected: Found) -> None:
-    assert findings_of("occupancy_grid", grid(said)) == expected
+def test_map_server_rules(keys: dict[str, str | None], expected: Found) -> None:
+    assert findings_of("occupancy_grid", grid(keys)) == expected
 
 
-def test_map_server_finds_the_picture_from_the_yamls_folder() -> None:
+def test_map_server_image_path_is_relative_to_yaml() -> None:
     files = {"maps/a.yaml": grid({"image": "../pictures/map.pgm"})["map.yaml"], "pictures/map.pgm": PGM}
     assert findings_of("occupancy_grid", files) == set()
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG's first chunks: all that a look at the size reads."""
+    """Return a PNG's first chunks: everything that the size check reads."""
     head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     body = zlib.compress(b"\0")
     chunks = [(b"IHDR", head), (b"IDAT", body), (b"IEND", b"")]
@@ -182,31 +182,31 @@ def png(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize(("width", "level"), [(32767, None), (32768, ERROR)])
-def test_nav2_takes_32767_cells_each_way(width: int, level: str | None) -> None:
+def test_nav2_limits_grid_to_32767_cells_per_side(width: int, level: str | None) -> None:
     for picture in (png(width, 2), b"P5 %d 2 255\n" % width + bytes(2 * width)):
         findings = formats.check(formats.get_format("occupancy_grid"), grid({}, picture))
         assert [p.level for p in findings] == ([level] if level else [])
         assert all(p.file == "map.pgm" for p in findings)
 
 
-def test_damaged_and_missing_pictures_are_errors() -> None:
+def test_damaged_and_missing_images_are_errors() -> None:
     assert findings_of("occupancy_grid", grid({}, PGM[:-1])) == {(ERROR, None)}
     assert findings_of("occupancy_grid", grid({}, b"GIF89a")) == {(WARNING, None)}
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("keys", "expected"),
     [
         ({"mode": "trinary"}, {(WARNING, "mode"), (WARNING, None)}),
         ({"mode": "scale"}, set()),
         ({"mode": "raw"}, {(WARNING, None)}),
     ],
 )
-def test_a_speed_mask_has_no_unknown_cells(said: dict[str, str | None], expected: Found) -> None:
-    assert findings_of("occupancy_grid", grid(said, stem="speed_mask")) == expected
+def test_speed_mask_with_unknown_cells_is_warned_about(keys: dict[str, str | None], expected: Found) -> None:
+    assert findings_of("occupancy_grid", grid(keys, stem="speed_mask")) == expected
 
 
-def test_a_wide_grid_is_told_in_its_report() -> None:
+def test_wide_grid_is_reported() -> None:
     cells = np.zeros((1, 32768), np.uint8)
     layers = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(cells, 0.05, (0.0, 0.0, 0.5))})
     chain = DerivationChain((), tuple(layers.parts))
@@ -218,7 +218,7 @@ def test_a_wide_grid_is_told_in_its_report() -> None:
 
 # --- the route server ---------------------------------------------------------------------------------------------
 def graph(node: dict[str, Any] | None = None, edge: dict[str, Any] | None = None, **top: Any) -> dict[str, bytes]:
-    """Two nodes and an edge, with these further properties."""
+    """Build two nodes and an edge with these further properties."""
     rows: list[dict[str, Any]] = [
         {
             "type": "Feature",
@@ -275,7 +275,7 @@ OPERATION = {"type": "Speed", "trigger": "ON_ENTER"}
         ({"g.geojson": b'{"features": ['}, {(ERROR, None)}),
     ],
 )
-def test_route_server(files: dict[str, bytes], expected: Found) -> None:
+def test_route_server_rules(files: dict[str, bytes], expected: Found) -> None:
     assert findings_of("nav2_route", files) == expected
 
 
@@ -287,7 +287,7 @@ def test_far_nodes_lose_millimetres() -> None:
 
 # --- topological_navigation ---------------------------------------------------------------------------------------
 def tmap2(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, Any]:
-    """A with an edge to B, after the schema, then changed."""
+    """Build a node A with an edge to B according to the schema, then changed."""
     pose = {"orientation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}, "position": {"x": 0.0, "y": 0.0, "z": 0.0}}
     edge = {"action": "move_base", "edge_id": "A_B", "node": "B"}
     nodes = [
@@ -330,15 +330,15 @@ TMAP2: list[Any] = [
 
 
 @pytest.mark.parametrize(("change", "expected"), TMAP2)
-def test_topological_navigation(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
-    """The same for a file that is laid out as PyYAML does, which is counted, and for one that is parsed."""
+def test_topological_navigation_rules(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+    """Equal results for a file in PyYAML's layout, which is counted, and for one that is parsed."""
     top = tmap2(change)
     assert findings_of("tmap2", {"a.tmap2.yaml": json.dumps(top).encode()}) == expected, "parsed"
     block = yaml.dump(json.loads(json.dumps(top)), default_flow_style=False).encode()
     assert findings_of("tmap2", {"a.tmap2.yaml": block}) == expected, "counted"
 
 
-def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
     from app.formats.tmap import rules
 
     def parse(*_: Any) -> Any:
@@ -349,7 +349,7 @@ def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> Non
     assert findings_of("tmap2", {"a.tmap2.yaml": block}) == set()
 
 
-def test_of_a_large_network_that_is_served_the_head_is_looked_at() -> None:
+def test_only_head_of_large_written_network_is_checked() -> None:
     text = yaml.dump(tmap2(lambda top: top["meta"].update(last_updated=0)), default_flow_style=False).encode()
     files = {"a.tmap2.yaml": text + b"# " + bytes([120]) * 2**20 + b"\n"}
     token = formats.JUST_WRITTEN.set(True)
@@ -423,7 +423,7 @@ RMF: list[Any] = [
 
 
 @pytest.mark.parametrize(("change", "expected"), RMF)
-def test_building_map_generator(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+def test_building_map_generator_rules(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
     assert findings_of("openrmf", building(change)) == expected
 
 
@@ -457,7 +457,7 @@ def nav(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[s
         (lambda top: top["lifts"]["l"].update(dims=[1]), {(ERROR, "lifts.l")}),
     ],
 )
-def test_fleet_adapter(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+def test_fleet_adapter_rules(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
     assert findings_of("rmf_nav_graph", nav(change)) == expected
 
 
@@ -494,7 +494,7 @@ connections:
         ("  - !dir [A, B]\n", "  - [A, B]\n  - [A, B]\n", {(WARNING, "connections")}),
     ],
 )
-def test_fawkes(old: str, new: str, expected: Found) -> None:
+def test_fawkes_rules(old: str, new: str, expected: Found) -> None:
     assert old in FAWKES
     assert findings_of("navgraph", {"g.yaml": FAWKES.replace(old, new, 1).encode()}) == expected
 
@@ -527,7 +527,7 @@ FULL = "# Octomap OcTree file"
         (octree(FULL, "ColorOcTree", size=2, body=bytes(16)), set()),
     ],
 )
-def test_octomap(files: dict[str, bytes], expected: Found) -> None:
+def test_octomap_rules(files: dict[str, bytes], expected: Found) -> None:
     assert findings_of("octomap", files) == expected
 
 
@@ -588,7 +588,7 @@ THETA = "layouts[0].nodes[0].vehicleTypeNodeProperties[0].theta"
         (lambda top: lay(top)["stations"][0].update(interactionNodeIds=["x"]), {(ERROR, "layouts")}),
     ],
 )
-def test_lif(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+def test_lif_rules(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
     assert findings_of("lif", lif(change)) == expected
 
 
@@ -613,7 +613,7 @@ KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Style id="s"/>
         ("</Document>", "", {(ERROR, None)}),
     ],
 )
-def test_kml(old: str, new: str, expected: Found) -> None:
+def test_kml_rules(old: str, new: str, expected: Found) -> None:
     assert findings_of("kml", {"a.kml": KML.replace(old, new).encode() if old else KML.encode()}) == expected
 
 
@@ -627,7 +627,7 @@ def test_kml(old: str, new: str, expected: Found) -> None:
         ({"files/a.png": "x"}, {(ERROR, None)}),
     ],
 )
-def test_kmz(members: dict[str, str], expected: Found) -> None:
+def test_kmz_rules(members: dict[str, str], expected: Found) -> None:
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as z:
         for name, text in members.items():
@@ -663,7 +663,7 @@ OSM = """<osm version="0.6"><bounds/>
         ),
     ],
 )
-def test_osm(old: str, new: str, expected: Found) -> None:
+def test_osm_rules(old: str, new: str, expected: Found) -> None:
     text = OSM.replace(old, new, 1) if old else OSM
     text = text.replace("</osm>", "</gpx>") if "gpx" in new else text
     assert findings_of("osm", {"a.osm": text.encode()}) == expected
@@ -695,7 +695,7 @@ navsat_transform_node: {wait_for_datum: true, datum: [53.25, -0.5, 0.0]}
         (", datum: [53.25, -0.5, 0.0]", "", {(WARNING, "navsat_transform_node.datum")}),
     ],
 )
-def test_datum(old: str, new: str, expected: Found) -> None:
+def test_datum_rules(old: str, new: str, expected: Found) -> None:
     assert findings_of("datum", {"datum.yaml": DATUM.replace(old, new, 1).encode()}) == expected
 
 
@@ -703,8 +703,8 @@ def test_datum(old: str, new: str, expected: Found) -> None:
 @pytest.mark.parametrize(
     ("name", "files"), [case for case in CASES if formats.get_format(str(case.values[0])).check is not None]
 )
-def test_a_check_of_damaged_files_ends_in_findings(name: str, files: dict[str, bytes]) -> None:
-    """Whatever the bytes are, there is no crash; what cannot be parsed is an error."""
+def test_check_of_damaged_files_returns_findings(name: str, files: dict[str, bytes]) -> None:
+    """Arbitrary bytes cause no crash; unparsable content is an error."""
     fmt = formats.get_format(name)
     for victim, data in files.items():
         for damaged in mutations(data, seed=len(victim)):

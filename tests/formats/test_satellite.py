@@ -1,4 +1,4 @@
-"""Georeferenced pictures: samples against gdalinfo's words, real maps, world files, corners, floor plans, limits."""
+"""Georeferenced images: samples against gdalinfo, real maps, world files, corners, floor plans, limits."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def gdalinfo(path: Path) -> dict[str, Any]:
 
 # --- samples and real maps ----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", [n for n in FACTS if n != "made"])
-def test_samples(name: str) -> None:
+def test_samples_match_gdalinfo(name: str) -> None:
     facts = FACTS[name]
     files = sample(name)
     groups, rest = formats.group(files)
@@ -121,7 +121,7 @@ REAL = ("opengeos_dtm/dtm.tif", "rasterio/RGB.byte.tif", "rasterio/rgb-byte-tent
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_real_maps_hold_their_facts_and_come_back(
+def test_real_maps_match_facts_and_round_trip(
     shared: Path, same: Same, facts_json: dict[str, Any], name: str, tmp_path: Path
 ) -> None:
     facts = facts_json[f"geotiff/{name}"]["facts"]
@@ -140,7 +140,7 @@ def test_real_maps_hold_their_facts_and_come_back(
         assert np.abs(np.array(box) - [*ring.min(axis=0), *ring.max(axis=0)]).max() < 2e-7
     else:
         assert picture.crs == "local"
-        assert "names no CRS" in context.warnings[0].problem
+        assert "no CRS" in context.warnings[0].problem
     back, _ = written(picture)
     assert same("satellite", files, back) == []
     (tmp_path / "satellite.tif").write_bytes(back["satellite.tif"])
@@ -161,7 +161,7 @@ def test_damaged_tiles_are_refused_with_the_reason(shared: Path) -> None:
     assert caught.value.problems[0].file == "corrupt.tif"
 
 
-def test_pictures_of_all_kinds_hold_their_facts(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_images_of_all_kinds_match_facts(shared: Path, facts_json: dict[str, Any]) -> None:
     """The real PNGs as floor plans: size, bands and transparency as counted by another tool."""
     plans = [n for n, e in facts_json.items() if e["kind"] == "image" and n.endswith((".png", ".bmp"))]
     assert len(plans) > 10
@@ -182,7 +182,7 @@ def test_pictures_of_all_kinds_hold_their_facts(shared: Path, facts_json: dict[s
     "kind", ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]
 )
 @pytest.mark.parametrize("bands", [1, 2, 3, 4, 5])
-def test_every_type_comes_back(kind: str, bands: int) -> None:
+def test_every_pixel_type_round_trips(kind: str, bands: int) -> None:
     picture = utm((7, 5, bands), kind)
     back, _ = read({"a.tif": tif(picture)})
     assert back.pixels.dtype == kind
@@ -191,7 +191,7 @@ def test_every_type_comes_back(kind: str, bands: int) -> None:
     assert tif(back) == tif(picture)
 
 
-def test_what_a_tiff_says_besides_pixels_comes_back() -> None:
+def test_tiff_metadata_round_trips() -> None:
     bands = [
         {"colour": "gray", "description": "height", "unit": "m", "scale": 0.01, "offset": 100.0},
         {"colour": "undefined", "satellite": {"tags": {"SENSOR": "a"}}},
@@ -214,23 +214,23 @@ def test_what_a_tiff_says_besides_pixels_comes_back() -> None:
 
 
 @pytest.mark.parametrize("value", [0, 255, 7])
-def test_no_data_of_whole_numbers(value: int) -> None:
+def test_integer_nodata_round_trips(value: int) -> None:
     back, _ = read({"a.tif": tif(utm(nodata=value))})
     assert back.nodata == value
     assert isinstance(back.properties["nodata"], int)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", -32768.5])
-def test_no_data_of_floats(value: Any) -> None:
+def test_float_nodata_round_trips(value: Any) -> None:
     back, _ = read({"a.tif": tif(utm(kind=np.float32, nodata=value))})
     assert back.properties["nodata"] == value
 
 
-def test_no_data_that_no_pixel_can_have_is_left_out() -> None:
+def test_nodata_outside_pixel_range_is_skipped() -> None:
     assert read({"a.tif": tif(utm(nodata=-9999))})[0].nodata is None
 
 
-def test_a_palette_comes_back_and_is_shown_in_colour() -> None:
+def test_palette_round_trips_and_is_displayed_in_colour() -> None:
     palette = [[k, 255 - k, 7, 255] for k in range(256)]
     picture = utm((3, 4, 1), bands=[{"colour": "palette"}], palette=palette)
     back, _ = read({"a.tif": tif(picture)})
@@ -255,7 +255,7 @@ def test_a_palette_comes_back_and_is_shown_in_colour() -> None:
     ],
     ids=["degrees", "mercator", "british", "own"],
 )
-def test_a_crs_comes_back(crs: str) -> None:
+def test_crs_round_trips(crs: str) -> None:
     picture = GeoImage(np.zeros((2, 2, 1), np.uint8), (1e-5, 0.0, -0.5, 0.0, -1e-5, 53.2), crs)
     back, context = read({"a.tif": tif(picture)})
     assert crs_bounds(back.crs, back.outline()) == pytest.approx(crs_bounds(crs, picture.outline()), abs=1e-11)
@@ -269,7 +269,7 @@ def test_a_crs_comes_back(crs: str) -> None:
     "transform",
     [(0.05, 0.0, -3.0, 0.0, -0.05, 7.0), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), (0.04, 0.03, 1.0, 0.03, -0.04, 2.0)],
 )
-def test_local_metres_come_back_without_a_doubt(transform: Any) -> None:
+def test_local_metres_round_trip_without_warning(transform: Any) -> None:
     picture = GeoImage(np.ones((2, 3, 1), np.uint8), transform)
     data = tif(picture)
     assert detect("a.tif", data)
@@ -277,7 +277,7 @@ def test_local_metres_come_back_without_a_doubt(transform: Any) -> None:
     assert (back.crs, back.transform, context.warnings) == ("local", transform, [])
 
 
-def test_a_tiff_without_a_crs_takes_the_option() -> None:
+def test_tiff_without_crs_uses_option() -> None:
     data = without_tag(tif(GeoImage(np.ones((2, 3, 1), np.uint8), (2.0, 0.0, 5e5, 0.0, -2.0, 4e5))))
     assert read({"a.tif": data})[0].crs == "local"
     picture, context = read({"a.tif": data}, options={"crs": "epsg:27700"})
@@ -288,12 +288,12 @@ def test_a_tiff_without_a_crs_takes_the_option() -> None:
 
 
 def without_tag(data: bytes) -> bytes:
-    """Our own tag, which says local, under another name of the same length."""
+    """Rename our own tag, which marks local coordinates, to another name of the same length."""
     assert geotiff.OWN_TAG.encode() in data
     return data.replace(geotiff.OWN_TAG.encode(), b"X" * len(geotiff.OWN_TAG))
 
 
-def test_ground_control_points_place_a_tiff() -> None:
+def test_ground_control_points_georeference_tiff() -> None:
     import rasterio
     from rasterio.control import GroundControlPoint
     from rasterio.io import MemoryFile
@@ -311,7 +311,7 @@ def test_ground_control_points_place_a_tiff() -> None:
     assert picture.crs == "EPSG:27700"
 
 
-def test_of_several_pages_the_first_is_read_with_a_warning() -> None:
+def test_first_of_several_pages_is_read_with_warning() -> None:
     frames = [Image.new("L", (4, 3), shade) for shade in (10, 20, 30)]
     out = io.BytesIO()
     frames[0].save(out, "TIFF", save_all=True, append_images=frames[1:])
@@ -321,19 +321,19 @@ def test_of_several_pages_the_first_is_read_with_a_warning() -> None:
 
 
 # --- world files --------------------------------------------------------------------------------------------------
-def test_a_world_file_is_of_the_centre_of_the_first_pixel() -> None:
+def test_world_file_refers_to_centre_of_first_pixel() -> None:
     world = b"2\n0.5\n0.25\n-3\n100\n200\n"
     picture, _ = read({"a.pgw": world, "a.png": image()}, options={"crs": "local"})
     assert picture.transform == (2.0, 0.25, 98.875, 0.5, -3.0, 201.25)
 
 
-def test_numbers_like_degrees_are_degrees_and_others_metres() -> None:
+def test_coordinates_without_crs_are_degrees_if_plausible_else_metres() -> None:
     degrees, context = read({"a.pgw": b"1e-5 0 0 -1e-5 -0.5 53.2", "a.png": image()})
     assert degrees.crs == "EPSG:4326"
-    assert "taken for degrees" in context.warnings[0].problem
+    assert "read as degrees" in context.warnings[0].problem
     metres, context = read({"a.pgw": b"0.05 0 0 -0.05 -0.5 53.2", "a.png": image()})
     assert metres.crs == "local"
-    assert "taken for metres of the local frame" in context.warnings[0].problem
+    assert "read as metres of the local frame" in context.warnings[0].problem
     assert read({"a.pgw": b"0.05 0 0 -0.05 -0.5 53.2", "a.png": image()}, options={"crs": UTM})[0].crs == UTM
 
 
@@ -348,7 +348,7 @@ def test_numbers_like_degrees_are_degrees_and_others_metres() -> None:
         ("x/a.pgw", "x/a.png"),
     ],
 )
-def test_a_world_file_finds_its_picture(world: str, picture: str) -> None:
+def test_world_file_is_matched_to_image(world: str, picture: str) -> None:
     kind = {"png": "PNG", "tif": "TIFF"}.get(picture[-3:].lower(), "JPEG")
     files = {picture: image(kind=kind), world: b"2\n0\n0\n-2\n665000\n5905000\n", "else.txt": b"?"}
     upload_bundle = upload_reader.read(files, UploadHints(options={"crs": UTM}), EnvironmentContext(), LIMITS)
@@ -356,7 +356,7 @@ def test_a_world_file_finds_its_picture(world: str, picture: str) -> None:
     assert {n for n, use in upload_bundle.files.items() if use.used} == {world, picture}
 
 
-def test_a_geotiff_is_believed_before_its_world_file() -> None:
+def test_geotiff_takes_precedence_over_world_file() -> None:
     files = {"a.tif": tif(utm()), "a.tfw": b"9 0 0 -9 9 9"}
     upload_bundle = upload_reader.read(files, UploadHints(), EnvironmentContext(), LIMITS)
     (picture,) = upload_bundle.parts.values()
@@ -367,7 +367,7 @@ def test_a_geotiff_is_believed_before_its_world_file() -> None:
 
 
 @pytest.mark.parametrize(
-    ("world", "line", "said"),
+    ("world", "line", "reason"),
     [
         (b"1\n0\n0\nnan\n0\n0\n", 4, "finite"),
         (b"1\n0\n0\n-1\ninf\n0\n", 5, "finite"),
@@ -380,18 +380,18 @@ def test_a_geotiff_is_believed_before_its_world_file() -> None:
         (b"1\n0\n0\n-1\n1e12\n0\n", None, "beyond"),
     ],
 )
-def test_wrong_world_files_are_refused(world: bytes, line: int | None, said: str) -> None:
-    with pytest.raises(UnreadableFile, match=said) as caught:
+def test_wrong_world_files_are_refused(world: bytes, line: int | None, reason: str) -> None:
+    with pytest.raises(UnreadableFile, match=reason) as caught:
         read({"a.pgw": world, "a.png": image()})
     assert caught.value.problems[0].line == line
 
 
-def test_a_world_file_without_its_picture_says_what_to_add() -> None:
+def test_world_file_without_image_reports_missing_image() -> None:
     with pytest.raises(UnreadableFile, match=r"add a\.png beside it"):
         upload_reader.read({"a.pgw": b"1 0 0 -1 0 0"}, UploadHints(), EnvironmentContext(), LIMITS)
 
 
-def test_a_crs_stands_beside_the_picture() -> None:
+def test_crs_is_read_from_sidecar_file() -> None:
     wkt = geotiff.crs_to_wkt(UTM).encode()
     world = b"2 0 0 -2 665000 5905000"
     for name, body in (("a.prj", wkt), ("a.png.aux.xml", b"<PAMDataset><SRS>" + wkt + b"</SRS></PAMDataset>")):
@@ -423,14 +423,14 @@ def test_wrong_crs_files_are_refused_by_name(name: str, body: bytes) -> None:
 
 
 # --- options ------------------------------------------------------------------------------------------------------
-def test_two_opposite_corners() -> None:
+def test_two_opposite_corners_georeference_image() -> None:
     for corners in ((53.2, -0.6, 53.1, -0.5), (53.1, -0.6, 53.2, -0.5)):
         picture, _ = read({"a.png": image((50, 100, 3))}, options={"corners": corners})
         assert picture.transform == pytest.approx((0.001, 0.0, -0.6, 0.0, -0.002, 53.2), abs=1e-15)
         assert picture.crs == "EPSG:4326"
 
 
-def test_four_corners_of_a_turned_picture() -> None:
+def test_four_corners_georeference_rotated_image() -> None:
     ends = np.array([[-0.5, 53.2], [-0.4992, 53.2003], [-0.4994, 53.1999], [-0.5002, 53.1996]])
     picture, context = read({"a.png": image((40, 80, 3))}, options={"corners": tuple(ends[:, ::-1].ravel().tolist())})
     corners = pixel_positions(picture.transform, np.array([0.0, 80.0, 80.0, 0.0]), np.array([0.0, 0.0, 40.0, 40.0]))
@@ -438,7 +438,7 @@ def test_four_corners_of_a_turned_picture() -> None:
     assert context.warnings == []
 
 
-def test_corners_that_are_no_parallelogram() -> None:
+def test_corners_that_are_not_parallelogram_are_refused() -> None:
     nearly = (53.2, -0.5, 53.2, -0.49, 53.19, -0.49, 53.1904, -0.5)
     _, context = read({"a.png": image((100, 100, 3))}, options={"corners": nearly})
     assert "1.0 pixels off" in context.warnings[0].problem
@@ -447,7 +447,7 @@ def test_corners_that_are_no_parallelogram() -> None:
         read({"a.png": image((100, 100, 3))}, options={"corners": crossed})
 
 
-def test_a_floor_plan_with_its_scale() -> None:
+def test_floor_plan_is_georeferenced_by_scale() -> None:
     picture, _ = read(
         {"plan.png": image((30, 40, 3))}, options={"metres_per_pixel": 0.1, "origin": (5.0, 6.0), "yaw": math.pi / 2}
     )
@@ -475,7 +475,7 @@ def test_wrong_options_are_refused_by_name(options: dict[str, Any], where: str) 
     assert caught.value.problems[0].where == where
 
 
-def test_a_picture_alone_says_what_to_supply() -> None:
+def test_image_without_position_reports_what_to_supply() -> None:
     for hints in (UploadHints(), UploadHints("satellite")):
         with pytest.raises(UnreadableFile, match=r"world file .*corners=.*metres_per_pixel") as caught:
             upload_reader.read({"a.png": image()}, hints, EnvironmentContext(), LIMITS)
@@ -488,7 +488,7 @@ ROOM = (
 )
 
 
-def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given() -> None:
+def test_image_without_position_in_folder_is_stored_as_source() -> None:
     files = {
         "config/location/satellite-auto.png": image(),
         "config/metric/map/map.yaml": ROOM,
@@ -507,7 +507,7 @@ def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given
     assert upload_bundle.files["config/location/satellite-auto.png"].format == "satellite"
 
 
-def test_of_several_pictures_the_options_place_the_one_that_is_named() -> None:
+def test_options_apply_to_named_file_of_several_images() -> None:
     files = {"a.png": image(), "b.png": image(seed=2)}
     options = {"metres_per_pixel": "0.5"}
     for hints in (UploadHints(options=options), UploadHints("satellite", options=options)):
@@ -522,7 +522,7 @@ def test_of_several_pictures_the_options_place_the_one_that_is_named() -> None:
         upload_reader.read(files, UploadHints(options={**options, "file": "c.png"}), EnvironmentContext(), LIMITS)
 
 
-def test_what_says_where_it_lies_is_not_moved_by_options() -> None:
+def test_georeferenced_image_ignores_position_options() -> None:
     picture, context = read({"a.tif": tif(utm())}, options={"metres_per_pixel": 1.0, "crs": "local"})
     assert picture.transform == utm().transform
     assert picture.crs == UTM
@@ -530,7 +530,7 @@ def test_what_says_where_it_lies_is_not_moved_by_options() -> None:
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
-def test_a_cog_has_tiles_and_overviews_and_gdal_takes_it(tmp_path: Path) -> None:
+def test_cog_has_tiles_and_overviews_and_is_read_by_gdal(tmp_path: Path) -> None:
     pixels = np.random.default_rng(3).integers(0, 255, (1500, 1100, 3), dtype=np.uint8)
     picture = GeoImage(pixels, (0.25, 0.0, 665000.0, 0.0, -0.25, 5905000.0), UTM)
     data = tif(picture)
@@ -556,7 +556,7 @@ def test_credits_are_written_and_read() -> None:
     assert read({"a.tif": data})[0].attribution == ("© Aerial Ltd; CC BY 4.0",)
 
 
-def test_png_with_world_file_as_gdal_reads_it(tmp_path: Path) -> None:
+def test_png_with_world_file_matches_gdal(tmp_path: Path) -> None:
     turned = GeoImage(utm().pixels, (0.4, 0.3, 665000.0, 0.3, -0.4, 5905000.0), UTM)
     files, context = written(turned, file_type="png")
     assert sorted(files) == ["satellite.pgw", "satellite.png", "satellite.png.aux.xml"]
@@ -573,7 +573,7 @@ def test_png_with_world_file_as_gdal_reads_it(tmp_path: Path) -> None:
     assert written(back, file_type="png")[0] == files
 
 
-def test_png_of_floats_declares_what_is_lost() -> None:
+def test_png_of_floats_reports_loss() -> None:
     values = np.array([[[10.0], [20.0]], [[15.0], [-9999.0]]], np.float32)
     picture = GeoImage(values, utm().transform, UTM, {"nodata": -9999.0})
     files, context = written(picture, file_type="png")
@@ -586,7 +586,7 @@ def test_png_of_floats_declares_what_is_lost() -> None:
     assert [(d.subject, d.count) for d in context.dropped] == [("bands", 5)]
 
 
-def test_another_crs_on_request(tmp_path: Path) -> None:
+def test_crs_option_resamples_image(tmp_path: Path) -> None:
     picture = utm((40, 60, 3))
     (tmp_path / "a.tif").write_bytes(written(picture, HERE, crs="local")[0]["satellite.tif"])
     info = gdalinfo(tmp_path / "a.tif")
@@ -604,11 +604,11 @@ def test_another_crs_on_request(tmp_path: Path) -> None:
     assert "metres of the local frame" in context.warnings[0].problem
     with pytest.raises(MissingDatum, match="datum"):
         written(picture, crs="local")
-    with pytest.raises(Invalid, match="ask for one of them"):
+    with pytest.raises(Invalid, match="set one of them"):
         written(picture, resampling="nearest")
 
 
-def test_a_resolution_on_request() -> None:
+def test_resolution_option_resamples_image() -> None:
     back, _ = read({"a.tif": tif(utm((40, 60, 3)), resolution=2.0)})
     assert back.pixels.shape[:2] == (10, 15)
     assert back.transform == (2.0, 0.0, 665000.0, 0.0, -2.0, 5905000.0)
@@ -616,7 +616,7 @@ def test_a_resolution_on_request() -> None:
         tif(utm(), resolution=1e-6)
 
 
-def test_which_picture() -> None:
+def test_image_is_selected_by_name_and_level() -> None:
     fmt = get_format("satellite")
     keys = [PartKey("imagery", name="a"), PartKey("imagery", name="b")]
     with pytest.raises(MissingLayer, match="GeoTIFF"):
@@ -647,8 +647,8 @@ def test_limits_are_checked_before_anything_is_decoded() -> None:
         read({"a.png": image((100, 100, 3))}, limits=Limits(pixels=9_999), options={"metres_per_pixel": 1.0})
 
 
-def test_nothing_but_the_given_bytes_is_opened(tmp_path: Path) -> None:
-    """A VRT, and a TIFF whose first bytes lie, are refused whatever they point to."""
+def test_reader_opens_only_given_bytes(tmp_path: Path) -> None:
+    """A VRT, and a TIFF with false first bytes, are refused without opening the files that they refer to."""
     secret = tmp_path / "secret.tif"
     secret.write_bytes(tif(utm()))
     vrt = (
@@ -661,7 +661,7 @@ def test_nothing_but_the_given_bytes_is_opened(tmp_path: Path) -> None:
 
 
 def bigger(data: bytes, tag: int, value: int) -> bytes:
-    """A little-endian classic TIFF with another value of a tag of its first page."""
+    """Replace the value of a tag of the first page of a little-endian classic TIFF."""
     (at,) = struct.unpack_from("<I", data, 4)
     (count,) = struct.unpack_from("<H", data, at)
     for k in range(count):
@@ -672,25 +672,25 @@ def bigger(data: bytes, tag: int, value: int) -> bytes:
 
 
 @pytest.mark.parametrize(("width", "height"), [(2**31 - 1, 2**31 - 1), (100_000, 100_000), (0, 3), (2**32 - 1, 1)])
-def test_lying_sizes(width: int, height: int) -> None:
+def test_false_tiff_sizes_are_refused(width: int, height: int) -> None:
     data = (SAMPLES / "orchard.tif").read_bytes()
-    lying = bigger(bigger(data, 256, width), 257, height)
+    false_size = bigger(bigger(data, 256, width), 257, height)
     tracemalloc.start()
     try:
         with pytest.raises((UnreadableFile, TooLarge)):
-            read({"a.tif": lying})
+            read({"a.tif": false_size})
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()
 
 
-def test_resampled_is_the_same_function_for_everybody() -> None:
+def test_crs_option_gives_same_pixels_as_resample() -> None:
     data = written(utm((8, 8, 1)), crs="wgs84")[0]["satellite.tif"]
     direct = resample(utm((8, 8, 1)), crs="EPSG:4326")
     assert np.array_equal(read({"a.tif": data})[0].pixels, direct.pixels)
 
 
-def test_many_pictures_of_one_upload_are_sorted_in_time() -> None:
+def test_many_images_of_upload_are_grouped_in_time() -> None:
     lone, placed_itself = image(), (SAMPLES / "orchard.tif").read_bytes()
     files: dict[str, bytes] = {}
     for k in range(2000):

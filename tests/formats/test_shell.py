@@ -1,4 +1,4 @@
-"""Shell variables: the literals that a real shell would end with, nothing that needs one, and bounded effort."""
+"""Shell variables: literals with the values of a real shell, nothing that needs execution, and bounded effort."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def values(text: str | bytes) -> dict[str, str]:
     return shell.assignments(text.encode() if isinstance(text, str) else text)[0]
 
 
-def test_only_what_is_literal_on_every_run() -> None:
+def test_only_unconditional_literals_are_read() -> None:
     variables, warnings = shell.assignments(TEMPLATE)
     assert variables == {"COMMON_RELEASE": "v1.0.1", "FIELD_NAME": 'east "path"', "FIELD_ID": "p1"}
     text = "\n".join(warnings)
@@ -119,7 +119,7 @@ def test_only_what_is_literal_on_every_run() -> None:
         ("\n\n# nothing\n", {}),
     ],
 )
-def test_lines(text: str, expected: dict[str, str]) -> None:
+def test_shell_lines_give_expected_values(text: str, expected: dict[str, str]) -> None:
     variables, warnings = shell.assignments(text.encode())
     assert variables == expected
     assert all("line" in w for w in warnings)
@@ -128,7 +128,7 @@ def test_lines(text: str, expected: dict[str, str]) -> None:
 @pytest.mark.parametrize(
     "text", [t for (t,) in [(m,) for m in ("A=$(id)", "A=1; id", "id", "A='\x1b'", "PATH=x", "return\nA=1")]]
 )
-def test_what_is_left_out_is_told(text: str) -> None:
+def test_skipped_assignments_are_reported(text: str) -> None:
     assert shell.assignments(text.encode())[1]
 
 
@@ -145,7 +145,7 @@ def test_real_property_files(shared: Path, facts_json: dict[str, Any]) -> None:
         assert warnings == []
 
 
-def test_bounds() -> None:
+def test_shell_reader_enforces_limits() -> None:
     with pytest.raises(TooLarge):
         shell.assignments(b"#" * (shell.MAX_BYTES + 1))
     with pytest.raises(UnreadableFile, match="not UTF-8"):
@@ -185,7 +185,7 @@ def test_hostile_repetition_is_quick(piece: str) -> None:
 
 @given(st.binary(max_size=200))
 @settings(max_examples=300, deadline=None)
-def test_any_bytes(data: bytes) -> None:
+def test_any_bytes_are_parsed_without_error(data: bytes) -> None:
     try:
         variables, _ = shell.assignments(data)
     except UnreadableFile:
@@ -199,8 +199,8 @@ BASH = shutil.which("bash") or ""
 
 
 @pytest.mark.skipif(not BASH, reason="bash is absent")
-def test_a_real_shell_ends_with_the_same_values(tmp_path: Path) -> None:
-    """What is read of random scripts is what bash ends with (these pieces make no command that could do harm)."""
+def test_values_match_real_shell(tmp_path: Path) -> None:
+    """Values read from random scripts equal bash's (the script pieces form no harmful command)."""
     dice, checked = random.Random(3), 0
     scripts = ["".join(dice.choice(PIECES) for _ in range(dice.randrange(2, 14))) for _ in range(4000)]
     scripts = [s for s in scripts if values(s)]
@@ -230,7 +230,7 @@ def test_exports_read_back(wanted: dict[str, str]) -> None:
 
 
 @pytest.mark.skipif(not BASH, reason="bash is absent")
-def test_exports_are_what_a_shell_reads() -> None:
+def test_exports_match_real_shell() -> None:
     value = 'it\'s $HOME `id` "x" \\ ; é #'
     script = shell.exports({"A": value}).decode() + 'printf %s "$A"'
     ran = subprocess.run([BASH, "--norc", "-c", script], capture_output=True, check=True)
@@ -240,6 +240,6 @@ def test_exports_are_what_a_shell_reads() -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("A;id", "1"), ("1A", "x"), ("", "x"), ("A", "x\ny"), ("PATH", "x"), ("A\n", "x")]
 )
-def test_exports_refuses(name: str, value: str) -> None:
+def test_exports_rejects_invalid_names_and_values(name: str, value: str) -> None:
     with pytest.raises(ValueError, match="cannot be exported"):
         shell.exports({name: value})

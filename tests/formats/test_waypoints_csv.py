@@ -1,4 +1,4 @@
-"""waypoints_csv: places, angles and further columns, by facts that were worked out by hand."""
+"""waypoints_csv: positions, angles and further columns, with hand-computed facts."""
 
 from __future__ import annotations
 
@@ -82,13 +82,13 @@ def test_edges_and_altitudes_are_reported_as_dropped() -> None:
         ("name,x,x,y\na,1,1,2\n", "line 1"),
     ],
 )
-def test_bad_values_are_refused_with_their_place(text: str, place: str) -> None:
+def test_bad_values_are_refused_with_location(text: str, place: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(text)
     assert caught.value.problems[0].where == place
 
 
-def test_repeated_names_are_warned_of() -> None:
+def test_duplicate_names_are_warned_about() -> None:
     part, context = read("name,x,y\na,0,0\na,1,0\n")
     assert len(set(part.ids)) == 2
-    assert "1 names stand twice" in context.warnings[0].problem
+    assert "1 duplicate names" in context.warnings[0].problem

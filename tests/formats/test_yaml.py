@@ -36,7 +36,7 @@ def load(text: str | bytes) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("said", "value"),
+    ("text", "value"),
     [
         ("1", 1),
         ("-7", -7),
@@ -88,8 +88,8 @@ def load(text: str | bytes) -> Any:
         ("[1, [2, {a: b}], 'c']", [1, [2, {"a": "b"}], "c"]),
     ],
 )
-def test_what_a_scalar_means(said: str, value: Any) -> None:
-    read = load(f"key: {said}\n")
+def test_scalar_text_gives_expected_value(text: str, value: Any) -> None:
+    read = load(f"key: {text}\n")
     assert read == {"key": value}
     assert type(read["key"]) is type(value)
 
@@ -100,17 +100,17 @@ def test_keys_are_texts_as_written() -> None:
     }  # fmt: skip
 
 
-def test_aliases_and_a_byte_order_mark() -> None:
+def test_aliases_and_byte_order_mark_are_read() -> None:
     text = "\ufeffa: &a [1, 2]\nb: *a\nc: &t text\nd: {e: *t}\nf: &a 3\ng: *a\n"
     assert load(text) == {"a": [1, 2], "b": [1, 2], "c": "text", "d": {"e": "text"}, "f": 3, "g": 3}
 
 
-def test_lines_may_end_as_windows_ends_them() -> None:
+def test_windows_line_endings_are_read() -> None:
     assert load("a:\r\n- b: 1\r\n  c: x y\r\n") == {"a": [{"b": 1, "c": "x y"}]}
 
 
 @pytest.mark.parametrize(
-    ("said", "line", "part"),
+    ("text", "line", "part"),
     [
         ("a: 1\nb: .nan\n", 2, "finite"),
         ("a: -.inf\n", 1, "finite"),
@@ -145,14 +145,14 @@ def test_lines_may_end_as_windows_ends_them() -> None:
         ("a: 1\n  b: 2\n", 2, "not allowed"),
     ],
 )
-def test_what_is_refused_and_where(said: str, line: int, part: str) -> None:
+def test_invalid_yaml_is_refused_with_line(text: str, line: int, part: str) -> None:
     with pytest.raises(UnreadableFile, match=part) as caught:
-        load(said)
+        load(text)
     assert caught.value.problems[0].line == line
     assert part in caught.value.problems[0].problem
 
 
-def test_bytes_that_are_no_text() -> None:
+def test_invalid_utf8_is_refused() -> None:
     with pytest.raises(UnreadableFile, match="UTF-8") as caught:
         load(b"a: 1\nb: \xff\n")
     assert caught.value.problems[0].line == 2
@@ -182,7 +182,7 @@ def test_deep_block_nesting_ends_at_the_limit() -> None:
     assert caught.value.problems[0].line is not None
 
 
-def test_an_alias_bomb_is_refused_before_it_unfolds() -> None:
+def test_alias_bomb_is_refused_before_expansion() -> None:
     names = "abcdefghij"
     flow = "a: &a [" + ", ".join(["lol"] * 9) + "]\n"
     block = "a: &a\n" + "- lol\n" * 9
@@ -194,7 +194,7 @@ def test_an_alias_bomb_is_refused_before_it_unfolds() -> None:
             load(bomb)
 
 
-def test_a_long_text_repeated_by_aliases_is_refused() -> None:
+def test_long_text_repeated_by_aliases_is_refused() -> None:
     for text in (f"a: &a {'x' * 100_000}\nb:\n", f"a: &a\n- {'x' * 100_000}\nb:\n"):
         with pytest.raises(TooLarge, match="expand"):
             load(text + "- *a\n" * 1000)
@@ -204,7 +204,7 @@ def test_a_long_text_repeated_by_aliases_is_refused() -> None:
     "filling", [" ", "a", "a ", "'", "''", '"', "- ", "-", "[]", "a: ", "a:", "#", "~", "1", "é", "\\", "&a "]
 )
 @pytest.mark.parametrize("start", ["", "a: ", "- ", "a: '", 'a: "'])
-def test_long_lines_take_time_in_proportion(start: str, filling: str) -> None:
+def test_long_lines_take_linear_time(start: str, filling: str) -> None:
     text = start + filling * (200_000 // len(filling)) + "@"
     began = time.process_time()
     with suppress(BadUpload):
@@ -221,14 +221,14 @@ def test_limits_on_nodes_and_bytes() -> None:
 
 
 def quick(text: str) -> Any:
-    """What the quick way makes of it, or a mark that it leaves it to the reference."""
+    """Return the fast parser's result, or its mark that the reference parser is needed."""
     try:
         return load_lines(text, LIMITS)
     except NotSimpleError:
         return NotImplemented
 
 
-def test_both_ways_agree_on_all_real_files(shared: Path) -> None:
+def test_fast_and_full_parsers_agree_on_real_files(shared: Path) -> None:
     paths = [p for end in ("*.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in (shared / "data").rglob(end)]
     assert len(paths) > 50
     simple = set()
@@ -271,7 +271,7 @@ line = st.tuples(
 @given(st.lists(line, max_size=9), st.sampled_from(["\n", "\n", "\r\n"]))
 @example([(0, "", ["k: &n"], ""), (0, "- ", ["a"], ""), (0, "", ["b"], ": "), (0, "- ", ["*n"], "")], "\n")
 @example([(0, "", ["a", "1"], ": "), (2, "", ["b c"], "")], "\n")
-def test_both_ways_agree_on_whatever_the_quick_way_takes(rows: list[Any], end: str) -> None:
+def test_fast_and_full_parsers_agree_on_fast_syntax(rows: list[Any], end: str) -> None:
     text = end.join(" " * indent + dash + glue.join(words) for indent, dash, words, glue in rows)
     value = quick(text)
     if value is not NotImplemented:
@@ -299,7 +299,7 @@ FLOWING = [
 )
 @example([("", "- ", ["[1, 2, {a: [4, true]}]"])] * 2)
 @example([("", "- [1, 2.5, ", ["1", ", ", "yes", "]"]), ("", "- [1, 2.5, ", ["08", ", ", "''", "]"])])
-def test_both_ways_agree_on_collections_in_flow_style(rows: list[Any]) -> None:
+def test_fast_and_full_parsers_agree_on_flow_collections(rows: list[Any]) -> None:
     text = "\n".join(indent + start + "".join(words) for indent, start, words in rows)
     value = quick(text)
     if value is not NotImplemented:
@@ -318,7 +318,7 @@ flowing = st.recursive(
 
 @examples
 @given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
-def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
+def test_flow_rows_use_fast_parser(rows: list[Any]) -> None:
     text = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
     reference = load_events(text, LIMITS)
     assert orjson.dumps(reference) == orjson.dumps({"rows": rows}, option=orjson.OPT_SORT_KEYS)
@@ -342,10 +342,10 @@ def test_limits_hold_for_collections_in_flow_style() -> None:
 
 @examples
 @given(st.text("ab1.-: \n'\"#[]{}&*!|>~é", max_size=60))
-def test_both_ways_agree_on_any_text(said: str) -> None:
-    value = quick(said)
+def test_fast_and_full_parsers_agree_on_any_text(text: str) -> None:
+    value = quick(text)
     if value is not NotImplemented:
-        assert orjson.dumps(value) == orjson.dumps(load_events(said, LIMITS)), said
+        assert orjson.dumps(value) == orjson.dumps(load_events(text, LIMITS)), text
 
 
 @examples
@@ -379,7 +379,7 @@ values = st.recursive(
 
 @examples
 @given(st.dictionaries(texts, values, min_size=1, max_size=5))
-def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any]) -> None:
+def test_written_yaml_reads_back_equal_also_in_pyyaml(value: dict[str, Any]) -> None:
     text = yaml.mapping(value, 0)
     assert orjson.dumps(load(text), option=orjson.OPT_SORT_KEYS) == orjson.dumps(value, option=orjson.OPT_SORT_KEYS)
     assert pyyaml.safe_load(text) == value
@@ -388,7 +388,7 @@ def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any])
 
 @examples
 @given(st.dictionaries(texts, values, min_size=1, max_size=5), st.randoms(use_true_random=False))
-def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any) -> None:
+def test_fast_and_full_parsers_agree_on_damaged_documents(value: dict[str, Any], random: Any) -> None:
     lines = yaml.mapping(value, 0).split("\n")
     for _ in range(random.randrange(4)):
         k = random.randrange(len(lines))
@@ -422,6 +422,6 @@ plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x
 @given(
     st.dictionaries(plain, plain | st.booleans() | st.integers(-1000, 1000) | st.lists(plain, max_size=3), min_size=1)
 )
-def test_what_is_written_is_the_same_for_a_reader_of_yaml_1_2(value: dict[str, Any]) -> None:
+def test_written_yaml_is_equal_in_yaml_1_2(value: dict[str, Any]) -> None:
     tree = ryml.parse_in_arena(yaml.mapping(value, 0).encode())
     assert orjson.loads(ryml.emit_json(tree)) == value

@@ -1,20 +1,20 @@
-"""GeoJSON (RFC 7946), with JSON-FG's ``place`` (OGC 21-045r1) for what stands in metres.
+"""GeoJSON (RFC 7946), with JSON-FG's ``place`` (OGC 21-045r1) for items in metres.
 
-**Reading.** Each feature is an object of the family ``geojson``; its properties are the object's, and whatever has no
-word here comes back: ``properties.geojson`` holds the ``id`` as it stood where it is no text or repeats another's,
-``members`` (foreign ones and ``bbox``), ``geometry`` as it stood where it says more than its points (a fourth
-coordinate, an open ring), ``kept`` (properties that would stand for one of our words with a value of another type) and
-``added`` (words that we put in). ``document.geojson`` holds the root's type and further members.
+**Reading.** Each feature is an object of the family ``geojson``; its properties are the object's, and everything
+without a canonical name is stored and written again: ``properties.geojson`` contains the original ``id`` if it is not a
+text or repeats another one, ``members`` (foreign ones and ``bbox``), the original ``geometry`` if it has more than its
+points (a fourth coordinate, an open ring), ``kept`` (properties with a canonical name but a value of another type) and
+``added`` (names of properties that we added). ``document.geojson`` contains the root's type and further members.
 
-**Our own words.** Features of other layers and families carry ``layer``, ``level`` and ``part`` among their properties
-(where an editor like QGIS keeps them) and go back to where they came from; ``more`` holds properties of those names. A
-collection without them, whose features are nodes and edges (``kind``, ``source``, ``target``) as the API answers them,
-is a topology.
+**Our own data.** Features of other layers and families have ``layer``, ``level`` and ``part`` in their properties
+(where an editor like QGIS preserves them) and are read back into their part; ``more`` contains properties of those
+names. A collection without them, whose features are nodes and edges (``kind``, ``source``, ``target``) as the API
+returns them, is a topology.
 
-**Metres never pass as degrees.** An item anchored in metres has them in ``place``, and the collection says with
-``coordRefSys`` that they are in a local engineering frame (x east, y north, z up); ``geometry`` is its place on earth
-where the environment has a datum, else null. ``fleet_map`` holds the datum, the levels and the parts' documents. A
-collection in another coordinate system is refused: RFC 7946 knows degrees only.
+**Metres and degrees are kept apart.** An item anchored in metres has them in ``place``, and the collection's
+``coordRefSys`` names a local engineering frame (x east, y north, z up); ``geometry`` is its position on earth if the
+environment has a datum, else null. ``fleet_map`` contains the datum, the levels and the parts' documents. A collection
+in another coordinate system is rejected: RFC 7946 allows degrees only.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from app.model.layers import VECTOR_LAYERS
 
 
 def detect(name: str, data: bytes) -> bool:  # noqa: ARG001
-    """A JSON object of a GeoJSON type, and not the Nav2 route server's graph: that is metres in GeoJSON's clothes."""
+    """Detect a JSON object of a GeoJSON type, except a graph of the Nav2 route server, which is in metres."""
     head = data[:65536].lstrip(b"\xef\xbb\xbf \t\r\n")
     if head[:1] != b"{":
         return False

@@ -1,4 +1,4 @@
-"""GeoJSON geometries as shapes: plain points and lines all at once, others one by one."""
+"""Convert GeoJSON geometries to shapes: plain points and lines all at once, others one by one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RaiseUnreadable = Callable[[int, str], NoReturn]
 
 
 def parse_geometries(raw: Sequence[Any], refuse: RaiseUnreadable) -> tuple[NDArray[np.object_], dict[int, Any]]:
-    """Shapely geometries of GeoJSON ones, and by place those whose text says more than the shape."""
+    """Convert GeoJSON geometries to shapely ones; also return, by index, those with more content than the shape."""
     out = np.empty(len(raw), object)
     odd: dict[int, Any] = {}
     plain: dict[str, list[int]] = {"Point": [], "LineString": []}
@@ -30,7 +30,7 @@ def parse_geometries(raw: Sequence[Any], refuse: RaiseUnreadable) -> tuple[NDArr
             (plain[kind] if kind in ("Point", "LineString") else single).append(k)
         else:
             single.append(k)
-    # Nearly all features of a network are points and lines in two dimensions: those are made at once.
+    # Most features of a network are 2-D points and lines: convert them all at once.
     at = [raw[k]["coordinates"] for k in plain["Point"]]
     if at and _flat(at):
         out[plain["Point"]] = shapely.points(np.array(at, np.float64))
@@ -65,16 +65,16 @@ def _flat(rows: list[Any]) -> bool:
 
 
 class GeometryParser:
-    """One GeoJSON geometry -> shapely. odd: the text says something that the shape does not."""
+    """Convert one GeoJSON geometry to shapely. odd: the geometry has content that the shape lacks."""
 
     def __init__(self) -> None:
         self.odd = False
 
     def shape(self, geometry: Any) -> Any:
-        """The shape. Raises ValueError with the reason where it is no geometry of GeoJSON."""
+        """Return the shape. Raises ValueError with the reason if it is not a GeoJSON geometry."""
         if not isinstance(geometry, dict) or geometry.get("type") not in GEOMETRIES:
             kind = geometry.get("type") if isinstance(geometry, dict) else geometry
-            raise ValueError(f"{str(kind)[:40]!r} is no geometry type of GeoJSON")
+            raise ValueError(f"unsupported geometry type {str(kind)[:40]!r}")
         kind = geometry["type"]
         inner = geometry.get("geometries" if kind == "GeometryCollection" else "coordinates")
         if not isinstance(inner, list):
@@ -99,7 +99,7 @@ class GeometryParser:
         return shapely.multipolygons([self._polygon(part) for part in inner])
 
     def _positions(self, rows: Any) -> NDArray[np.float64]:
-        """[n, 2 or 3]: three where all have an altitude and any is not 0."""
+        """Return [n, 2 or 3]: three columns if all have an altitude and any is not 0."""
         if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
             raise ValueError("coordinates must be arrays of positions")
         if not set(map(type, chain.from_iterable(rows))) <= {int, float} or any(len(row) < 2 for row in rows):
@@ -117,7 +117,7 @@ class GeometryParser:
     def _line(self, rows: Any) -> Any:
         at = self._positions(rows)
         if len(at) < 2:
-            raise ValueError("a line needs two positions or more")
+            raise ValueError("a line needs at least two positions")
         return shapely.linestrings(at)
 
     def _polygon(self, rings: Any) -> Any:
@@ -132,9 +132,9 @@ class GeometryParser:
     def _ring(self, rows: Any) -> Any:
         at = self._positions(rows)
         if len(at) and (at[0] != at[-1]).any():
-            # RFC 7946 asks for a closed ring; it is clear what an open one means.
+            # RFC 7946 requires a closed ring; an open one is unambiguous.
             self.odd = True
             at = np.concatenate([at, at[:1]])
         if len(at) < 4:
-            raise ValueError("a polygon's ring needs four positions or more, the last one equal to the first")
+            raise ValueError("a polygon's ring needs at least four positions, the last one equal to the first")
         return shapely.linearrings(at)

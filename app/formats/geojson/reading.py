@@ -1,4 +1,4 @@
-"""Reading GeoJSON and JSON-FG: features as parts of layers, in degrees or in metres."""
+"""Read GeoJSON and JSON-FG: features as parts of layers, in degrees or in metres."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _METRES = {"Engineering2D", "Engineering3D"}
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """Objects, and the layers that our own words tell of.
+    """Read objects, and the layers that our own data describes.
 
-    Raises UnreadableFile (with a line where there is one) for what is not GeoJSON, for numbers that are not finite, for
-    places that are not on earth and for coordinate systems other than WGS 84; TooLarge beyond the limits.
+    Raises UnreadableFile (with a line if known) for files that are not GeoJSON, for numbers that are not finite, for
+    positions that are not on earth and for coordinate systems other than WGS 84; TooLarge beyond the limits.
     """
     data = files[context.main].removeprefix(b"\xef\xbb\xbf")
     top = json.load(data, context.limits)
@@ -35,7 +35,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _has_own_members(p: Any) -> bool:
-    """Whether these properties carry our own words."""
+    """Whether these properties contain our own data."""
     return (
         isinstance(p, dict)
         and "part" in p
@@ -51,7 +51,7 @@ def _raise_unreadable(reason: str, line: int | None = None, location: str | None
 
 
 def _is_box(box: Any) -> bool:
-    """Whether these are four or six numbers, corner after corner, within the earth's longitudes and latitudes."""
+    """Whether these are four or six numbers, corner after corner, within the range of longitudes and latitudes."""
     if not isinstance(box, list) or len(box) not in (4, 6):
         return False
     numbers = [float(v) for v in box if isinstance(v, (int, float)) and not isinstance(v, bool)]
@@ -67,7 +67,7 @@ class _Reader:
         self.data = data
         self.context = context
         if not isinstance(top, dict):
-            _raise_unreadable("GeoJSON is one object with a type", 1)
+            _raise_unreadable("GeoJSON must be one object with a type", 1)
         self.top = top
         self.root = str(top.get("type"))
         self.rows = self._rows()
@@ -92,12 +92,10 @@ class _Reader:
             return [self.top]
         if self.root in GEOMETRIES:
             return [{"type": "Feature", "geometry": self.top, "properties": None}]
-        _raise_unreadable(
-            f"{self.root[:40]!r} is no GeoJSON type: FeatureCollection, Feature or a geometry is needed", 1
-        )
+        _raise_unreadable(f"unsupported type {self.root[:40]!r}: must be FeatureCollection, Feature or a geometry", 1)
 
     def line(self, k: int) -> int | None:
-        """The line where feature k begins, as far as the text tells: features seldom hold features."""
+        """Return the line where feature k begins, assuming that features contain no features."""
         line_number = None
         for n, match in enumerate(re.finditer(rb'"type"\s*:\s*"Feature"', self.data)):
             if n == k:
@@ -111,7 +109,7 @@ class _Reader:
         return isinstance(reference, str) and reference.rstrip("/").rpartition("/")[2] in _METRES
 
     def _check_crs(self, crs: Any, location: str | None) -> None:
-        """The ``crs`` of the 2008 specification: WGS 84 in longitude, latitude or nothing."""
+        """Check ``crs`` of the 2008 specification: WGS 84 in longitude, latitude, or absent."""
         if crs is None:
             return
         properties = crs.get("properties") if isinstance(crs, dict) else None
@@ -119,8 +117,8 @@ class _Reader:
         name = name if isinstance(name, str) else orjson.dumps(crs).decode()
         if not _EARTH.match(name) or "UTM" in name.upper():
             _raise_unreadable(
-                f"its coordinates are in {name[:80]}, but GeoJSON means degrees (WGS 84 longitude, latitude): export "
-                "it again in EPSG:4326 (a Nav2 route graph is the format nav2_route)",
+                f"the coordinates are in {name[:80]}, but GeoJSON uses degrees (WGS 84 longitude, latitude): "
+                "export the file again in EPSG:4326 (a Nav2 route graph has the format nav2_route)",
                 1,
                 location or "crs",
             )
@@ -128,7 +126,7 @@ class _Reader:
     # --- features ---
 
     def report_missing_members(self) -> None:
-        """Report features without the members that every feature has, and a CRS of places that is not known."""
+        """Warn about features without mandatory members, and about an unknown CRS of places."""
         for member in ("geometry", "properties"):
             lacking = [
                 k
@@ -136,19 +134,17 @@ class _Reader:
                 if member not in row and not (member == "geometry" and "place" in row)
             ]
             if lacking:
-                reason = (
-                    f"{len(lacking)} features have no member {member!r}: each must have one, null where there is none"
-                )
+                reason = f"{len(lacking)} features lack the mandatory member {member!r}; use null for an empty one"
                 self.context.warn(reason, line=self.line(lacking[0]), where=self.name(lacking[0]))
         crs = self.top.get("coordRefSys")
         if crs is not None and not self.local:
             text = crs if isinstance(crs, str) else orjson.dumps(crs).decode()
             if not _EARTH.match(text):
-                reason = f"{text[:80]} is unsupported: only `geometry` (WGS 84) is read, `place` is ignored"
+                reason = f"{text[:80]} is unsupported; only `geometry` (WGS 84) is read, `place` is ignored"
                 self.context.warn(reason, where="coordRefSys")
         box = self.top.get("bbox")
         if box is not None and not _is_box(box):
-            self.context.warn("is no box [west, south, east, north] in degrees; it is kept", where="bbox")
+            self.context.warn("not a box [west, south, east, north] in degrees; it is stored unchanged", where="bbox")
 
     def layers(self) -> Layers:
         self.report_missing_members()
@@ -177,7 +173,7 @@ class _Reader:
             ids = unique_ids(file_ids)
             repeats = [a for a, b in zip(ids, file_ids, strict=True) if a != b]
             if repeats:
-                self.context.warn(f"{len(repeats)} ids stand more than once; later ones got #2, #3 …", where=repeats[0])
+                self.context.warn(f"{len(repeats)} duplicate ids; later ones got #2, #3 …", where=repeats[0])
             rows = [
                 self._properties(
                     k,
@@ -213,7 +209,7 @@ class _Reader:
         return PartKey("objects", self.context.level, FAMILY)
 
     def _network(self) -> bool:
-        """Whether the unmarked features are a topology: edges whose ends are all there."""
+        """Whether the unmarked features are a topology: edges whose end nodes all exist."""
         nodes, ends = set(), []
         for row, mark in zip(self.rows, self.marks, strict=True):
             p = row.get("properties")
@@ -230,13 +226,13 @@ class _Reader:
         stubs = [e for e in ends if not isinstance(e, str) or e not in nodes]
         if stubs:
             self.context.warn(
-                f"{len(stubs)} edges begin or end at nodes that are not there ({str(stubs[0])[:80]}): the features are "
-                "kept as objects, not as a network"
+                f"{len(stubs)} edges begin or end at missing nodes ({str(stubs[0])[:80]}); the features are "
+                "stored as objects, not as a network"
             )
         return not stubs
 
     def _read_geometry(self, k: int, row: dict[str, Any]) -> tuple[bool, Any]:
-        """(whether it is in metres, the GeoJSON geometry or None)."""
+        """Return whether the feature is in metres, and its GeoJSON geometry or None."""
         place = row.get("place")
         if "crs" in row:
             self._check_crs(row["crs"], self.name(k))
@@ -246,7 +242,7 @@ class _Reader:
                 return True, place
             if row.get("geometry") is None:
                 self.context.warn(
-                    "its place is in a coordinate system that is not known here; it is kept without a geometry",
+                    "place is in an unsupported coordinate system; the feature is stored without a geometry",
                     line=self.line(k),
                     where=self.name(k),
                 )
@@ -265,10 +261,12 @@ class _Reader:
             k = int(owner[bad[0]])
             x, y = coordinates[bad[0]].tolist()
             reason = (
-                f"({x:g}, {y:g}) is beyond ±1e7 metres"
+                f"({x:g}, {y:g}) is outside ±1e7 metres"
                 if local[k]
-                else f"({x:g}, {y:g}) is no longitude, latitude in degrees: metres belong into JSON-FG's place, with "
-                f"coordRefSys {LOCAL_2D}, or the file must be exported in EPSG:4326"
+                else (
+                    f"({x:g}, {y:g}) is not longitude, latitude in degrees: use JSON-FG's place with coordRefSys "
+                    f"{LOCAL_2D} for metres, or export the file in EPSG:4326"
+                )
             )
             _raise_unreadable(reason, self.line(k), self.name(k))
 
@@ -310,7 +308,7 @@ class _Reader:
             source_properties["properties"] = None
         members = {k: v for k, v in row.items() if k not in ("type", "id", "geometry", "properties")}
         if metres:
-            # Written again from the canonical coordinates.
+            # Written from the canonical coordinates instead.
             del members["place"]
             members.pop("coordRefSys", None)
         if self.root != "FeatureCollection":

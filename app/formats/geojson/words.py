@@ -1,11 +1,11 @@
-"""The names of GeoJSON and JSON-FG that reader and writer share, and our own."""
+"""Names in GeoJSON and JSON-FG that reader and writer share, and our own."""
 
 from __future__ import annotations
 
 FAMILY = "geojson"
 LOCAL_2D = "http://www.opengis.net/def/crs/OGC/0/Engineering2D"
 LOCAL_3D = "http://www.opengis.net/def/crs/OGC/0/Engineering3D"
-"""OGC's names for a local engineering frame: what ``coordRefSys`` says of metres in the environment's frame."""
+"""OGC's names for a local engineering frame, as ``coordRefSys`` of metres in the environment's frame."""
 
 CONFORMS = "http://www.opengis.net/spec/json-fg-1/1.0/conf/core"
 OWN_MEMBER = "fleet_map"

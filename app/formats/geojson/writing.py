@@ -1,4 +1,4 @@
-"""Writing GeoJSON: one feature for each item, with its layer, level and part."""
+"""Write GeoJSON: one feature for each item, with its layer, level and part."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from app.syntax.decimals import DEGREES, METRES
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.geojson``: an uploaded collection as it was, everything else beside it in our own words."""
+    """Write ``map.geojson``: an uploaded collection unchanged, and everything else with our own data."""
     out = _Writer(layers)
     pictures: tuple[Layer, ...] = ("occupancy", "voxels", "imagery")
     for layer in pictures:
-        context.drop(layer, len(layers.parts_of(layer)), "GeoJSON holds features, no cells or pixels")
-    context.drop("resources", len(layers.resources()), "GeoJSON is one text without further files")
+        context.drop(layer, len(layers.parts_of(layer)), "GeoJSON contains features, not cells or pixels")
+    context.drop("resources", len(layers.resources()), "GeoJSON is one text file without further files")
     return {"map.geojson": out.data(context)}
 
 
@@ -70,7 +70,7 @@ class _Writer:
             if root == "Feature":
                 return _dump({**rows[0], OWN_MEMBER: extension} if extension else rows[0])
             if rows[0]["geometry"] is not None:
-                context.drop("datum", len(extension), "a geometry alone has no place for it")
+                context.drop("datum", len(extension), "a single geometry cannot express it")
                 return _dump(rows[0]["geometry"])
         if self.metres:
             top = {"conformsTo": [CONFORMS], **top, "coordRefSys": LOCAL_3D if self.deep else LOCAL_2D}
@@ -99,7 +99,7 @@ class _Writer:
         for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
             origin = p.get("drawn_from")
             if key.layer == "topology" and isinstance(origin, str) and (key.level, origin) in drawn:
-                # The drawing it was made from is written; with the network it would stand there twice.
+                # The drawing that the network was derived from is written; the network would duplicate it.
                 continue
             place = metres.get(k)
             geometry = None if k in metres and frame is None else degrees[k]
@@ -119,7 +119,7 @@ class _Writer:
         return rows
 
     def foreign(self, row: dict[str, Any], p: Properties, shape: Any, geometry: Any, place: Any) -> None:
-        """A feature of an uploaded collection, as it was but for what has changed since. place: ... for none."""
+        """Write a feature of an uploaded collection, updated to its item. place: ... for none."""
         source_value = p.get(FAMILY)
         source_properties: Mapping[str, Any] = source_value if isinstance(source_value, Mapping) else {}
         if "id" in source_properties:
@@ -152,7 +152,7 @@ class _Writer:
 
 
 def _is_same_shape(odd: dict[str, Any], shape: Any) -> bool:
-    """Whether an uploaded geometry still is what the item looks like."""
+    """Whether an uploaded geometry still equals the item's geometry."""
     try:
         return bool(shapely.equals_identical(GeometryParser().shape(odd), shape))
     except (ValueError, shapely.errors.GEOSException, RecursionError):
@@ -160,7 +160,7 @@ def _is_same_shape(odd: dict[str, Any], shape: Any) -> bool:
 
 
 def _mappings(geometry: NDArray[np.object_], decimals: int) -> list[Any]:
-    """GeoJSON geometries, rounded; None for an item without one."""
+    """Write GeoJSON geometries, rounded; None for an item without one."""
     n = len(geometry)
     if not n:
         return []
@@ -186,7 +186,7 @@ def _mappings(geometry: NDArray[np.object_], decimals: int) -> list[Any]:
 
 
 def _mapping(geometry: Any, rows: list[Any], at: list[int]) -> dict[str, Any]:
-    """One geometry from its coordinates in order; at: where the next one stands."""
+    """Write one geometry from its coordinates in order; at: index of the next one."""
 
     def take(part: Any) -> list[Any]:
         begin = at[0]
@@ -214,10 +214,10 @@ def _mapping(geometry: Any, rows: list[Any], at: list[int]) -> dict[str, Any]:
 
 
 def _dump(value: Any) -> bytes:
-    """One line for each feature, so that texts compare well."""
+    """Write one line per feature, so that texts compare well."""
     if isinstance(value, dict) and value.get("type") == "FeatureCollection":
         head = {k: v for k, v in value.items() if k != "features"}
-        out = BytesIO()  # not joined from rows: orjson's answers take 4 kB and more each, however short they are
+        out = BytesIO()  # not joined from rows: each result of orjson takes at least 4 kB, however short it is
         out.write(orjson.dumps(head)[:-1])
         out.write(b',"features":[')
         for k, row in enumerate(value["features"]):

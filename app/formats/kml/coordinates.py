@@ -1,4 +1,4 @@
-"""Texts of coordinates as arrays: all of a document at once, or one by one where one is odd."""
+"""Convert coordinate texts to arrays: all of a document at once, irregular ones one by one."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ _SPACES = bytes.maketrans(b",;", b"  ")
 
 @dataclass(frozen=True, slots=True)
 class Sequences:
-    """k lists of coordinates. points: float64 [n, 3], altitude 0 where none is given. start: int [k + 1], where each
-    list begins. odd: bool [k], True where a text is not plain tuples of two or three numbers (its list is empty).
+    """k lists of coordinates.
+
+    points: float64 [n, 3], altitude 0 if none is given. start: int [k + 1], index of the first point of each list. odd:
+    bool [k], True if a text is not plain tuples of two or three numbers (its list is empty).
     """
 
     points: NDArray[np.float64]
@@ -34,7 +36,7 @@ class Sequences:
 
 
 def parse_coordinates(texts: Sequence[str]) -> Sequences:
-    """Coordinate texts -> numbers, all at once; what is not plain is marked, not refused."""
+    """Parse all coordinate texts at once; irregular ones are marked, not rejected."""
     joined = ";".join(texts).encode() + b";"
     classes = joined.translate(_CLASSES)
     kind = np.frombuffer(classes, np.uint8)
@@ -77,8 +79,9 @@ def parse_coordinates(texts: Sequence[str]) -> Sequences:
 
 
 def parse_two_way_rings(parsed: Sequences, rings: Sequence[int]) -> Sequences:
-    """The same with these rings of three points (an edge drawn as an area: there and back) made ones of four, as few as
-    a ring can have, by giving their second point twice.
+    """Give rings of three points a fourth one, as few as a ring can have, by repeating their second point.
+
+    Such a ring is an edge drawn as an area: there and back.
     """
     times = np.ones(len(parsed.points), np.int64)
     times[parsed.start[list(rings)] + 1] = 2
@@ -87,7 +90,7 @@ def parse_two_way_rings(parsed: Sequences, rings: Sequence[int]) -> Sequences:
 
 
 def _parse_each(texts: Sequence[str]) -> Sequences:
-    """The same where one text spoils the others."""
+    """Parse the texts one by one, if an irregular one prevents parsing all at once."""
     if len(texts) == 1:
         return Sequences(np.empty((0, 3)), np.zeros(2, np.int64), np.ones(1, bool))
     each = [parse_coordinates([t]) for t in texts]
@@ -100,9 +103,9 @@ PLAIN_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)
 
 
 def parse_lenient_tuples(text: str, line: int | None) -> list[tuple[float, float, float]]:
-    """Coordinates as Google Earth reads them: blanks around commas, a stray comma, and a,b,c,d,e,f without blanks.
+    """Parse coordinates as Google Earth does: spaces around commas, a stray comma, and a,b,c,d,e,f without spaces.
 
-    Tuples of one number are left out. Raises UnreadableFile for what is no number.
+    Tuples of one number are skipped. Raises UnreadableFile for anything but numbers.
     """
     out = []
     for token in _SPACED_COMMA.sub(",", text).split():
@@ -120,7 +123,7 @@ def parse_lenient_tuples(text: str, line: int | None) -> list[tuple[float, float
 
 
 def parse_point(values: Sequence[float], line: int | None) -> tuple[float, float, float]:
-    """Longitude, latitude and altitude (0 where none is given). Raises UnreadableFile off the earth."""
+    """Return longitude, latitude and altitude (0 if none is given). Raises UnreadableFile if not on earth."""
     x, y, z = (*values, 0.0, 0.0)[:3]
     if not (abs(x) <= 180.0 and abs(y) <= 90.0 and math.isfinite(z)):
         raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [off_earth_problem(x, y, line)])
@@ -128,17 +131,17 @@ def parse_point(values: Sequence[float], line: int | None) -> tuple[float, float
 
 
 def off_earth_problem(x: float, y: float, line: int | None) -> Problem:
-    """That a place is not on earth."""
+    """Describe a position that is not on earth."""
     return with_line(f"longitude {x:g}, latitude {y:g}: must be finite, within ±180 and ±90 degrees", line)
 
 
 def with_line(problem: str, line: int | None) -> Problem:
-    """A problem on a line of the file, where that is known."""
+    """Build a problem with the line of the file, if known."""
     return Problem(problem, line=line)
 
 
 def parse_floats(texts: Sequence[str], line: int | None) -> list[float]:
-    """Numbers as XML writes them. Raises UnreadableFile for other words."""
+    """Parse numbers as XML writes them. Raises UnreadableFile for other texts."""
     for t in texts:
         if not PLAIN_NUMBER.match(t.strip()):
             raise UnreadableFile(f"{t[:40]!r} is not a number", [with_line(f"{t[:40]!r} is not a number", line)])

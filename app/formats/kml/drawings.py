@@ -1,4 +1,4 @@
-"""Drawings that were uploaded, filled in again: kept texts whose slots take what the layers say now."""
+"""Write uploaded drawings again: stored texts with slots that are filled from the layers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from app.syntax import decimals
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A drawing with its items, as text. level and name: where it came from. root: the start tag's declarations."""
+    """A drawing with its items, as text. level and name: of its part. root: the start tag's declarations."""
 
     level: str
     name: str
@@ -56,7 +56,7 @@ _XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")
 
 
 def group_by_drawing(layers: Layers) -> dict[PartKey, Features]:
-    """The vector parts; fences and zones that were drawn in a document stand with the objects of that document."""
+    """Return the vector parts; fences and zones drawn in a document are moved to the objects of that document."""
     out = {key: part for key, part in layers.parts.items() if isinstance(part, Features)}
     for key in sorted(out):
         part = out[key]
@@ -80,7 +80,7 @@ def group_by_drawing(layers: Layers) -> dict[PartKey, Features]:
 
 
 def _skeletons(part: Features) -> dict[str, Mapping[str, Any]]:
-    """The drawings that a part remembers, by name. Edits can put anything there: what does not fit is left out."""
+    """Return a part's stored drawings by name; entries that edits made invalid are skipped."""
     source_document = part.document.get(FAMILY)
     documents = source_document.get("documents") if isinstance(source_document, Mapping) else None
     return {
@@ -93,7 +93,7 @@ def _skeletons(part: Features) -> dict[str, Mapping[str, Any]]:
 
 
 def _kept_element(p: Properties, documents: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """What an item remembers of its element in one of the known drawings, where that can be made use of."""
+    """Return an item's stored element in one of the existing drawings, if it is valid."""
     source_element = p.get(FAMILY)
     usable = (
         isinstance(source_element, Mapping)
@@ -109,7 +109,7 @@ def _kept_element(p: Properties, documents: Mapping[str, Any]) -> Mapping[str, A
 def fill_drawings(
     key: PartKey, part: Features, frame: LocalFrame | None, context: WriteContext
 ) -> tuple[list[Document], Features | None]:
-    """The uploaded drawings with their items in place, and the objects that belong to none of them."""
+    """Return the uploaded drawings with their items in place, and the objects that belong to none of them."""
     skeletons = _skeletons(part)
     geometry = part.in_wgs84(frame)
     texts = degree_texts(geometry, thin=True)
@@ -131,7 +131,7 @@ def fill_drawings(
                 )
             )
         except (etree.LxmlError, ValueError, LookupError, AttributeError, StopIteration):
-            loose.append(k)  # not an element as it was read from a file
+            loose.append(k)  # not an element of a file
     documents = []
     for name, document in sorted(skeletons.items()):
         items = sorted(placed[name])
@@ -142,7 +142,7 @@ def fill_drawings(
             text = _fill_skeleton(document["xml"], items)
             if not _is_well_formed(text):
                 bad.update(k for _, k, _ in items)
-                context.drop("drawing", 1, "what is remembered of its document is damaged; its objects are written")
+                context.drop("drawing", 1, "the stored rest of its document is damaged; its objects are still written")
                 text = ""
             loose += bad
         if text:
@@ -151,7 +151,7 @@ def fill_drawings(
 
 
 def _is_well_formed(xml: str) -> bool:
-    """Whether it is XML, its prefixes declared."""
+    """Whether a text is XML once its prefixes are declared."""
     try:
         expat.ParserCreate(namespace_separator=" ").Parse(xml, True)
     except (expat.ExpatError, UnicodeError):
@@ -160,7 +160,7 @@ def _is_well_formed(xml: str) -> bool:
 
 
 def _fill_skeleton(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
-    """A document with its items where they stood."""
+    """Write a document with its items at their original positions."""
     pieces = _ITEMS.split(skeleton)
     starts = [int(n[:18]) for n in pieces[1::2]]
     groups: list[list[str]] = [[] for _ in starts]
@@ -176,7 +176,7 @@ def _fill_skeleton(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
 
 
 def _declarations(xml: str) -> str:
-    """The namespace declarations of a document's root."""
+    """Return the namespace declarations of a document's root."""
     root = _ROOT.match(xml)
     return "".join(_XMLNS.findall(root[3])) if root else ""
 
@@ -184,7 +184,7 @@ def _declarations(xml: str) -> str:
 def _fill_element(
     source_element: Mapping[str, Any], p: Properties, geometry: Any, texts: CoordinateTexts, k: int, declarations: str
 ) -> str:
-    """A kept element with the name, the values and the place that the object has now."""
+    """Write a stored element with the object's current name, values and geometry."""
     xml: str = source_element["xml"]
     shape = source_element.get("shape")
     if shape is None:
@@ -211,7 +211,7 @@ def _fill_element(
 
 
 def _with_name(start: re.Match[str], name: str) -> str:
-    """A start tag, and the name as its first child."""
+    """Write a start tag, with the name as its first child."""
     qname, _, attributes, empty = start.groups()
     prefix = qname.rpartition(":")[0]
     tag = f"{prefix}:name" if prefix else "name"
@@ -225,7 +225,7 @@ def _value(label: str, p: Properties, aside: Mapping[str, Any]) -> str:
 
 
 def _parse_element(xml: str, declarations: str) -> etree._Element:
-    """A kept element as a tree, inside a wrapper with its document's namespaces; slots stay as instructions."""
+    """Parse a stored element inside a wrapper with its document's namespaces; slots remain processing instructions."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
     wrapper = etree.fromstring(f"<w{declarations}>{xml}</w>".encode(), parser)
     return wrapper[0]
@@ -237,7 +237,7 @@ def _serialise_element(element: etree._Element) -> str:
 
 
 def _update_geometry(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
-    """An element that holds its own geometry: as it is, unless the object lies elsewhere by now."""
+    """Write an element that contains its own geometry: unchanged unless the object has moved."""
     element = _parse_element(xml, declarations)
     before = item_geometry(element)
     both_empty = before.is_empty and geometry.is_empty
@@ -247,7 +247,7 @@ def _update_geometry(xml: str, geometry: Any, declarations: str, lists: list[str
 
 
 def _redraw(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
-    """The element with another geometry. An overlay gets new corners, a model a new place."""
+    """Replace an element's geometry; an overlay gets new corners, a model a new position."""
     element = _parse_element(xml, declarations)
     kind = local_name(element)
     if kind == "GroundOverlay":
@@ -298,7 +298,7 @@ _STYLE_URL = re.compile(r"(<(?:[\w.-]+:)?styleUrl(?:\s[^>]*)?>\s*#)([^<\s]*)")
 
 
 def unique_names(documents: list[str]) -> list[str]:
-    """The documents with style ids that no other one has, so that each placemark keeps its own style."""
+    """Make style ids unique across documents, so that each placemark keeps its own style."""
     used: set[str] = set()
     out = []
     for xml in documents:
@@ -320,7 +320,7 @@ def _rename(xml: str, names: Mapping[str, str]) -> str:
 
 
 def wrap_document(document: Document, xml: str) -> str:
-    """A whole document inside ours: its root becomes a Document that says where it came from."""
+    """Embed a complete document in ours: its root becomes a Document with its source."""
     data = data_element(OWN_ELEMENT, "document") + data_element("document", document.name)
     if document.entry is not None:
         data += data_element("entry", document.entry)

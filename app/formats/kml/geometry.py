@@ -1,4 +1,4 @@
-"""KML geometries and overlays as shapes."""
+"""Convert KML geometries and overlays to shapes."""
 
 from __future__ import annotations
 
@@ -27,21 +27,23 @@ from app.model.features import NO_GEOMETRY
 
 
 def _flat(points: Sequence[tuple[float, float, float]]) -> NDArray[np.float64]:
-    """float64 [n, 2], or [n, 3] where any altitude is not 0."""
+    """Return float64 [n, 2], or [n, 3] if any altitude is not 0."""
     array = np.array(points, np.float64).reshape(-1, 3)
     return array if array[:, 2].any() else array[:, :2]
 
 
 def _line(points: Sequence[tuple[float, float, float]]) -> Any:
-    """A line; one point is a point, none is nothing."""
+    """Build a line; one point becomes a point, no points None."""
     if len(points) > 1:
         return shapely.linestrings(_flat(points))
     return shapely.points(_flat(points)[0]) if points else NO_GEOMETRY
 
 
 def _area(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Any:
-    """A polygon from its rings, closed if they are open. A ring of too few points (edges are drawn so: there and back)
-    is filled up with a point it has: an area of nothing, but still what was drawn.
+    """Build a polygon from its rings, closing open ones.
+
+    A ring of too few points (an edge drawn there and back) is padded with one of its points: its area is 0, but the
+    drawing is preserved.
     """
     if not rings or not rings[0]:
         return NO_GEOMETRY
@@ -53,7 +55,7 @@ def _area(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Any:
 
 
 def _join_geometries(parts: Sequence[Any]) -> Any:
-    """Several geometries as one: Multi… where they are of one type."""
+    """Combine several geometries into one: Multi… if they are of one type."""
     flat = list(parts)
     while any(p.geom_type.startswith(("Multi", "Geometry")) for p in flat):
         flat = [q for p in flat for q in shapely.get_parts(p)]
@@ -70,7 +72,7 @@ def _join_geometries(parts: Sequence[Any]) -> Any:
 
 
 def read_geometry(g: etree._Element) -> Any:
-    """One geometry element, whatever oddity it has; empty ones give NO_GEOMETRY. Raises UnreadableFile."""
+    """Parse one geometry element, also irregular ones; empty ones give NO_GEOMETRY. Raises UnreadableFile."""
     name = local_name(g)
     if name in ("Point", "LineString", "LinearRing"):
         points = _coordinate_tuples(g)
@@ -100,7 +102,7 @@ def _coordinate_tuples(g: etree._Element) -> list[tuple[float, float, float]]:
 
 
 def item_geometry(element: etree._Element) -> Any:
-    """The geometry of a placemark or overlay, of any shape. Raises UnreadableFile."""
+    """Parse the geometry of a placemark or overlay, of any shape. Raises UnreadableFile."""
     if local_name(element) == "GroundOverlay":
         return overlay_footprint(element)
     geometries = [c for c in element if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
@@ -111,7 +113,7 @@ def item_geometry(element: etree._Element) -> Any:
 
 
 def overlay_footprint(element: etree._Element) -> Any:
-    """Where a GroundOverlay lies: its gx:LatLonQuad, else its LatLonBox turned about its middle (counter-clockwise)."""
+    """Return the corners of a GroundOverlay: its gx:LatLonQuad, else its LatLonBox rotated counter-clockwise."""
     quad, box = child(element, "LatLonQuad"), child(element, "LatLonBox")
     if quad is not None:
         corners = _coordinate_tuples(quad)
@@ -145,7 +147,7 @@ def overlay_footprint(element: etree._Element) -> Any:
 
 
 def _is_within_earth(shape: Any) -> Any:
-    """A footprint that crosses the antimeridian as two, one on either side."""
+    """Split a footprint that crosses the antimeridian into two, one on either side."""
     west, _, east, _ = shape.bounds
     if west >= -180.0 and east <= 180.0:
         return shapely.intersection(shape, shapely.box(-180.0, -90.0, 180.0, 90.0)) if shape.bounds[3] > 90 else shape
@@ -159,8 +161,10 @@ def _is_within_earth(shape: Any) -> Any:
 
 
 def parse_plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:
-    """Shape and coordinate elements of a geometry without oddities of structure: ``P`` point, ``L`` line, ``A2`` area
-    of two rings, ``M…`` several of them; (role, element) in the order of the geometry's own coordinates.
+    """Return the shape and the coordinate elements of a geometry of regular structure.
+
+    The shape is a code: ``P`` point, ``L`` line, ``A2`` area of two rings, ``M…`` several of them; the elements are
+    (role, element) in the order of the geometry's own coordinates.
     """
     name = local_name(g)
     if name == "Polygon":
@@ -197,7 +201,7 @@ def parse_plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree
 
 
 def _single_ring(side: etree._Element) -> etree._Element | None:
-    """The coordinates of ``<outerBoundaryIs><LinearRing><coordinates/>`` with nothing else in it, as nearly all are."""
+    """Return the coordinates of ``<outerBoundaryIs><LinearRing><coordinates/>`` without other content."""
     if len(side) == 1 and local_name(side) == "outerBoundaryIs":
         ring = side[0]
         if len(ring) == 1 and not len(ring[0]) and local_name(ring) == "LinearRing":
@@ -207,7 +211,7 @@ def _single_ring(side: etree._Element) -> etree._Element | None:
 
 
 def item_geometries(items: Sequence[Item], parsed: Sequences) -> NDArray[np.object_]:
-    """All geometries, the plain ones made by the array. 3-D only where an altitude is not 0."""
+    """Build all geometries, the regular ones by array operations. 3-D only if an altitude is not 0."""
     out = np.full(len(items), NO_GEOMETRY, object)
     rows_by_shape: dict[str, list[tuple[int, int]]] = {"P": [], "L": [], "A1": []}
     for n, item in enumerate(items):
@@ -244,7 +248,7 @@ def item_geometries(items: Sequence[Item], parsed: Sequences) -> NDArray[np.obje
 
 
 def _assemble_geometry(item: Item, parsed: Sequences) -> Any:
-    """A plain geometry of several lists: an area with holes, or a collection."""
+    """Build a regular geometry of several lists: an area with holes, or a collection."""
     lists = [parsed.points[parsed.start[k] : parsed.start[k + 1]] for _, k, _ in item.sequences]
     deep = any(p[:, 2].any() for p in lists)
     rows = iter([p if deep else p[:, :2] for p in lists])

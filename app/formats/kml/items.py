@@ -1,4 +1,4 @@
-"""Placemarks and overlays while their tree is read."""
+"""Placemarks and overlays of a KML tree."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.model.features import MAX_ID
 
 @dataclass(slots=True)
 class Item:
-    """A placemark or overlay while its tree is read."""
+    """Placemark or overlay of a KML tree that is being read."""
 
     element: etree._Element
     title: etree._Element | None = None
@@ -24,8 +24,9 @@ class Item:
 
 
 def find_items(root: etree._Element) -> list[Item]:
-    """The placemarks and overlays of the document: those that stand in nothing but containers (elsewhere, as in an
-    Update or in an element that nobody knows, they are part of what they stand in).
+    """Return the placemarks and overlays of the document that are only inside containers.
+
+    Elsewhere, such as in an Update or an unknown element, they are part of that element.
     """
     usable: dict[etree._Element, bool] = {}
 
@@ -65,7 +66,7 @@ def find_items(root: etree._Element) -> list[Item]:
 
 
 def extended_values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
-    """The plain values of an ExtendedData: (name, element whose text is the value), the first of each name."""
+    """Return the plain values of an ExtendedData as (name, element with the value), the first of each name."""
     out: dict[str, etree._Element] = {}
     for entry in extended.iter("{*}Data", "{*}SimpleData"):
         name = entry.get("name")
@@ -79,7 +80,7 @@ def extended_values(extended: etree._Element) -> list[tuple[str, etree._Element]
 
 
 def own_words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str]) -> dict[str, str]:
-    """The values by name as texts; of these names as they were before ``spell`` quoted what looks like a number."""
+    """Return the values by name as texts; for these names without the quotes that ``spell`` adds around numbers."""
     values = {name: value.text or "" for name, value in data}
     for name in names & values.keys():
         value = unspell(values[name])
@@ -88,7 +89,7 @@ def own_words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str])
 
 
 def usable_text(text: str) -> str:
-    """A text as an id: printable and not too long."""
+    """Return a text as an id: printable and not too long."""
     if text.isprintable() and 0 < len(text) <= MAX_ID - 12 and text[0] != " " != text[-1]:
         return text
     clean = "".join(c if c.isprintable() else " " for c in text).strip()

@@ -1,7 +1,7 @@
-"""KML: drawings from Google Earth and the like, and any map of ours to look at there.
+"""KML: drawings from Google Earth and similar tools, and exports of any map to view there.
 
-Positions are longitude, latitude[, altitude], degrees WGS 84. A placemark or overlay is one object; whatever the file
-says beyond the canonical words is kept and comes back (``kml.reading`` tells how). Nothing that a file refers to is
+Positions are longitude, latitude[, altitude], degrees WGS 84. A placemark or overlay is one object; content beyond the
+canonical properties is stored and written again (see ``kml.reading``). Files that a drawing refers to are never
 fetched. Source: OGC 12-007r2 (KML 2.3), Google's ``gx`` extension.
 """
 
@@ -27,13 +27,13 @@ _HEADS = (b"<kml", b":kml", b"opengis.net/kml", b"earth.google.com/kml")
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What is written beside the drawing."""
+    """Files to write beside the drawing."""
 
-    pictures: bool = parameter(False, "write the images of grids and pictures as files beside the KML")
+    pictures: bool = parameter(False, "also write the images of grids and imagery as files beside the KML")
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A file called .kml, or one whose root says so."""
+    """Detect a .kml file, or a file with a kml root element."""
     if is_archive(data):
         return False
     head = data[:4096]
@@ -43,7 +43,7 @@ def detect(name: str, data: bytes) -> bool:
 
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> list[str]:
-    """The images of our own overlays, which lie beside the drawing."""
+    """Return the images of our own overlays beside the drawing."""
     if b'"fleetmap"' not in data or b"<GroundOverlay" not in data:
         return []
     folder = main[: main.rfind("/") + 1]
@@ -52,7 +52,7 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> list[str]:
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The objects of a drawing, or the layers that we once wrote into it."""
+    """Read the objects of a drawing, or the layers that we wrote into it."""
     folder = context.main[: context.main.rfind("/") + 1]
     images = {n.removeprefix(folder): d for n, d in files.items() if n.startswith(folder) and n != context.main}
     layers, _ = read_kml(files[context.main], context, images)
@@ -60,9 +60,9 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """The drawings as they were uploaded, with everything else beside them in our own words."""
+    """Write the uploaded drawings unchanged, and all other content as placemarks of our own."""
     files = sum(len(p.files) for k, p in layers.parts_of("resources", name="kmz").items() if hasattr(p, "files"))
-    context.drop("resources", files, "images and further files of a drawing travel in KMZ only")
+    context.drop("resources", files, "only KMZ contains images and further files of a drawing")
     pictures = isinstance(context.options, WriteOptions) and context.options.pictures
     written = write_kml(layers, context, with_pictures=pictures, taken=frozenset())
     return {MAIN: written.kml, **written.pictures}

@@ -1,8 +1,8 @@
 """KMZ: a KML file with its images in a ZIP archive.
 
-The main document is the first entry whose name ends in ``.kml``, in the archive's own order, as the reference reader
-takes it; every other entry is kept byte for byte. Grids and pictures travel here as overlays
-with their images and come back as what they are.
+The main document is the first entry in the archive whose name ends in ``.kml``, as in the reference reader; every
+other entry is stored byte for byte. Grids and images are written as overlays with their images and are read back as
+grids and images.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RESOURCES = "kmz"
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A file called .kmz, or an archive under another name that begins with a KML file (a .zip is a folder)."""
+    """Detect a .kmz file, or an archive of another name that begins with a KML file (a .zip is a folder)."""
     lower = name.lower()
     if lower.endswith(".kmz"):
         return True
@@ -37,7 +37,7 @@ def _first_entry_name(data: bytes) -> bytes:
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The layers of the main document, and all other entries as resources."""
+    """Read the layers of the main document, and all other entries as resources."""
     entries = archive.unpack(files[context.main], context.limits)
     main = main_document_name(entries)
     companions = {name: body for name, body in entries.items() if name != main}
@@ -50,23 +50,23 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def main_document_name(entries: Files) -> str:
-    """The name of the main document. Raises UnreadableFile where there is none."""
+    """Return the name of the main document. Raises UnreadableFile if there is none."""
     main = next((name for name in entries if name.lower().endswith(".kml")), None)
     if main is None:
         names = ", ".join(sorted(entries)[:5]) or "nothing"
-        reason = f"the archive has no .kml entry (it holds {names}): a KMZ needs one, usually doc.kml"
+        reason = f"the archive has no .kml entry (it contains {names}): a KMZ needs one, usually doc.kml"
         raise UnreadableFile(reason, [Problem(reason)])
     return main
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """One archive: the main document first, then pictures and the entries that were uploaded, by name."""
+    """Write one archive: the main document first, then images and uploaded entries, by name."""
     extra_files: dict[str, bytes] = {}
     for part in layers.parts_of("resources", name=RESOURCES).values():
         if isinstance(part, Resources):
             for name, body in part.files.items():
                 if extra_files.setdefault(name, body) != body:
-                    context.drop("resources", 1, f"two levels bring another file called {name}")
+                    context.drop("resources", 1, f"two levels contain different files named {name}")
     written = write_kml(layers, context, with_pictures=True, taken=frozenset(extra_files))
     main = written.entry if written.entry and not name_problem(written.entry) else DOCUMENT
     stem, n = main.removesuffix(".kml"), 2

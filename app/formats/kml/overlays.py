@@ -1,4 +1,4 @@
-"""Grids and images as overlays on the ground, with their pictures."""
+"""Grids and images as ground overlays with image files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from app.syntax import decimals, images
 def write_overlays(
     layers: Layers, context: WriteContext, with_pictures: bool, taken: frozenset[str]
 ) -> tuple[list[str], dict[str, bytes]]:
-    """Each grid and picture as a GroundOverlay at its place, with all that its image does not say, and the images."""
+    """Write each grid and image as a GroundOverlay, with metadata that its image lacks, and the image files."""
     out: list[str] = []
     image_files: dict[str, bytes] = {}
     counts: Counter[str] = Counter()
@@ -46,7 +46,7 @@ def write_overlays(
         out.append(_overlay(key, part, name, corners))
         counts[key.layer] += 1
     for layer, count in sorted(counts.items() if not with_pictures else ()):
-        why = "their images travel in KMZ, or beside the KML with pictures=true; without them it tells where they lie"
+        why = "the images are in KMZ only, or beside the KML with pictures=true; this KML contains the positions only"
         context.drop(layer, count, why)
     return out, image_files if with_pictures else {}
 
@@ -54,8 +54,10 @@ def write_overlays(
 def _corners(
     key: PartKey, part: OccupancyGrid | GeoImage, layers: Layers, context: WriteContext
 ) -> NDArray[np.float64] | None:
-    """The lower left, lower right, upper right and upper left corner of an image, (longitude, latitude); None, with
-    the reason in the report, where KML has no place for it."""
+    """Return an image's lower left, lower right, upper right and upper left corner as (longitude, latitude).
+
+    None if KML cannot express the position; the reason is reported.
+    """
     if isinstance(part, OccupancyGrid):
         shape = np.array([shapely.polygons(part.corners())], object)
         local = Features((key.name,), shape, ({},), np.ones(1, bool))
@@ -68,16 +70,16 @@ def _corners(
         except Invalid as error:
             problem = error.detail
     elif layers.frame is None:
-        problem = "it lies in local metres, and there is no datum"
+        problem = "it is in local metres, and there is no datum"
     else:
         corners = layers.frame.to_wgs84(corners)
     if not problem and not (np.isfinite(corners).all() and (np.abs(corners) <= [180.0, 90.0]).all()):
         problem = "its corners are not on earth"
     if not problem and abs(corners[:, 1].mean()) > MAX_DATUM_LATITUDE:
-        problem = f"it lies beyond ±{MAX_DATUM_LATITUDE:g} degrees of latitude"
+        problem = f"it is beyond ±{MAX_DATUM_LATITUDE:g} degrees of latitude"
     if not problem and np.ptp(corners[:, 0]) > 180.0:
-        problem = "it crosses the antimeridian, and an overlay cannot"
-    context.drop(f"imagery {key.level}/{key.name}", int(bool(problem)), f"it cannot be placed: {problem}")
+        problem = "it crosses the antimeridian, which an overlay cannot"
+    context.drop(f"imagery {key.level}/{key.name}", int(bool(problem)), f"no position in KML: {problem}")
     return None if problem else corners
 
 
@@ -85,19 +87,19 @@ def _png(key: PartKey, part: OccupancyGrid | GeoImage, context: WriteContext) ->
     if isinstance(part, OccupancyGrid):
         return images.overlay_png(part)
     if not _is_displayable(part):
-        why = "an overlay's image has 8-bit grey or colours: bands, values and palettes beyond them are drawn as shown"
+        why = "an overlay's image has 8-bit grey or colours: other bands, values and palettes are written as displayed"
         context.drop(f"imagery {key.level}/{key.name}: pixel values", 1, why)
     return images.encode_png(display_pixels(part))
 
 
 def _is_displayable(picture: GeoImage) -> bool:
-    """Whether a PNG holds the picture's very pixels."""
+    """Whether a PNG stores the image's pixels without loss."""
     plain = picture.pixels.dtype == np.uint8 and picture.colours == DEFAULT_COLOURS.get(len(picture.colours))
     return plain and picture.nodata is None
 
 
 def _overlay(key: PartKey, part: OccupancyGrid | GeoImage, href: str, ring: NDArray[np.float64]) -> str:
-    """Where an image lies: a box and its rotation (exact to the box's own flatness), and the exact corners."""
+    """Return an image's position: a box and its rotation (assuming a flat box), and the exact corners."""
     longitude, latitude = ring.mean(axis=0).tolist()
     frame = local_frame(Datum(latitude, longitude))
     metres = frame.to_local(ring)

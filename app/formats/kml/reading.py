@@ -1,27 +1,27 @@
-"""What KML and KMZ share: reading KML into layers, and how its coordinates and our own words are spelled in it.
+"""Shared by KML and KMZ: read KML into layers; document how KML content and our own data are stored.
 
 Source: OGC KML 2.2/2.3 and Google's ``gx`` extension. Positions are longitude, latitude[, altitude]: degrees WGS 84,
 metres.
 
-**What is kept of a drawing.** A placemark or overlay is one object. ``properties.kml`` keeps where it stood and what
-the canonical words cannot say:
+**Stored data of a drawing.** A placemark or overlay is one object. ``properties.kml`` contains its place in the
+document and everything that canonical properties cannot express:
 
-``document``  key of the file it came from: ``Features.document["kml"]["documents"][key]`` has the rest of that file, of
-              which the key is made, not of the file's name: equal drawings are equal content
-``place``     its number in that file
-``xml``       the element as text, with slots instead of what the canonical words say: ``<?n?>`` the name, ``<?c?>`` a
-              list of coordinates, ``<?d NAME?>`` a plain value of its ExtendedData, which stands in ``properties``
-              under its own name (or under ``properties.kml.data``, where the name means something else here)
-``shape``     the geometry that the coordinate slots belong to; without it ``xml`` holds the geometry itself
+``document``  key of the source file: ``Features.document["kml"]["documents"][key]`` has the rest of that file. The key
+              is a hash of that rest, not the file's name: equal drawings are equal content
+``place``     its index in that file
+``xml``       the element as text, with slots for the canonical values: ``<?n?>`` the name, ``<?c?>`` a list of
+              coordinates, ``<?d NAME?>`` a plain value of its ExtendedData, which is in ``properties`` under its own
+              name (or under ``properties.kml.data`` if that name has a canonical meaning)
+``shape``     the geometry that the coordinate slots belong to; without it ``xml`` contains the geometry itself
 
-A document is ``{"xml": …}``: the file without its objects, ``<?items N?>`` where those from number N on stood, and
-``<?end?>`` where more can be added. Slots are processing instructions, which a reader never lets in, so no text of a
-file can pass for one.
+A document is ``{"xml": …}``: the file without its objects, with ``<?items N?>`` in place of the objects from index N
+on, and ``<?end?>`` where more can be added. Slots are processing instructions, which the reader rejects in files, so no
+text of a file can be mistaken for one.
 
-**Our own words.** Items of other layers and format families carry in their ExtendedData: ``layer``, ``id``, every
-property under its own name, ``level`` and ``part`` where they are not the usual ones, and ``local``: the exact metres
-of an item that is anchored in the local frame. Values are texts, or JSON where they are no texts. What such items have
-in common stands in the ExtendedData of their folder, marked by ``fleetmap``.
+**Our own data.** Items of other layers and format families have in their ExtendedData: ``layer``, ``id``, every
+property under its own name, ``level`` and ``part`` if they are not the default, and ``local``: the exact metres of an
+item that is anchored in the local frame. Values are texts, or JSON if they are not texts. Data shared by such items is
+in the ExtendedData of their folder, marked by ``fleetmap``.
 """
 
 from __future__ import annotations
@@ -69,15 +69,15 @@ from app.model.layers import VECTOR_LAYERS, Layers, Part, PartKey
 from app.syntax import images, xml
 
 DOCUMENT_KEY_DIGITS = 16
-"""Hexadecimal digits of a SHA-256 that serve as a drawing's key among the drawings of an environment."""
+"""Number of hexadecimal digits of a SHA-256 in a drawing's key within an environment."""
 
 MOVED = 1e-8
-"""Degrees (a millimetre): an item of ours whose drawn place differs more from its exact metres has been moved."""
+"""Distance in degrees (a millimetre) beyond which an item of ours counts as moved from its exact metres."""
 
 
 @dataclass(slots=True)
 class _OwnItems:
-    """Items of ours on their way back to one part."""
+    """Items of ours that are read back into one part."""
 
     ids: list[str] = field(default_factory=list)
     geometry: list[Any] = field(default_factory=list)
@@ -89,15 +89,15 @@ class _OwnItems:
 def read_kml(
     data: bytes, context: ReadContext, pictures: Mapping[str, bytes], entry: str | None = None
 ) -> tuple[Layers, set[str]]:
-    """KML -> layers, and the names of the pictures that became grids.
+    """Read KML into layers; also return the names of the images that became grids.
 
-    pictures: what relative references may mean (KMZ). entry: the name of this document inside its archive. Raises
+    pictures: targets of relative references (KMZ). entry: the name of this document inside its archive. Raises
     UnreadableFile with the line.
     """
     root = xml.parse(data, context.limits, remove_blank_text=True)
     if local_name(root) not in CONTAINERS | ITEMS:
         raise UnreadableFile(
-            f"the root element is <{local_name(root)}>: KML starts with <kml>",
+            f"the root element is <{local_name(root)}>: KML must start with <kml>",
             [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
         )
     xml.report_active_content(data, context.warn)
@@ -110,7 +110,7 @@ def read_kml(
 
 
 class _Reader:
-    """One file. Its documents (ours may hold several) are read one after the other into shared columns."""
+    """Reader of one file; its documents (ours may contain several) are read in turn into shared columns."""
 
     def __init__(self, context: ReadContext, pictures: Mapping[str, bytes]) -> None:
         self.context = context
@@ -125,7 +125,7 @@ class _Reader:
         self.credit: list[str] = []
 
     def read(self, root: etree._Element, entry: str | None) -> None:
-        """A document, and those that we have put inside it."""
+        """Read a document, and those embedded in it."""
         marks = self._marks(root)
         for element, values in marks:
             if values.get(OWN_ELEMENT) == "document" and element is not root and element.getparent() is not None:
@@ -136,7 +136,7 @@ class _Reader:
         self._read_document(root, None, entry, self.context.level, ours)
 
     def _marks(self, root: etree._Element) -> list[tuple[etree._Element, dict[str, str]]]:
-        """Containers that carry our mark, innermost last, with their words."""
+        """Return the containers with our mark, innermost last, and their values."""
         out = []
         for extended in root.iter("{*}ExtendedData"):
             parent = extended.getparent()
@@ -147,7 +147,7 @@ class _Reader:
         return out
 
     def _detach(self, element: etree._Element) -> None:
-        """Take a document of its own out of ours: it becomes a ``kml`` root again."""
+        """Extract an embedded document: it becomes a ``kml`` root again."""
         for added in (child(element, "ExtendedData"), child(element, "name")):
             if added is not None:
                 element.remove(added)
@@ -167,7 +167,7 @@ class _Reader:
         for schema in root.iter("{*}Schema"):
             if schema.get("parent"):
                 noun = f"<{schema.get('name', '')[:80]}> elements, placemarks of KML's oldest Schema form,"
-                self.context.warn(f"{noun} are kept but not read as objects", line=schema.sourceline)
+                self.context.warn(f"{noun} are stored but not read as objects", line=schema.sourceline)
         parsed = self._sequences(items)
         _check_places(items, parsed)
         own_items, other_items = [], []
@@ -182,14 +182,14 @@ class _Reader:
         if (other_items or not all_own) and self.context.wants("objects"):
             self._take_drawing(root, other_items, parsed, name, entry, level)
 
-    # --- our own words ---
+    # --- our own data ---
 
     def _key(self, values: Mapping[str, str], layer: str) -> PartKey:
         part = values.get("part") or DEFAULT_PART[layer] or FAMILY
         return PartKey(layer, values.get("level") or self.context.level, part)  # type: ignore[arg-type]
 
     def _take_own_items(self, own_items: Sequence[tuple[Item, dict[str, str]]], parsed: Sequences) -> None:
-        """Items of ours go back to their parts."""
+        """Read items of ours back into their parts."""
         geometry = item_geometries([item for item, _ in own_items], parsed)
         metres = parse_metres([values.get("local") for _, values in own_items], [item.element for item, _ in own_items])
         for (item, values), drawn, exact in zip(own_items, geometry, metres, strict=True):
@@ -224,21 +224,21 @@ class _Reader:
         names = ("latitude", "longitude", "altitude", "heading")
         numbers = {n: properties[n] for n in names if isinstance(properties.get(n), int | float)}
         if "latitude" not in numbers or "longitude" not in numbers:
-            reason = "the datum has no latitude and longitude"
+            reason = "the datum lacks latitude and longitude"
             raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
         self.datum = Datum(**numbers)
 
     def _take_raster(self, element: etree._Element, values: Mapping[str, str], title: str) -> None:
-        """A grid or a picture of ours, where its image travels with the drawing."""
+        """Read a grid or an image of ours whose image file came with the drawing."""
         icon = child(element, "Icon")
         href = "" if icon is None else child_text(icon, "href")
         layer = values["layer"]
         label = values.get("part") or title or DEFAULT_PART[layer]
-        noun = "grid" if layer == "occupancy" else "picture"
+        noun = "grid" if layer == "occupancy" else "image"
         data = self.pictures.get(href)
         if data is None:
             self.context.warn(
-                f"its image {href!r} is not in the upload, so the {noun} is left out: upload the KMZ, or both files",
+                f"image {href!r} is not in the upload; the {noun} is skipped: upload the KMZ, or both files",
                 line=element.sourceline,
                 where=label,
             )
@@ -249,14 +249,14 @@ class _Reader:
         try:
             self.rasters[self._key(values, layer)] = read(data, href, parameters)
         except (KeyError, TypeError) as error:
-            reason = f"the {noun} {label} lacks what places it: {error}"
+            reason = f"the {noun} {label} lacks its georeference: {error}"
             raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)]) from error
 
     def _grid(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> OccupancyGrid:
-        """A grid: the image's palette index is the cell."""
+        """Build a grid: the palette index of a pixel is the cell value."""
         image = images.read_image(data, self.context.limits)
         if image.mode != "P":
-            raise UnreadableFile(f"{href} is no longer the picture of a grid: its colours have changed")
+            raise UnreadableFile(f"{href} no longer shows a grid: its colours have changed")
         properties = parameters.get("properties")
         return OccupancyGrid(
             np.ascontiguousarray(np.asarray(image, np.uint8)[::-1]),
@@ -270,10 +270,10 @@ class _Reader:
         )
 
     def _picture(self, data: bytes, href: str, parameters: Mapping[str, Any]) -> GeoImage:
-        """A picture: its pixels, and the exact place that its overlay has in our words."""
+        """Build an image: its pixels, and the exact georeference in our own data."""
         image = images.read_image(data, self.context.limits)
         if image.mode not in ("L", "LA", "RGB", "RGBA"):
-            raise UnreadableFile(f"{href} is no longer the picture that was written: its colours have changed")
+            raise UnreadableFile(f"{href} is not the image that was written: its colours have changed")
         pixels = np.asarray(image, np.uint8).reshape(image.height, image.width, -1)
         a, b, c, d, e, f = (float(v) for v in parameters["transform"])
         properties = parameters.get("properties")
@@ -281,7 +281,7 @@ class _Reader:
         return GeoImage(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(parameters["crs"]), picture_properties)
 
     def _remove_ours(self, root: etree._Element, ours: list[tuple[etree._Element, dict[str, str]]]) -> bool:
-        """Take out our folders and styles; True where nothing of anybody else is left in the file."""
+        """Remove our folders and styles; return True if nothing else is left in the file."""
         for element, values in reversed(ours):
             for extended in element.findall("{*}ExtendedData")[:1]:
                 element.remove(extended)
@@ -311,7 +311,7 @@ class _Reader:
     # --- drawings ---
 
     def _sequences(self, items: Sequence[Item]) -> Sequences:
-        """Find the lists of coordinates of all items with a plain structure, and read them at once."""
+        """Find the coordinate lists of all items of regular structure, and parse them at once."""
         texts: list[str] = []
         for item in items:
             if len(item.geometries) != 1 or local_name(item.element) == "GroundOverlay":
@@ -332,7 +332,7 @@ class _Reader:
         full = count > 0
         ends = parsed.points[parsed.start[1:][full] - 1]
         closed[full] = (parsed.points[parsed.start[:-1][full]] == ends).all(axis=1)
-        # A ring that is "there and back" already in four points would be taken for one of three (see _there_and_back).
+        # A ring of four points that is "there and back" would be confused with a padded one (see _there_and_back).
         four = np.flatnonzero(count == 4)
         second = parsed.points[parsed.start[four] + 1]
         closed[four[(second == parsed.points[parsed.start[four] + 2]).all(axis=1)]] = False
@@ -347,8 +347,8 @@ class _Reader:
                 strange.append(item.element)
         if strange:
             self.context.warn(
-                f"{len(strange)} geometries have coordinates that are not plain tuples, open rings or too few points; "
-                "they are read as Google Earth does and kept as they are",
+                f"{len(strange)} geometries have irregular coordinates, open rings or too few points; they are "
+                "read as Google Earth does and stored unchanged",
                 line=strange[0].sourceline,
                 where=child_text(strange[0], "name")[:200] or None,
             )
@@ -364,7 +364,7 @@ class _Reader:
         entry: str | None,
         level: str,
     ) -> None:
-        """Somebody's drawing: its items become objects, the rest of it the document. name: its key, if it has one."""
+        """Read a drawing: its items become objects, the rest of it the document. name: its key, if it has one."""
         geometry = item_geometries(items, parsed)
         ids, titles = _identify(items, self.context)
         properties: list[dict[str, Any]] = []
@@ -413,7 +413,7 @@ class _Reader:
         return Layers(parts, self.datum, levels or (Level(self.context.level),))
 
     def _with_credits(self, parts: dict[PartKey, Part]) -> dict[PartKey, Part]:
-        """Our map's description tells the licences and credits of all its parts; some parts tell their own besides."""
+        """Add those credits of our map's description to every part that no part's own document states."""
         stated = {
             k: texts if isinstance(texts := p.document.get("attribution"), list) else []
             for k, p in parts.items()
@@ -428,14 +428,12 @@ class _Reader:
         return out
 
     def _read_own_part(self, key: PartKey, part_items: _OwnItems) -> Features:
-        """Items of ours as they were: the exact metres where they were local, unless somebody has moved them."""
+        """Restore items of ours: exact metres if they were local, unless they have been moved."""
         n = len(part_items.ids)
         ids = unique_ids(part_items.ids)
         if ids != part_items.ids:
             repeats = [i for i, c in Counter(part_items.ids).items() if c > 1]
-            self.context.warn(
-                f"{len(repeats)} ids of {key.layer} are used twice: later ones got #2, #3 …", where=repeats[0]
-            )
+            self.context.warn(f"{len(repeats)} duplicate ids of {key.layer}; later ones got #2, #3 …", where=repeats[0])
         geometry = np.empty(n, object)
         geometry[:] = part_items.geometry
         local = np.array([m is not None for m in part_items.local], bool)
@@ -447,7 +445,7 @@ class _Reader:
         return Features(tuple(ids), geometry, tuple(part_items.properties), local, part_items.document)
 
     def _restore_metres(self, drawn: NDArray[np.object_], metres: NDArray[np.object_]) -> NDArray[np.object_]:
-        """The exact metres, or what was drawn since, brought to metres."""
+        """Return the exact metres; for items that were moved, the drawn position converted to metres."""
         if self.datum is None:
             return metres
         frame: LocalFrame = local_frame(self.datum)
@@ -458,13 +456,14 @@ class _Reader:
         out = metres.copy()
         out[moved] = frame.geometries_to_local(drawn[moved])
         self.context.warn(
-            f"{int(moved.sum())} items were moved in the drawing: their new places count, not their metres"
+            f"{int(moved.sum())} items were moved in the drawing; their new positions are used instead of the "
+            "exact metres"
         )
         return out
 
 
 _KINDS = ("poi", "path", "path", "region", "poi", "path", "region", "")
-"""Kind of an object by its geometry's type number; a collection is judged by what is in it."""
+"""Return an object's kind by its geometry's type number; a collection is judged by its contents."""
 
 
 def _mixed_type(geometry: Any) -> str:
@@ -473,7 +472,7 @@ def _mixed_type(geometry: Any) -> str:
 
 
 def _concatenate(a: Features, b: Features) -> Features:
-    """Objects that were drawn and objects that we had written, in one part."""
+    """Merge drawn objects and objects written by us into one part."""
     ids = unique_ids([*a.ids, *b.ids])
     return Features(
         tuple(ids),
@@ -485,7 +484,7 @@ def _concatenate(a: Features, b: Features) -> Features:
 
 
 def _check_places(items: Sequence[Item], parsed: Sequences) -> None:
-    """Refuse coordinates that are not on earth, with the line of their geometry."""
+    """Reject coordinates that are not on earth, with the line of their geometry."""
     points = parsed.points
     valid = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0) & (np.abs(points[:, 2]) <= MAX_METRES)
     if valid.all():
@@ -499,7 +498,7 @@ def _check_places(items: Sequence[Item], parsed: Sequences) -> None:
 
 
 def _identify(items: Sequence[Item], context: ReadContext) -> tuple[list[str], list[tuple[etree._Element, str] | None]]:
-    """Ids (the id attribute where it is the only one of its kind, else the name) and (element, text) of the names."""
+    """Return ids (the id attribute if unique, else the name) and (element, text) of the names."""
     attributes = [
         e.get("id") or next((v for a, v in xml.attributes(e).items() if a.endswith("}id")), "") if e.attrib else ""
         for e in (item.element for item in items)
@@ -518,5 +517,5 @@ def _identify(items: Sequence[Item], context: ReadContext) -> tuple[list[str], l
     repeats = [n for n, c in Counter(t[1] for t in titles if t and t[1]).items() if c > 1]
     if repeats:
         suffix = f" and {len(repeats) - 1} more" if len(repeats) > 1 else ""
-        context.warn(f"several placemarks are called {repeats[0]!r}{suffix}; all are kept", where=repeats[0][:200])
+        context.warn(f"several placemarks have the name {repeats[0]!r}{suffix}; all are stored", where=repeats[0][:200])
     return ids, titles

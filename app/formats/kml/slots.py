@@ -1,4 +1,4 @@
-"""Elements kept as texts, with slots where their names and coordinates were."""
+"""Store elements as texts, with slots in place of names and coordinates."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from app.errors import Problem, UnreadableFile
 from app.formats.kml.items import Item
 from app.formats.kml.words import CONTAINERS, COORDINATES, END, FAMILY, ITEMS, NAME, local_name
 
-# Marks that stand for slots while libxml2 holds the tree: four C1 controls in a row, which no text has, not even UTF-8
-# misread as Latin-1 (and such characters keep a Python text at one byte a character). A file that has them is refused.
+# Stand-ins for slots while libxml2 holds the tree: four C1 controls in a row, which occur in no text, not even in UTF-8
+# misread as Latin-1 (and they keep a Python text at one byte per character). A file that contains them is rejected.
 _MARK = "\x91\x9c\x82"
 _M_ITEM, _M_COORDINATES, _M_NAME, _M_OPEN, _M_CLOSE, _M_END = (_MARK + chr(0x86 + k) for k in range(6))
 _SLOTS = {
@@ -29,7 +29,7 @@ def keep_element_text(
     titles: Sequence[etree._Element | None],
     properties: Sequence[dict[str, Any]],
 ) -> str:
-    """Put each item's element as text, with slots, into its properties; the rest of the document is the answer."""
+    """Store each item's element as text with slots in its properties; return the rest of the document."""
     names = values = coordinates = 0
     for item, title, item_properties in zip(items, titles, properties, strict=True):
         if title is not None:
@@ -48,7 +48,7 @@ def keep_element_text(
     marks = (_M_ITEM, _M_NAME, _M_COORDINATES, _M_OPEN, _M_CLOSE)
     expected = [len(items) + sum(begins), names, coordinates, values, values]
     if [counts.pop(m[-1], 0) for m in marks] != expected or counts.pop(_M_END[-1], 0) > 1 or counts:
-        reason = "the file has runs of control characters (U+0091 U+009C U+0082 …) that serve as marks here"
+        reason = "the file contains control characters that are reserved here (U+0091 U+009C U+0082 …): remove them"
         raise UnreadableFile(reason, [Problem(reason)])
     skeleton = []
     for k, (item_properties, first) in enumerate(zip(properties, begins, strict=True)):
@@ -59,7 +59,7 @@ def keep_element_text(
 
 
 def _cut_into_slots(text: str) -> tuple[Iterator[str], Counter[str]]:
-    """The text cut at its item marks, with slots for its other marks, and how many there are of each."""
+    """Cut the text at its item marks, replace other marks by slots, and count the marks of each item."""
     first, *chunks = text.split(_MARK)
     pieces: list[str] = []
     current = [first]
@@ -77,8 +77,9 @@ def _cut_into_slots(text: str) -> tuple[Iterator[str], Counter[str]]:
 
 
 def _serialise(root: etree._Element, items: Sequence[etree._Element]) -> tuple[str, list[bool]]:
-    """The tree as text with a mark behind each item, before each that follows no other item directly (True in the
-    list), and where more can be added.
+    """Serialise the tree with a mark behind each item, and where more can be added.
+
+    A mark also precedes each item that does not directly follow another one (True in the list).
     """
     top = [c for c in root if local_name(c) in CONTAINERS | ITEMS]
     if local_name(root) == "kml" and len(top) == 1 and local_name(top[0]) in CONTAINERS:

@@ -20,19 +20,23 @@ KML = "http://www.opengis.net/kml/2.2"
 GX = "http://www.google.com/kml/ext/2.2"
 
 SAME_PLACE = 1e-10
-"""Degrees: a geometry that differs less from what the kept element says has not been edited (coordinates are printed
-to 1e-12)."""
+"""Tolerance in degrees between a geometry and its stored element; a larger difference is an edit.
+
+Coordinates are printed to 1e-12.
+"""
 
 
 def data_element(name: str, value: Any) -> str:
-    """A value of ExtendedData."""
+    """Write a value of ExtendedData."""
     return f'<Data name="{quote_attribute(name)}"><value>{spell(value)}</value></Data>'
 
 
 @dataclass(frozen=True, slots=True)
 class CoordinateTexts:
-    """The coordinate lists of n geometries as text: those of geometry k are texts[start[k]:start[k + 1]], in the order
-    of its parts and rings; shape[k] is the geometry in the letters of ``reading``.
+    """Coordinate lists of n geometries as text.
+
+    Those of geometry k are texts[start[k]:start[k + 1]], in the order of its parts and rings; shape[k] is the geometry
+    in the codes of ``reading``.
     """
 
     texts: list[str]
@@ -40,7 +44,7 @@ class CoordinateTexts:
     shape: list[str]
 
     def texts_of(self, k: int) -> list[str]:
-        """Those of geometry k."""
+        """Return the lists of geometry k."""
         return self.texts[self.start[k] : self.start[k + 1]]
 
 
@@ -50,8 +54,10 @@ _LETTERS = {0: "P", 1: "L", 2: "L"}
 def coordinate_texts(
     geometry: NDArray[np.object_], digits: int, form: Callable[..., str], glue: str, *, thin: bool = False
 ) -> CoordinateTexts:
-    """All coordinates as text at once. form: joins the numbers of one position; glue: stands between positions. thin:
-    rings that were drawn as three points get back to three.
+    """Write all coordinates as text at once.
+
+    form: joins the numbers of one position; glue: separates positions. thin: rings drawn as three points are written as
+    three again.
     """
     parts, owner = shapely.get_parts(geometry, return_index=True)
     while len(parts) and (shapely.get_type_id(parts) > 3).any():
@@ -103,17 +109,17 @@ def _comma(*numbers: str) -> str:
 
 
 def bracket(*numbers: str) -> str:
-    """A position as JSON."""
+    """Write a position as JSON."""
     return f"[{','.join(numbers)}]"
 
 
 def degree_texts(geometry: NDArray[np.object_], *, thin: bool = False) -> CoordinateTexts:
-    """Coordinates in degrees as KML lists them."""
+    """Write coordinates in degrees as KML lists them."""
     return coordinate_texts(geometry, decimals.DEGREES, _comma, " ", thin=thin)
 
 
 def geometry_element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
-    """A geometry as KML; its coordinate lists come from ``lists``."""
+    """Write a geometry as KML; its coordinate lists come from ``lists``."""
     kind = geometry.geom_type
     if geometry.is_empty:
         return ""
@@ -133,7 +139,7 @@ def geometry_element(geometry: Any, lists: Iterator[str], extra: str = "") -> st
 
 
 def place_members(key: PartKey) -> str:
-    """Where an item belongs, as far as it is not what a reader takes for granted."""
+    """Return an item's level and part, as far as they are not the reader's defaults."""
     data = data_element("layer", key.layer)
     if key.level != GROUND:
         data += data_element("level", key.level)

@@ -1,4 +1,4 @@
-"""The elements of KML, and the values that they may have."""
+"""The elements of KML, and their allowed values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from app.formats.kml.words import child_text, local_name
 from app.model.frame import MAX_METRES
 
 FREE = frozenset({"ExtendedData", "Metadata"})
-"""Elements in which anything may stand."""
+"""Elements with arbitrary content."""
 
 _NAMES = """
     address Alias altitude altitudeMode altitudeOffset angles AnimatedUpdate antialias BalloonStyle
@@ -62,14 +62,14 @@ _VALUES: Mapping[str, Number | OneOf] = {
         ("clampToGround", "relativeToGround", "absolute", "clampToSeaFloor", "relativeToSeaFloor"),
     ),
 }
-"""Plain values of KML, by element: places are refused if they are out of range, views and styles are doubtful.
+"""Rules for plain values of KML, by element: positions out of range are rejected, doubtful views and styles reported.
 
 Source: OGC KML 2.3, Google's gx extension.
 """
 
 
 def check_values(root: etree._Element, context: ReadContext) -> None:
-    """Refuse places that are out of range, with the line; report doubtful values, once for each element."""
+    """Reject positions that are out of range, with the line; report doubtful values, once for each element."""
     doubts: dict[str, list[Any]] = {}
     for name, rule in _VALUES.items():
         for element in root.iter("{*}" + name):
@@ -94,8 +94,10 @@ def check_values(root: etree._Element, context: ReadContext) -> None:
 
 
 def parse_metres(texts: Sequence[str | None], elements: Sequence[etree._Element]) -> list[Any]:
-    """The exact coordinates of local items (None: not local): nested JSON lists, of a point, a line or an area, or a
-    GeoJSON geometry. Points and lines are made all at once.
+    """Parse the exact coordinates of local items (None: not local).
+
+    They are nested JSON lists of a point, a line or an area, or a GeoJSON geometry. Points and lines are built all at
+    once.
     """
     out: list[Any] = [None] * len(texts)
     points: list[tuple[int, Any]] = []
@@ -134,5 +136,5 @@ def parse_metres(texts: Sequence[str | None], elements: Sequence[etree._Element]
 
 
 def _no_metres(element: etree._Element) -> UnreadableFile:
-    reason = "the local coordinates of an item are not [x, y], a list of them, or a GeoJSON geometry"
+    reason = "the local coordinates of an item must be [x, y], a list of them, or a GeoJSON geometry"
     return UnreadableFile(reason, [Problem(reason, line=element.sourceline)])

@@ -1,4 +1,4 @@
-"""The names of KML that reader and writer share, and values as texts."""
+"""Names in KML that reader and writer share, and values as texts."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ DEFAULT_PART: Mapping[str, str] = {
     **{"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": "", "imagery": "satellite"}
 }
 OWN_KEYS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", OWN_ELEMENT})
-"""Names in ExtendedData that place an item; a property of such a name travels in ``more``."""
+"""Names in ExtendedData that locate an item; a property of such a name is stored in ``more``."""
 
 PLACE_KEYS = frozenset({"layer", "level", "part", "id"})
-"""Those whose values are names."""
+"""Those of them whose values are names."""
 
 _CANONICAL = OWN_KEYS | {
     *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
@@ -41,7 +41,7 @@ _CANONICAL = OWN_KEYS | {
 
 @cache
 def reserved_names() -> frozenset[str]:
-    """Property names that mean something to us: a drawing's own value of that name stays under ``kml.data``."""
+    """Property names with a canonical meaning: a drawing's own value of that name is stored under ``kml.data``."""
     return _CANONICAL | all_formats().keys()
 
 
@@ -50,42 +50,42 @@ SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
 
 
 def local_name(element: etree._Element) -> str:
-    """The tag without its namespace."""
+    """Return the tag without its namespace."""
     tag: str = element.tag
     return tag.rpartition("}")[2]
 
 
 def child(element: etree._Element, name: str) -> etree._Element | None:
-    """The first child of this name, in any namespace: KML is found in five of them, and without one."""
+    """Return the first child of this name, in any namespace: files use five, or none."""
     return next(element.iterchildren("{*}" + name), None)
 
 
 def child_text(element: etree._Element, name: str) -> str:
-    """The stripped text of the first child of this name, else an empty text."""
+    """Return the stripped text of the first child of this name, else an empty text."""
     match = child(element, name)
     return "" if match is None else (match.text or "").strip()
 
 
 _ILLEGAL = "\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff"
 ILLEGAL = re.compile(f"[{_ILLEGAL}]")
-"""Characters that XML 1.0 cannot hold."""
+"""Characters that XML 1.0 cannot contain."""
 
 _PLAIN = re.compile(rf"(?!(?:true|false|null)\Z)[^\s\-0-9{{\[\"{_ILLEGAL}][^{_ILLEGAL}]*\Z")
 _ESCAPES = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "\r": "&#13;"})
 
 
 def escape(text: str) -> str:
-    """A text for XML content and (with ``quote_attribute``) attributes; what XML cannot hold becomes U+FFFD."""
+    """Escape a text for XML content; characters that XML cannot contain become U+FFFD. See ``quote_attribute``."""
     return ILLEGAL.sub("\ufffd", text).translate(_ESCAPES)
 
 
 def quote_attribute(text: str) -> str:
-    """A text for an attribute in double quotes."""
+    """Escape a text for an attribute in double quotes."""
     return escape(text).replace('"', "&quot;").replace("\n", "&#10;").replace("\t", "&#9;")
 
 
 def spell(value: Any) -> str:
-    """A property's value as an escaped text: texts as they are where that is unmistakable, all else as JSON."""
+    """Write a property's value as an escaped text: unambiguous texts unchanged, everything else as JSON."""
     if isinstance(value, str):
         if _PLAIN.match(value):
             return value.translate(_ESCAPES)
@@ -97,7 +97,7 @@ def spell(value: Any) -> str:
 
 
 def unspell(text: str) -> Any:
-    """The value that ``spell`` wrote; a text that is no JSON stays one."""
+    """Parse a value that ``spell`` wrote; a text that is not JSON is returned unchanged."""
     if text[:1] in _JSON_STARTS or text in ("true", "false", "null"):
         try:
             return orjson.loads(text)

@@ -1,4 +1,4 @@
-"""Writing KML: the drawings that were uploaded as they were, and everything else in our own words (see ``reading``)."""
+"""Write KML: uploaded drawings unchanged, all other content as placemarks of our own (see ``reading``)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ NEEDS = LayerRequirements(
     ),
     anchor="wgs84",
 )
-"""What ``write_kml`` can draw: any of these layers."""
+"""Alternatives of layers that ``write_kml`` can draw."""
 
 _COLOURS = {
     "node": "<IconStyle><color>ff00a5ff</color><scale>0.6</scale><Icon><href>"
@@ -58,12 +58,12 @@ _COLOURS = {
     "object": "<LineStyle><color>ffb0b0b0</color><width>2</width></LineStyle>"
     "<PolyStyle><color>60b0b0b0</color></PolyStyle>",
 }
-"""Our styles, by what they are for; colours are aabbggrr."""
+"""Our styles, by use; colours are aabbggrr."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenKml:
-    """A KML file, the pictures that it refers to, and the name its one source had inside an archive, if any."""
+    """A KML file, the images that it refers to, and the name of its only source inside an archive, if any."""
 
     kml: bytes
     pictures: dict[str, bytes]
@@ -71,7 +71,7 @@ class WrittenKml:
 
 
 def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, taken: frozenset[str]) -> WrittenKml:
-    """All vector layers and the places of grids. with_pictures: grids' pictures are made too; taken: names in use."""
+    """Write all vector layers and the positions of grids. with_pictures: also image files; taken: names in use."""
     frame = layers.frame
     documents: list[Document] = []
     folders: list[str] = []
@@ -90,16 +90,16 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
         if remainder is not None:
             folders.append(_folder(key, remainder, layers, frame, shared))
     overlays, pictures = write_overlays(layers, context, with_pictures, taken)
-    # A drawing that is all there is comes back as it was: the datum stands beside what is ours, not inside it.
+    # A single uploaded drawing is written unchanged: the datum is written only with our own content.
     datum = [_datum(layers)] if folders or overlays or not documents else []
     ours = "".join([*datum, *folders, *overlays])
-    context.drop("voxels", len(layers.parts_of("voxels")), "KML has no place for it")
+    context.drop("voxels", len(layers.parts_of("voxels")), "KML cannot express it")
     entry = documents[0].entry if len(documents) == 1 else None
     return WrittenKml((HEAD + _file(documents, ours, context)).encode(), pictures, entry)
 
 
 def _file(documents: list[Document], ours: str, context: WriteContext) -> str:
-    """Drawings and our own folders as one document, in the simplest way that keeps all of it."""
+    """Combine drawings and our own folders into one document, in the simplest lossless form."""
     if len(documents) == 1:
         only = documents[0].xml
         if not ours and all(escape(text) in only for text in context.attribution):
@@ -112,7 +112,7 @@ def _file(documents: list[Document], ours: str, context: WriteContext) -> str:
 
 
 def _map(ours: str, context: WriteContext, documents: list[str]) -> str:
-    """Our own Document: its styles, what we tell in our words, and the documents of others."""
+    """Write our own Document: its styles, our own data, and embedded documents."""
     credit = escape("\n".join(context.attribution))
     styles = "".join(f'<Style id="{STYLE}{n}">{s}</Style>' for n, s in _COLOURS.items() if f"#{STYLE}{n}<" in ours)
     return "".join(
@@ -129,7 +129,7 @@ def _map(ours: str, context: WriteContext, documents: list[str]) -> str:
 
 
 def _drop_drawing(part: Features, drawn: set[str]) -> Features | None:
-    """A network without what was made from a drawing that is written too; None where nothing else is in it."""
+    """Return a network without the part derived from a drawing that is also written; None if nothing else is in it."""
     mask = [isinstance(i := p.get("drawn_from"), str) and i in drawn for p in part.properties]
     if not any(mask):
         return part
@@ -137,7 +137,7 @@ def _drop_drawing(part: Features, drawn: set[str]) -> Features | None:
 
 
 def _datum(layers: Layers) -> str:
-    """The environment's datum as a placemark; the numbers that count stand in its ExtendedData."""
+    """Write the environment's datum as a placemark; its exact numbers are in its ExtendedData."""
     datum = layers.datum
     if datum is None:
         return ""
@@ -150,13 +150,13 @@ def _datum(layers: Layers) -> str:
 
 
 def _attribution_texts(part: Features) -> list[str]:
-    """The licences and credits that a part's own document tells."""
+    """Return the licences and credits in a part's own document."""
     attribution = part.document.get("attribution")
     return [text for text in attribution if isinstance(text, str)] if isinstance(attribution, list) else []
 
 
 def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None, shared: Sequence[str] = ()) -> str:
-    """A part in our own words. shared: credits that no part's document tells."""
+    """Write a part with our own data. shared: credits that are in no part's document."""
     data = [data_element(OWN_ELEMENT, "part"), place_members(key)]
     elevation = layers.elevation(key.level)
     if elevation:
@@ -177,7 +177,7 @@ def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | No
 
 
 def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Iterator[str]:
-    """Every item of a part as a placemark that says all we know of it."""
+    """Write every item of a part as a placemark with all its properties."""
     geometry = part.in_wgs84(frame)
     texts = degree_texts(geometry)
     exact = _local_texts(part)
@@ -225,7 +225,7 @@ def _style(layer: Layer, properties: Properties) -> str:
 
 
 def _local_texts(part: Features) -> list[str]:
-    """The exact metres of local items as JSON, an empty text for the others."""
+    """Write the exact metres of local items as JSON, an empty text for the others."""
     out = [""] * len(part)
     indices = np.flatnonzero(part.local)
     if not len(indices):

@@ -1,4 +1,4 @@
-"""The file that is written: its points, ways and relations, and their ids."""
+"""File content that is being written: points, ways and relations, and their ids."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from app.syntax.decimals import number
 
 @dataclass(slots=True)
 class Point:
-    """A point that is written. at: (lon, lat) as its source said them where the file says metres too, else None."""
+    """A point to write. at: (lon, lat) of the source if the file also has metres, else None."""
 
     xyz: tuple[float, float, float]
     local: bool
@@ -35,7 +35,7 @@ class Point:
 
 @dataclass(slots=True)
 class Level:
-    """How the elements of one level are called in the file: stored id -> id."""
+    """Ids of one level's elements in the file: stored id -> id."""
 
     nodes: dict[int, int] = field(default_factory=dict)
     ways: dict[int, int] = field(default_factory=dict)
@@ -43,10 +43,11 @@ class Level:
 
 
 class Document:
-    """What is written: points, ways and relations by their ids in the file, and what is lost on the way.
+    """File content that is being written: points, ways and relations by their ids in the file, and the losses.
 
-    levels: how stored elements are called here. explained: of each network, the items that stored lanelets stand for.
-    moved: those that no longer lie where the lanelets do. metric: stored places are metres of another frame.
+    levels: ids of stored elements in the file. explained: for each network, the items that stored lanelets represent.
+    moved: those of them that are no longer at the lanelets' position. metric: stored positions are metres of another
+    frame.
     """
 
     def __init__(self, layers: Layers, context: WriteContext) -> None:
@@ -69,13 +70,13 @@ class Document:
         self.taken = {k[1] for part in own_parts for i in part.ids if (k := element_id(i))}
         self.taken.update(chain.from_iterable(integers(source_members.get("refs")) or () for source_members in rows))
         self.counter = 0
-        # In a map whose metres are another frame's, new points say only where on earth they are.
+        # In a map with metres of another frame, new points have a position on earth only.
         self.say_metres = self.metric or not any(
             LOCAL[0] in as_texts(t) for source_members in rows for t in _iterate_tags(source_members)
         )
 
     def next_id(self) -> int:
-        """A new id; points, ways and relations share one row of numbers."""
+        """Return a new id; points, ways and relations share one sequence of numbers."""
         self.counter += 1
         while self.counter in self.taken:
             self.counter += 1
@@ -83,12 +84,12 @@ class Document:
         return self.counter
 
     def unknown(self, kind: str, number: int, source_members: Mapping[str, Any]) -> None:
-        """Keep the elements inside an element that OSM does not know."""
+        """Store the elements inside an element that OSM does not define."""
         if source_members.get("children"):
             self.children[kind, number] = source_members["children"]
 
     def to_anchor(self, x: float, y: float, z: float | None, local: bool) -> tuple[float, float, float]:
-        """A place in metres in the coordinates that a point is anchored in."""
+        """Convert a position in metres to the anchor of a point."""
         high = math.nan if z is None else z
         if local or self.layers.frame is None:
             return x, y, high
@@ -96,7 +97,7 @@ class Document:
         return lon, lat, high
 
     def add_point(self, x: float, y: float, z: float, tags: Mapping[str, str] = NO_ATTRIBUTES) -> int:
-        """A new point at a place in metres; its id."""
+        """Add a point at a position in metres and return its id."""
         new = self.next_id()
         point_tags = dict(tags)
         if self.say_metres:
@@ -107,7 +108,7 @@ class Document:
         return new
 
     def point_in_metres(self, point: Point) -> tuple[float, float] | None:
-        """[x, y], or None where the point has no place in metres."""
+        """Return [x, y], or None if the point has no position in metres."""
         if point.local:
             return point.xyz[:2]
         if self.layers.frame is None or math.isnan(point.xyz[0]):
@@ -116,19 +117,19 @@ class Document:
         return x, y
 
     def text(self) -> bytes:
-        """The file. The document is empty afterwards."""
+        """Return the file. The document is empty afterwards."""
         nodes = self._nodes_in_degrees()
         return xml_text.document(self._head(), nodes, self.ways, self.relations, self.children)
 
     def _nodes_in_degrees(self) -> dict[int, xml_text.Node]:
-        """All points in degrees with their tags."""
+        """Return all points in degrees with their tags."""
         todo = [i for i, p in self.points.items() if p.local and not (self.metric or math.isnan(p.xyz[0]))]
         degrees: dict[int, tuple[float, float]] = {}
         if todo and self.layers.frame is not None:
             places = self.layers.frame.to_wgs84(np.array([self.points[i].xyz[:2] for i in todo], np.float64))
             degrees = {i: (x, y) for i, (x, y) in zip(todo, places.tolist(), strict=True)}
         out = {}
-        while self.points:  # each point makes room for its node: there may be millions
+        while self.points:  # frees each point before the next: there may be millions
             i, point = self.points.popitem()
             if not point.local:
                 lon, lat = point.xyz[:2]
@@ -138,7 +139,7 @@ class Document:
         return out
 
     def _tags(self, point: Point) -> Mapping[str, str]:
-        """The tags as they were said, but for places that are no longer true."""
+        """Return the stored tags, updated to the current position."""
         tags = point.tags
         if not point.stored:
             return tags
@@ -169,13 +170,13 @@ class Document:
 
 
 def _iterate_tags(source_members: Mapping[str, Any]) -> Iterable[Any]:
-    """The tags of a stored point or of a way's bends."""
+    """Return the tags of a stored point or of a way's bends."""
     bends = source_members.get("vertices")
     rows = bends if isinstance(bends, list) else [bends]
     return [source_members.get("tags"), *(row.get("tags") for row in rows if isinstance(row, Mapping))]
 
 
 def is_same_place(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
-    """The same place; a line without elevations says nothing of them."""
+    """Whether two positions are equal; a missing elevation is equal to any."""
     high = math.isnan(a[2]) or math.isnan(b[2]) or a[2] == b[2]
     return a[0] == b[0] and a[1] == b[1] and high

@@ -1,7 +1,7 @@
-"""Lanes as pairs of bounds: which way bounds run, the middle between them, and bounds beside a middle.
+"""Lanes as pairs of bounds: direction of bounds, the middle line between them, and bounds beside a middle line.
 
-Flat arrays: n lines are one array of places in a table of points, and where each begins (``LineSet``). Directions
-follow Lanelet2: looking along a lane, the left bound is on the left, and both run along it.
+Flat arrays: n lines are one array of indexes into a table of points, and the start of each line (``LineSet``).
+Directions follow Lanelet2: looking along a lane, the left bound is on the left, and both run along it.
 """
 
 from __future__ import annotations
@@ -18,42 +18,44 @@ Array = NDArray[np.float64]
 Places = NDArray[np.intp]
 
 SAME_RATIO = 1e-6
-"""Of a lane's length: bends of both bounds nearer than this along it are one bend of its middle."""
+"""Fraction of a lane's length: bends of both bounds closer than this along it are one bend of its middle."""
 
 MIN_CROSSING_COSINE = 0.2
-"""Cosine of the angle between a lane and a border across it; below it the lane would begin with a sliver."""
+"""Minimum cosine of the angle between a lane and a border across it; below it the lane would begin with a sliver."""
 
 MAX_MITRE_RATIO = 2.0
-"""How much longer than half the width a corner may reach out."""
+"""Maximum length of a mitred corner, as a multiple of half the width."""
 
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class LineSet:
-    """n lines of two and more points. indices: places of their points. first: [n + 1], where each begins in
-    ``indices``."""
+    """n lines of at least two points.
+
+    indices: indexes of their points. first: [n + 1], start of each line in ``indices``.
+    """
 
     indices: Places
     first: Places
 
     @property
     def owner(self) -> Places:
-        """[len(at)] which line each point belongs to."""
+        """Return the line of each point, [len(at)]."""
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
 
     @property
     def first_points(self) -> Places:
-        """[n] the first point of each line."""
+        """Return the first point of each line, [n]."""
         return self.indices[self.first[:-1]]
 
     @property
     def last_points(self) -> Places:
-        """[n] the last point of each line."""
+        """Return the last point of each line, [n]."""
         return self.indices[self.first[1:] - 1]
 
     def reverse(self, mask: NDArray[np.bool_]) -> LineSet:
-        """The same with these lines the other way round."""
+        """Return the lines with these ones reversed."""
         owner = self.owner
         positions = np.arange(len(self.indices))
         back = self.first[owner] + self.first[owner + 1] - 1 - positions
@@ -61,35 +63,35 @@ class LineSet:
 
 
 def runs(lines: Sequence[Sequence[int]]) -> LineSet:
-    """From lists of places."""
+    """Build lines from lists of indexes."""
     first = np.zeros(len(lines) + 1, np.intp)
     np.cumsum([len(line) for line in lines], out=first[1:])
     return LineSet(np.array([k for line in lines for k in line], np.intp), first)
 
 
 def align_bounds(left: LineSet, right: LineSet, xy: Array) -> tuple[LineSet, LineSet]:
-    """Both bounds along the lane. xy: [points, 2] in metres.
+    """Orient both bounds along the lane. xy: [points, 2] in metres.
 
-    Source: Lanelet2's ``geometry::align``, which its reader applies to every lanelet: a bound is turned where the
-    middle of the other one is not on its proper side.
+    Source: Lanelet2's ``geometry::align``, which its reader applies to every lanelet: a bound is reversed if the middle
+    of the other one is not on its proper side.
     """
     turned = left.reverse(_side(left, _middle(right, xy), xy) >= 0)
     return turned, right.reverse(_side(right, _middle(turned, xy), xy) <= 0)
 
 
 def _middle(lines: LineSet, xy: Array) -> Array:
-    """[n, 2] the middle one of its points; of two the mean."""
+    """Return the middle point of each line, [n, 2]; the mean of two points."""
     size = np.diff(lines.first)
     inner = xy[lines.indices[lines.first[:-1] + size // 2]]
     return np.where((size > 2)[:, None], inner, (xy[lines.first_points] + xy[lines.last_points]) / 2.0)
 
 
 def _side(lines: LineSet, points: Array, xy: Array) -> Array:
-    """[n] positive where a line's point is on its left, negative on its right."""
+    """Return [n]: positive if a line's point is on its left, negative on its right."""
     coordinates = xy[lines.indices]
     inner = np.ones(len(lines.indices), bool)
     inner[lines.first[1:] - 1] = False
-    start = np.flatnonzero(inner)  # a segment begins at every point but a line's last
+    start = np.flatnonzero(inner)  # a segment begins at every point except a line's last
     owner = lines.owner[start]
     a, along = coordinates[start], coordinates[start + 1] - coordinates[start]
     p = points[owner] - a
@@ -102,7 +104,7 @@ def _side(lines: LineSet, points: Array, xy: Array) -> Array:
     nearest = order[np.searchsorted(owner[order], np.arange(len(lines.first) - 1))]
     unit = along / np.sqrt(np.where(length > 0, length, 1.0))[:, None]
     normal = np.column_stack([-unit[:, 1], unit[:, 0]])
-    # At a corner the two segments decide together: the sum of their normals points to the left of both.
+    # At a corner both segments count: the sum of their normals points to the left of both.
     nearest_normal = normal[nearest].copy()
     before, after = nearest - 1, nearest + 1
     at_start = (t[nearest] == 0.0) & (before >= 0) & (owner[np.maximum(before, 0)] == owner[nearest])
@@ -116,10 +118,10 @@ def _side(lines: LineSet, points: Array, xy: Array) -> Array:
 
 
 def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Array, Places]:
-    """The line half-way between the bounds of n lanes: all its points [m, columns of places] and their lane [m].
+    """Return the line half-way between the bounds of n lanes: all its points [m, columns] and their lane [m].
 
-    It bends wherever a bound bends, at the same share of the bounds' lengths in ``xy`` (metres); ``places`` are in
-    whatever coordinates the middle shall have.
+    It bends wherever a bound bends, at the same fraction of the bounds' lengths in ``xy`` (metres); ``places`` are in
+    any coordinates, and so is the result.
     """
     ratio = [_ratios(side, xy) for side in (left, right)]
     owner = np.concatenate([left.owner, right.owner])
@@ -131,7 +133,7 @@ def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Ar
     last = np.append(np.flatnonzero(owner[1:] != owner[:-1]), len(t) - 1)
     near = fresh & (t > 1.0 - SAME_RATIO)
     fresh[near] = False
-    fresh[last] = True  # exactly at the end, whatever stands just before it
+    fresh[last] = True  # exactly at the end, regardless of the point before it
     owner, t = owner[fresh], t[fresh]
     query = t + 2.0 * owner
     sides = []
@@ -143,7 +145,7 @@ def middles(left: LineSet, right: LineSet, xy: Array, places: Array) -> tuple[Ar
 
 
 def _ratios(lines: LineSet, xy: Array) -> Array:
-    """Of each point, the share of its line's length that lies before it, 0 to 1."""
+    """Return each point's fraction of its line's length, 0 to 1."""
     owner = lines.owner
     step = np.hypot(*(xy[lines.indices[1:]] - xy[lines.indices[:-1]]).T)
     step[owner[1:] != owner[:-1]] = 0.0
@@ -162,9 +164,9 @@ def _ratios(lines: LineSet, xy: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """A lane's end at a node. lane: its number. far: it is the lane's last point. away: unit vector out of the node.
+    """End of a lane at a node. lane: its index. far: it is the lane's last point. away: unit vector out of the node.
 
-    inward, outward: whether traffic may come to the node, or leave it, on this lane. half: half its width, metres.
+    inward, outward: whether traffic may reach the node, or leave it, on this lane. half: half its width, metres.
     """
 
     lane: int
@@ -188,20 +190,20 @@ class Border:
         return abs(crossing_cosine(arm, self)) > MIN_CROSSING_COSINE
 
     def along(self, arm: Arm) -> bool:
-        """Whether the lane passes along the axis, so that its left bound is at ``left``; else at ``right``."""
+        """Whether the lane runs along the axis, so that its left bound is at ``left``; else at ``right``."""
         return (_dot(arm.away, self.axis) > 0) != arm.far
 
 
 def crossing_cosine(arm: Arm, at: Border) -> float:
-    """The cosine between a lane's way out of the node and the border's axis."""
+    """Return the cosine between a lane's direction out of the node and the border's axis."""
     return _dot(arm.away, at.axis)
 
 
 def border(at: Point, arms: Sequence[Arm]) -> Border | None:
-    """The border at a node that connects most of the ways through it, or None where nothing can be connected.
+    """Find the border at a node that connects most pairs of lanes, or None if it connects none.
 
-    Two lanes follow each other in Lanelet2 where both bounds end and begin at the same two points in the same order:
-    from one side of the border to the other.
+    Two lanes are connected in Lanelet2 if both bounds end and begin at the same two points in the same order: from one
+    side of the border to the other.
     """
     if len(arms) < 2:
         return None
@@ -223,8 +225,10 @@ def border(at: Point, arms: Sequence[Arm]) -> Border | None:
 
 
 def count_through(arms: Sequence[Arm], shares: Sequence[float]) -> int:
-    """How many ways from one lane into another one lead over the border. shares: ``crossing_cosine`` of each arm, 0
-    where it does not reach the border."""
+    """Count the lane pairs that are connected over the border.
+
+    shares: ``crossing_cosine`` of each arm, 0 if it does not reach the border.
+    """
     return sum(
         a.inward and b.outward and p * q < 0
         for a, p in zip(arms, shares, strict=True)
@@ -234,7 +238,7 @@ def count_through(arms: Sequence[Arm], shares: Sequence[float]) -> int:
 
 
 def count_ways(arms: Sequence[Arm]) -> int:
-    """How many ways there are from one lane into another one."""
+    """Count the pairs of different lanes, in and out."""
     return sum(a.inward and b.outward for a in arms for b in arms if a is not b)
 
 
@@ -243,7 +247,7 @@ def _axes(arms: Sequence[Arm]) -> list[Point]:
         x, y = arms[1].away[0] - arms[0].away[0], arms[1].away[1] - arms[0].away[1]
         length = math.hypot(x, y)
         return [(x / length, y / length)] if length > 1e-6 else []
-    # Which arms are on one side changes only where the axis is square to an arm: one axis for each gap between.
+    # The arms on one side change only where the axis is perpendicular to an arm: one axis for each gap between.
     square = sorted((math.atan2(arm.away[1], arm.away[0]) + math.pi / 2) % math.pi for arm in arms)
     axes = []
     for k, low in enumerate(square):
@@ -259,9 +263,9 @@ def _dot(a: Point, b: Point) -> float:
 
 
 def offset_bounds(middle: Array, half: float) -> tuple[Array, Array]:
-    """(left, right) bounds of a lane, [k, 2] each, at this distance from its middle [k, 2], with mitred corners.
+    """Return the (left, right) bounds of a lane, [k, 2] each, at this distance from its middle [k, 2], mitred.
 
-    The middle must have two and more points, no two alike in a row.
+    The middle must have at least two points, no two equal in a row.
     """
     along = np.diff(middle, axis=0)
     along /= np.hypot(along[:, 0], along[:, 1])[:, None]
@@ -270,7 +274,7 @@ def offset_bounds(middle: Array, half: float) -> tuple[Array, Array]:
     share = 1.0 + (before * after).sum(axis=1)
     mitre = (before + after) / np.maximum(share, 1e-9)[:, None]
     length = np.hypot(mitre[:, 0], mitre[:, 1])
-    hairpin = length < 1e-6  # straight back: the corner goes on straight
+    hairpin = length < 1e-6  # a reversal: continue straight
     mitre[hairpin] = before[hairpin]
     length[hairpin] = 1.0
     mitre *= np.minimum(1.0, MAX_MITRE_RATIO / np.maximum(length, 1e-9))[:, None]

@@ -1,4 +1,4 @@
-"""The network that lanelets make: reader and writer must agree on it."""
+"""Network that lanelets form, for reader and writer alike."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
 from app.model.geodesy import local_frame
 
 SAME_PLACE = {"wgs84": 1e-9, "local": 1e-4}
-"""Degrees and metres: an edge whose bends are nearer to its lanelet's middle than this lies there still."""
+"""Tolerance in degrees and metres within which an edge still follows its lanelet's middle."""
 
 
 @dataclass(slots=True)
 class Lane:
-    """A lanelet as its relation says it; bounds as node ids."""
+    """A lanelet as in its relation; bounds as node ids."""
 
     id: int
     tags: Mapping[str, str]
@@ -36,7 +36,7 @@ class Lane:
 
 @dataclass(slots=True)
 class PointTable:
-    """Where points are. row: node id -> row of ``xyz``, [n, 3] as they are anchored, z NaN where none is said."""
+    """Positions of points. row: node id -> row of ``xyz``, [n, 3] in their anchor, z NaN if absent."""
 
     row: dict[int, int]
     xyz: Array
@@ -45,23 +45,23 @@ class PointTable:
     labels: dict[str, str] = field(default_factory=dict)
 
     def metres(self) -> Array:
-        """[n, 2]; on earth in a frame near the middle of the data, which is right to a few parts in 100 000."""
+        """Return [n, 2] metres; for wgs84 in a frame near the middle of the data, exact to a few parts in 100 000."""
         if self.anchor == "local" or not len(self.xyz):
             return self.xyz[:, :2]
         lonlat = self.xyz[:, :2]
         low, high = lonlat.min(axis=0), lonlat.max(axis=0)
-        # A tenth of a degree: an edit at the map's edge must not move the frame and so every digit of the others.
+        # A tenth of a degree: an edit at the map's border must not move the frame and change the digits of all points.
         lon, lat = np.round((low + high) / 2.0, 1).tolist()
         frame = local_frame(Datum(float(np.clip(lat, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), lon))
         xy = frame.to_local(lonlat)
         if not (np.abs(xy) <= MAX_METRES).all():
-            reason = "the lanes spread over too much of the earth to be one network: give those of one site"
+            reason = "the lanes spread over too large an area for one network: upload the lanes of one site"
             raise Invalid(reason, [Problem(reason)])
         return xy
 
 
 def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> Features:
-    """Nodes and directed edges of lanelets, all of whose points have a place."""
+    """Build nodes and directed edges of lanelets whose points all have a position."""
     compact = SharedKeyDicts()
     lines, widths, ends = _follow(lanes, places) if lanes else ([], [], [])
     two_way = [is_two_way(lane.tags) for lane in lanes]
@@ -74,7 +74,7 @@ def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> 
         top = marks.find(pair)
         if top not in id_by_place:
             id_by_place[top] = f"n{top[0]}:{top[1]}"
-    # A node that our own tags name stands where it stood; every other one in the middle between its two points.
+    # A node with our own tags keeps its position; every other one is half-way between its two points.
     used: dict[str, tuple[int, int] | None] = dict.fromkeys(places.names)
     edges: list[tuple[str, Any, Properties]] = []
     for lane, line, width, pairs, both in zip(lanes, lines, widths, ends, two_way, strict=True):
@@ -100,11 +100,11 @@ def network(lanes: Sequence[Lane], places: PointTable, document: Properties) -> 
 
 
 Pair = tuple[int, int]
-"""The left and the right point of an end, by id."""
+"""Return the left and the right point of an end, by id."""
 
 
 def _follow(lanes: Sequence[Lane], places: PointTable) -> tuple[list[Any], list[float | None], list[tuple[Pair, Pair]]]:
-    """Of each lane its middle, its width, and its two ends."""
+    """Return each lane's middle, width, and two ends."""
     xy = places.metres()
     rows = ([[places.row[r] for r in side] for side in sides] for sides in _bounds(lanes))
     left, right = map(lane_geometry.runs, rows)
@@ -131,7 +131,7 @@ def _edge_properties(
 
 
 def _node(name: str, pair: Pair | None, places: PointTable, compact: SharedKeyDicts) -> tuple[Any, Properties]:
-    """Shape and properties of a node between two points, or (None) at the point that has its name."""
+    """Return shape and properties of a node between two points, or (None) at the point with its name."""
     if pair is None:
         at = places.xyz[places.row[places.names[name]]]
         properties: Properties = {
@@ -152,7 +152,7 @@ def _bounds(lanes: Sequence[Lane]) -> tuple[list[list[int]], list[list[int]]]:
 def _middles(
     lanes: Sequence[Lane], left: lane_geometry.LineSet, right: lane_geometry.LineSet, places: PointTable, xy: Array
 ) -> tuple[list[Any], list[float | None]]:
-    """Of each lane its middle as a line, and its width in metres, None where the bounds touch."""
+    """Return each lane's middle as a line, and its width in metres, None if the bounds touch."""
     high = ~np.isnan(places.xyz[:, 2])
     values = np.where(np.isnan(places.xyz), 0.0, places.xyz)
     points, owner = lane_geometry.middles(left, right, xy, values)
@@ -177,7 +177,7 @@ def _middles(
     apart = shapely.distance(*sides).tolist()
     widths = []
     for lane, width in zip(lanes, apart, strict=True):
-        # Where we made the bounds, the edge's width is in a tag; without one their distance is no information.
+        # For bounds of our own the edge's width is in a tag; without one their distance is meaningless.
         between = round(width, 6) if width >= 0.01 and EDGE not in lane.tags else None
         tag_width = positive(lane.tags.get("width"))
         widths.append(between if tag_width is None else tag_width)
@@ -185,8 +185,10 @@ def _middles(
 
 
 class _JoinedEnds:
-    """Which ends of lanes are one node. An end is its (left, right) points, looking along the lane; on a lane that may
-    be used both ways it is also (right, left)."""
+    """Disjoint sets of lane ends that are one node.
+
+    An end is its (left, right) points, looking along the lane; on a bidirectional lane it is also (right, left).
+    """
 
     def __init__(self) -> None:
         self.parent: dict[tuple[int, int], tuple[int, int]] = {}
@@ -195,7 +197,7 @@ class _JoinedEnds:
         a = self.find(pair)
         if both:
             b = self.find((pair[1], pair[0]))
-            # The smaller one stands for both, so that a node's id does not depend on the order of lanelets.
+            # The smaller one represents both, so that a node's id does not depend on the order of lanelets.
             self.parent[max(a, b)] = min(a, b)
 
     def find(self, pair: tuple[int, int]) -> tuple[int, int]:
@@ -214,7 +216,7 @@ def read_lanes(
     ways: Mapping[int, tuple[Sequence[int], Mapping[str, str]]],
     located: Mapping[int, Any],
 ) -> tuple[list[Lane], list[tuple[int, str]]]:
-    """The lanelets that can be followed, and of the others why not. relations: (id, members, tags, attributes)."""
+    """Return the usable lanelets, and (id, reason) of the others. relations: (id, members, tags, attributes)."""
     out, broken = [], []
     for i, members, tags, attributes in relations:
         if tags.get("type") != "lanelet":
@@ -227,7 +229,7 @@ def read_lanes(
             if kind == "way" and role in sides and ref in ways and not is_deleted(ways[ref][1]):
                 sides[role].append([r for r in ways[ref][0] if r in located])
         if any(len(sides[s]) != 1 or len(sides[s][0]) < 2 for s in ("left", "right")):
-            broken.append((i, "it needs one left and one right bound of two and more points each"))
+            broken.append((i, "it needs one left and one right bound of at least two points each"))
             continue
         middle = sides["centerline"][0] if len(sides["centerline"]) == 1 and len(sides["centerline"][0]) > 1 else None
         out.append(Lane(i, tags, sides["left"][0], sides["right"][0], middle))

@@ -1,4 +1,4 @@
-"""Lanelets for edges from elsewhere: bounds beside them, which meet where the edges meet."""
+"""Build lanelets for edges of other formats: bounds beside them, connected where the edges are."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ CANONICAL_NODE = frozenset({"kind", "name", NAME}) | CROSS_PART_PROPERTIES
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What new lanelets are given where the network does not say it."""
+    """Properties of new lanelets that the network does not specify."""
 
-    width: float = parameter(1.0, "width of lanes whose edge has none", minimum=0.01, maximum=100.0, unit="m")
-    subtype: str = parameter("road", "subtype of lanes whose source names none: road, walkway, crosswalk …")
+    width: float = parameter(1.0, "width of lanes for edges without width", minimum=0.01, maximum=100.0, unit="m")
+    subtype: str = parameter("road", "subtype of lanes without subtype in their source: road, walkway, crosswalk …")
     location: str = parameter("urban", "location of new lanes: urban or nonurban")
     bounds: str = parameter("virtual", "type of the bounds of new lanes: virtual, line_thin, curbstone …")
     projector_info: bool = parameter(
@@ -38,7 +38,7 @@ class WriteOptions:
 
 @dataclass(slots=True)
 class _NewLanelet:
-    """A lanelet to be made: its middle [k, 3] in metres, the edge along it, and the edge back, if it is two-way."""
+    """A lanelet to build: its middle [k, 3] in metres, the edge along it, and its reverse if it is bidirectional."""
 
     middle: Array
     half: float
@@ -47,14 +47,14 @@ class _NewLanelet:
 
 
 class NewLanelets:
-    """Makes lanelets of the edges that no stored one stands for."""
+    """Builder of lanelets for edges without a stored lanelet."""
 
     def __init__(self, out: Document) -> None:
         self.out, self.context, self.layers = out, out.context, out.layers
         self.options: WriteOptions = out.context.options
 
     def add_network(self) -> None:
-        """Lanelets for all edges that none explains, and points for nodes."""
+        """Add lanelets for all edges without a stored one, and points for nodes."""
         parts: dict[PartKey, Part] = {}
         for key, part in self.layers.vector("topology").items():
             explained_ids = self.out.explained.get(key, set())
@@ -65,8 +65,8 @@ class NewLanelets:
             return
         if self.layers.frame is None and not self.out.metric:
             raise MissingDatum(
-                "lanelet2 says where on earth a network lies, and the environment has no datum: set one with PATCH "
-                '/api/v1/environments/{env} {"datum": {"latitude": …, "longitude": …}} or upload a datum.yaml'
+                "lanelet2 needs positions on earth, but the environment has no datum: set one with PATCH "
+                '/api/v1/environments/{env} "datum": {"latitude": …, "longitude": …} or upload a datum.yaml'
             )
         net = merge_networks(Layers(parts, self.layers.datum, self.layers.levels), self.context)
         new = self._make_lanelets(net)
@@ -75,24 +75,24 @@ class NewLanelets:
         self._report_new_lanelets(net, new)
 
     def _report_new_lanelets(self, net: MergedNetwork, new: Sequence[_NewLanelet]) -> None:
-        """What new lanelets were given, and what they could not take."""
+        """Report defaults of new lanelets, and losses."""
         if new:
-            why = "the edges of the network say no more"
+            why = "not specified by the network's edges"
             if default := sum("width" not in lane.edge.properties for lane in new):
-                self.context.fill("width of lanes", self.options.width, f"{default} edges say none", "width")
+                self.context.fill("width of lanes", self.options.width, f"{default} edges have no width", "width")
             self.context.fill("type of bounds", self.options.bounds, why, "bounds")
             self.context.fill("location of lanelets", self.options.location, why, "location")
             if any(self._subtype(lane.edge) == self.options.subtype for lane in new):
                 self.context.fill("subtype of lanelets", self.options.subtype, why, "subtype")
         more = sum(bool(e.properties.keys() - CANONICAL_EDGE) for e in net.edges)
-        self.context.drop("further properties of edges", more, "lanelets have no place for them")
+        self.context.drop("further properties of edges", more, "lanelets cannot express them")
         more = sum(bool(n.properties.keys() - CANONICAL_NODE) for n in net.nodes)
-        self.context.drop("further properties of nodes", more, "points have no place for them")
+        self.context.drop("further properties of nodes", more, "points cannot express them")
         if len(set(net.levels)) > 1:
-            self.context.drop("levels of nodes", len(net.nodes), "Lanelet2 knows no levels: all networks are joined")
+            self.context.drop("levels of nodes", len(net.nodes), "Lanelet2 has no levels: all networks are joined")
 
     def _make_lanelets(self, net: MergedNetwork) -> list[_NewLanelet]:
-        """One for each edge, one for both where an edge has a like one on the way back."""
+        """Build one lanelet for each edge, or for an edge and its equal reverse."""
         waiting: dict[tuple[int, int], list[Edge]] = {}
         for edge in net.edges:
             waiting.setdefault((edge.source, edge.target), []).append(edge)
@@ -124,13 +124,15 @@ class NewLanelets:
                         break
             width = positive(edge.properties.get("width")) or self.options.width
             out.append(_NewLanelet(middle, width / 2.0, edge, back))
-        self.context.drop("edges from a node to itself", loops, "a lanelet does not end at the border where it begins")
-        self.context.drop("edges without length", without, "a lanelet needs bounds along its way")
+        self.context.drop("edges from a node to itself", loops, "a lanelet cannot end at the border where it begins")
+        self.context.drop("edges without length", without, "a lanelet needs bounds along its course")
         return out
 
     def _node_points(self, net: MergedNetwork, used: set[int]) -> dict[int, int]:
-        """A point for each node of the network; node number -> its id in the file. Nodes of lanelets that are written
-        as they came need none unless a new lanelet begins there."""
+        """Add a point for each node of the network; return node index -> id in the file.
+
+        Nodes of unchanged lanelets need one only if a new lanelet begins there.
+        """
         out = {}
         for k, node in enumerate(net.nodes):
             source_members = get_source_properties(node.properties, NAME)
@@ -156,7 +158,7 @@ class NewLanelets:
         return out
 
     def _bounds(self, net: MergedNetwork, new: Sequence[_NewLanelet], centres: Mapping[int, int]) -> None:
-        """Bounds, centrelines and relations of the new lanelets."""
+        """Add bounds, centrelines and relations of the new lanelets."""
         arms: dict[int, list[Arm]] = {}
         for k, lane in enumerate(new):
             for far, end in ((False, lane.edge.source), (True, lane.edge.target)):
@@ -200,7 +202,9 @@ class NewLanelets:
                 sides.append(names)
             self._emit(net, lane, sides, centres)
         if narrow:
-            self.context.warn(f"{narrow} lanes are narrower than their edges say, so that their bounds do not cross")
+            self.context.warn(
+                f"{narrow} lanes are narrower than the width of their edges, so that their bounds do not cross"
+            )
         possible = sum(map(lane_geometry.count_ways, arms.values()))
         connection_count = 0
         for node, node_arms in arms.items():
@@ -211,12 +215,12 @@ class NewLanelets:
             connection_count += lane_geometry.count_through(node_arms, across)
         if breaks := possible - connection_count:
             self.context.warn(
-                f"{breaks} of {possible} ways from one lane into the next are no connection in Lanelet2's sense: their "
-                "turns are too sharp for bounds to be shared"
+                f"{breaks} of {possible} pairs of successive lanes are not connected in Lanelet2's sense; their "
+                "turns are too sharp for shared bounds"
             )
 
     def _read_border(self, net: MergedNetwork, node: int) -> tuple[Border, tuple[int, int]] | None:
-        """The two points of a node of stored lanelets, in metres, where it is still there."""
+        """Return the two points of a node of stored lanelets, in metres, if they still exist."""
         at = net.nodes[node]
         pair = integers(get_source_properties(at.properties, NAME).get("points"))
         level = self.out.levels.get(at.level)
@@ -235,9 +239,9 @@ class NewLanelets:
     def _sides(
         self, k: int, lane: _NewLanelet, joins: dict[tuple[int, bool], tuple[int, bool]], borders: Mapping[int, Border]
     ) -> tuple[Array, Array, bool]:
-        """(left, right, whether they are closer than asked for). Ends that a border would spoil leave ``joins``."""
+        """Return (left, right, whether they are narrower); ends that a border would spoil leave ``joins``."""
         half = lane.half
-        if not shapely.LineString(lane.middle[:, :2]).is_simple:  # it crosses itself, however narrow it is
+        if not shapely.LineString(lane.middle[:, :2]).is_simple:  # the middle crosses itself at any width
             for far in (False, True):
                 joins.pop((k, far), None)
             return *lane_geometry.offset_bounds(lane.middle[:, :2], half), False
@@ -293,7 +297,7 @@ class NewLanelets:
         self.out.relations[self.out.next_id()] = (members, tags, NO_ATTRIBUTES)
 
     def _subtype(self, edge: Edge) -> str:
-        """What its source calls it, in Lanelet2's words."""
+        """Return the Lanelet2 subtype for the source's kind."""
         source_subtype = as_texts(get_source_properties(edge.properties, NAME).get("tags")).get("subtype")
         highway = as_texts(get_source_properties(edge.properties, "osm").get("tags")).get("highway")
         if source_subtype:
@@ -302,13 +306,13 @@ class NewLanelets:
 
 
 def _is_same_road(a: Edge, b: Edge) -> bool:
-    """Whether two edges, there and back, can be one lanelet."""
+    """Whether two edges, one the reverse of the other, can be one lanelet."""
     keys = ("speed_limit", "width", "name")
     return all(a.properties.get(w) == b.properties.get(w) for w in keys) and a.level == b.level
 
 
 def _middle_line(edge: Edge, net: MergedNetwork) -> Array | None:
-    """[k, 3] from node to node, metres, no point twice in a row; z NaN in two dimensions; None without a length."""
+    """Return [k, 3] from node to node in metres, no point twice in a row; z NaN in 2-D; None for length 0."""
     a, b = net.nodes[edge.source], net.nodes[edge.target]
     inner = np.empty((0, 3))
     if edge.geometry.geom_type == "LineString" and not edge.geometry.is_empty:
@@ -319,7 +323,7 @@ def _middle_line(edge: Edge, net: MergedNetwork) -> Array | None:
         line[:, 2] = np.where(np.isnan(line[:, 2]), 0.0, line[:, 2])
     keep = np.ones(len(line), bool)
     keep[1:] = np.hypot(*np.diff(line[:, :2], axis=0).T) > 1e-6
-    if not keep[-1]:  # the last point is the node: what stands on it goes
+    if not keep[-1]:  # the last point is the node: drop equal points before it
         before = np.flatnonzero(keep)[-1]
         keep[before], keep[-1] = before == 0, before != 0
     line = line[keep]

@@ -1,4 +1,4 @@
-"""Reading Lanelet2: the network of lanelets, and all elements as objects."""
+"""Read Lanelet2: the network of lanelets, and all elements as objects."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ PROJECTOR_SHAPE = _fields.record(
     map_origin=_fields.record(latitude=_fields.LATITUDE, longitude=_fields.LONGITUDE, altitude=_fields.COORDINATE),
     scale_factor=_fields.Number(0.0, 10.0, above=True),
 )
-"""What it holds. Source: autoware_map_projection_loader."""
+"""Shape of the file. Source: autoware_map_projection_loader."""
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The network of lanelets, and all elements as objects, on earth (in metres where the projector is ``Local``).
+    """Read the network of lanelets, and all elements as objects, in wgs84 (in metres with the projector ``Local``).
 
-    Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
+    Raises UnreadableFile, with a line if known, for files that are not OSM and for positions that are not on earth.
     """
     data = parse(files[context.main], context.limits)
     total = len(data.ids) + len(data.ways) + len(data.relations)
@@ -55,7 +55,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         limit = relation.tags.get("speed_limit")
         speed = None if limit is None else parse_speed(limit)
         if limit is not None and (speed is None or speed > MAX_SPEED):
-            reason = f"the speed limit {limit[:40]!r} is no speed from 0 to {MAX_SPEED:g} m/s"
+            reason = f"invalid speed limit {limit[:40]!r}: must be from 0 to {MAX_SPEED:g} m/s"
             context.warn(reason, where=f"relation {relation.id}")
     projector = next((n for n in files if n != context.main), None)
     local = _is_metric_only(data)
@@ -74,14 +74,14 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _is_metric_only(data: Data) -> bool:
-    """Whether no point stands on earth and some say their metres: Autoware's maps without a projection."""
+    """Whether no point has degrees and some have metres: Autoware's maps without a projection."""
     metres = any(LOCAL[0] in tags for tags in data.tags.values())
     return metres and bool(np.isnan(data.lonlat[:, 0]).all())
 
 
 def _projector_text(data: bytes, name: str) -> str:
     if len(data) > 2**16:
-        raise TooLarge(f"{name} has {len(data)} bytes; 65536 are the limit", [Problem("too large", name)])
+        raise TooLarge(f"{name} has {len(data)} bytes; the limit is 65536", [Problem("too large", name)])
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -98,7 +98,7 @@ def _projector_type(data: bytes, name: str, context: ReadContext) -> str:
         _fields.check(document, PROJECTOR_SHAPE, context, name)
     kind = document.get("projector_type") if isinstance(document, dict) else None
     if not isinstance(kind, str):
-        context.warn("it names no projector_type: places on earth are believed", file=name)
+        context.warn("missing projector_type; positions on earth are used", file=name)
         return ""
     return kind.lower()
 
@@ -116,7 +116,7 @@ class _Reader:
             ("relation", self.relations, data.relations),
         ):
             if len(distinct) != len(all_ids):
-                context.warn("ids stand more than once in the file; the last one counts", where=noun)
+                context.warn("duplicate ids in the file; the last element is used", where=noun)
         self.row = row
         xyz = np.full((len(data.ids), 3), np.nan)
         if not local:
@@ -127,10 +127,10 @@ class _Reader:
                 xyz[k, :2] = decimal(tags.get(LOCAL[0])), decimal(tags.get(LOCAL[1]))
             if "ele" in tags:
                 xyz[k, 2] = decimal(tags["ele"])
-                doubts["elevations are no numbers of metres and not believed"] += math.isnan(xyz[k, 2])
+                doubts["elevations are not numbers of metres and are ignored"] += math.isnan(xyz[k, 2])
         absent = np.isnan(xyz[:, :2]).any(axis=1)
         xyz[absent] = np.nan
-        doubts["points have no place; references to them are kept"] += int(absent.sum())
+        doubts["points have no position; references to them are stored"] += int(absent.sum())
         for text, times in doubts.items():
             if times:
                 context.warn(f"{times} {text}")
@@ -144,9 +144,9 @@ class _Reader:
         ways = {i: (way.refs, way.attributes) for i, way in self.ways.items()}
         lanes, broken = read_lanes(relations, ways, self.located)
         for i, reason in broken:
-            self.context.warn(f"the lanelet is no part of the network: {reason}", where=f"relation {i}")
+            self.context.warn(f"the lanelet is not part of the network: {reason}", where=f"relation {i}")
         if not lanes:
-            self.context.warn("the file has no lanelets that could be followed, so there is no network in it")
+            self.context.warn("the file has no usable lanelets; no network is created")
         names: dict[str, int] = {}
         labels: dict[str, str] = {}
         for k, tags in self.data.tags.items():
@@ -160,7 +160,7 @@ class _Reader:
             raise UnreadableFile(error.detail, list(error.problems)) from error
 
     def objects(self, document: Properties) -> Features:
-        """Points that are no mere bends, ways and relations."""
+        """Convert points that are not only bends, ways and relations."""
         data = self.data
         members = {i for r in self.relations.values() for kind, i, _ in r.members if kind == "node"}
         bent = set(chain.from_iterable(way.refs for way in self.ways.values()))
@@ -230,7 +230,7 @@ class _Reader:
         return self.compact(source_members)
 
     def bend(self, k: int) -> dict[str, Any]:
-        """What is known of a point beside its place; one value for all ways that bend there."""
+        """Return a point's data except its position; one value for all ways that bend there."""
         cached = self.points_by_row.get(k)
         if cached is None:
             cached = self.points_by_row[k] = self.read_point(k)
@@ -249,7 +249,7 @@ class _Reader:
 def _table(
     located: Mapping[int, int], xyz: Array, anchor: Anchor, names: dict[str, int], labels: dict[str, str]
 ) -> PointTable:
-    """Only points with a place, so that nothing else can be meant."""
+    """Only points with a position, so that ids are unambiguous."""
     rows = list(located.values())
     return PointTable({i: k for k, i in enumerate(located)}, xyz[rows].reshape(-1, 3), anchor, names, labels)
 

@@ -1,4 +1,4 @@
-"""Elements of a map that was read, written again."""
+"""Write the elements of a map that was read."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.model.layers import PartKey
 
 
 class StoredElements:
-    """Writes the elements of a map that was read, with what the network says otherwise."""
+    """Writer of stored elements, updated from the network."""
 
     def __init__(self, out: Document) -> None:
         self.out, self.context, self.layers = out, out.context, out.layers
@@ -43,7 +43,7 @@ class StoredElements:
             for i, shape, p in zip(part.ids, geometry, part.properties, strict=True)
             if (identity := element_id(i)) and NAME in p
         ]
-        self.out.lost["objects that are no element of a map"] += len(part) - len(rows)
+        self.out.lost["objects that are not elements of a map"] += len(part) - len(rows)
         for kind, i, shape, source_members in rows:
             if kind == "n":
                 self._point(level, i, shape, source_members, local, nodes if networks else None)
@@ -52,7 +52,7 @@ class StoredElements:
             for kind, i, shape, source_members in rows
             if kind == "w" and not self._write_way(level, i, shape, source_members, local)
         ]
-        for i, shape, source_members in drawn_anew:  # once the points of all others are there to be met
+        for i, shape, source_members in drawn_anew:  # after the points of all other elements
             refs = integers(source_members.get("refs")) or []
             points = self._redrawn(level, refs, _course(shape), local)
             self.out.ways[level.ways[i]] = (
@@ -83,7 +83,7 @@ class StoredElements:
         self.out.unknown("node", new, source_members)
 
     def _write_way(self, level: Level, i: int, shape: Any, source_members: Mapping[str, Any], local: bool) -> bool:
-        """Write a way; False where its geometry no longer has the points that it came with."""
+        """Write a way; False if its geometry no longer has the stored points."""
         refs = integers(source_members.get("refs"))
         at = _course(shape)
         new = level.ways[i] = self.out.next_id() if i in self.out.ways else i
@@ -102,7 +102,7 @@ class StoredElements:
                 point = self.out.points.get(name)
                 bend: Mapping[str, Any] = row if isinstance(row := rows[k], Mapping) else {}
                 if point is None or (ref not in level.nodes and not is_same_place(point.xyz, at[j])):
-                    # Two ways that no longer agree where their common point is keep their course each.
+                    # Two ways disagree on the position of their common point: each keeps its course.
                     if point is not None:
                         name = self.out.next_id()
                     tags_, attributes_ = as_texts(bend.get("tags")), as_texts(bend.get("attributes"))
@@ -119,7 +119,7 @@ class StoredElements:
         return True
 
     def _redrawn(self, level: Level, refs: list[int], at: list[tuple[float, float, float]], local: bool) -> list[int]:
-        """Points for a way whose geometry was edited: its own where one stands at a bend, else new ones."""
+        """Create points for a way with edited geometry: its own point if one is at a bend, else new ones."""
         names = (level.nodes.get(r, r) for r in refs)
         point_names = {self.out.points[n].xyz[:2]: n for n in names if n in self.out.points}
         out = []
@@ -138,8 +138,10 @@ class StoredElements:
         relations: Sequence[tuple[int, Mapping[str, Any]]],
         networks: Mapping[PartKey, Features],
     ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
-        """What the network says of each lanelet: its tags and whether it goes the other way round now; None where its
-        edges are gone. Without a network nothing is said of any."""
+        """Return each lanelet's tags and whether it is reversed, according to the network.
+
+        None if its edges were removed. Without a network the result is empty.
+        """
         if not networks:
             return {}
         table, ways = self._points_and_ways(level, part, local)
@@ -155,7 +157,7 @@ class StoredElements:
         lanes, broken = read_lanes(rows, ways, table.row)
         drawn = network(lanes, table, {})
         out = self._compare_lanelets(lanes, drawn, networks)
-        # A lanelet with a redrawn bound is written as it is drawn now; its edges stay with it.
+        # A lanelet with a redrawn bound is written as drawn; its edges stay with it.
         redrawn = {i for i, _ in broken}
         for key, net in networks.items():
             own_edges = (
@@ -169,7 +171,7 @@ class StoredElements:
     def _points_and_ways(
         self, level: Level, part: Features, local: bool
     ) -> tuple[PointTable, dict[int, tuple[list[int], Mapping[str, str]]]]:
-        """The points and ways of a part that are as they came, by their stored ids."""
+        """Return the unchanged points and ways of a part, by their stored ids."""
         ways: dict[int, tuple[list[int], Mapping[str, str]]] = {}
         row: dict[int, int] = {}
         xyz: list[tuple[float, float, float]] = []
@@ -188,11 +190,11 @@ class StoredElements:
             elif identity and identity[0] == "w":
                 missing = set(integers(source_members.get("missing")) or ())
                 refs = [r for k, r in enumerate(integers(source_members.get("refs")) or ()) if k not in missing]
-                if len(refs) != size:  # redrawn: its points are not those that it came with
+                if len(refs) != size:  # redrawn: not the stored points
                     continue
                 ways[identity[1]] = (refs, as_texts(source_members.get("attributes")))
             if any(r not in level.nodes for r in refs):
-                continue  # a point that it refers to is not among them: somebody has changed it
+                continue  # refers to a point that was removed by an edit
             for r in refs:
                 if r not in row:
                     row[r] = len(xyz)
@@ -203,7 +205,7 @@ class StoredElements:
     def _compare_lanelets(
         self, lanes: Sequence[Lane], drawn: Features, networks: Mapping[PartKey, Features]
     ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
-        """Lanelets as the networks have them now. drawn: the network that the lanelets make by themselves."""
+        """Compare lanelets with the current networks. drawn: the network that the stored lanelets form."""
         index_by_id = drawn.index()
         net_properties: dict[str, Properties] = {}
         for key, net in networks.items():
@@ -243,7 +245,7 @@ class StoredElements:
         return out
 
     def _edited_tags(self, lane: Lane, drawn: Properties, now: Properties) -> dict[str, str]:
-        """The lanelet's tags with what the network says otherwise."""
+        """Update a lanelet's tags from the network."""
         tags = dict(lane.tags)
         if now.get("speed_limit") != drawn.get("speed_limit"):
             tags.pop("speed_limit", None)
@@ -285,7 +287,7 @@ def _xyz(shape: Any) -> tuple[float, float, float]:
 
 
 def _course(shape: Any) -> list[tuple[float, float, float]]:
-    """The points of a line or ring, z NaN where it has none; nothing for any other geometry."""
+    """Return the points of a line or ring, z NaN if it has none; nothing for any other geometry."""
     if shape.geom_type not in ("LineString", "LinearRing", "Point") or shape.is_empty:
         return []
     return [(x, y, z) for x, y, z in shapely.get_coordinates(shape, include_z=True).tolist()]

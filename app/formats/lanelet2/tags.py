@@ -1,4 +1,4 @@
-"""Lanelet2's tags: names, subtypes, directions and speeds."""
+"""Tags of Lanelet2: names, subtypes, directions and speeds."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ PROJECTOR = "map_projector_info.yaml"
 GENERATOR = "Fleet Map Server"
 
 EDGE, BACK, SOURCE, TARGET, NODE = (f"fleetmap:{w}" for w in ("edge", "back", "source", "target", "node"))
-"""Our own tags: with them a network from elsewhere comes back with its ids."""
+"""Our own tags, with which a network of another format is read back with its ids."""
 
 LOCAL = ("local_x", "local_y")
 PLAIN_TAGS = frozenset({*LOCAL, "ele", "mgrs_code"})
-"""Tags of points that only say where they are."""
+"""Tags of points that contain only their position."""
 
 ON_FOOT = frozenset({"walkway", "crosswalk", "stairs"})
-"""Subtypes for pedestrians only, who may go both ways (Lanelet2: LaneletAndAreaTagging)."""
+"""Subtypes for pedestrians only, bidirectional by default (Lanelet2: LaneletAndAreaTagging)."""
 
 SUBTYPES: Mapping[str, str] = {
     **dict.fromkeys(("footway", "path", "pedestrian", "corridor"), "walkway"),
@@ -37,14 +37,14 @@ SUBTYPES: Mapping[str, str] = {
     "living_street": "play_street",
     "busway": "bus_lane",
 }
-"""What OSM's ``highway`` is called here; any other one is a road."""
+"""Lanelet2 subtypes of OSM's ``highway`` values; any other value is a road."""
 
 UNITS = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704, "m/h": 0.44704, "kmh": 1 / 3.6, "km/h": 1 / 3.6, "kph": 1 / 3.6}
-"""Metres per second; without a unit kilometres an hour are meant (Lanelet2: Attribute)."""
+"""Speed units in metres per second; the default is km/h (Lanelet2: Attribute)."""
 
 
 def is_two_way(tags: Mapping[str, str]) -> bool:
-    """Whether a lanelet may be used both ways (Lanelet2: LaneletAndAreaTagging, "Direction")."""
+    """Whether a lanelet is bidirectional (Lanelet2: LaneletAndAreaTagging, "Direction")."""
     one_way = _truth(tags.get("one_way"))
     if one_way is not None:
         return not one_way
@@ -53,7 +53,7 @@ def is_two_way(tags: Mapping[str, str]) -> bool:
     special = {k.removeprefix("one_way:"): _truth(v) for k, v in tags.items() if k.startswith("one_way:")}
     if on_foot:
         return not special.get("pedestrian", False)
-    # One participant's right to go back is not everybody's.
+    # The permission of one participant does not apply to others.
     return bool(allowed) and all(special.get(participant) is False for participant in allowed)
 
 
@@ -66,11 +66,11 @@ _SPEED = re.compile(r"\s*(\d{1,9}(?:\.\d{1,20})?)\s*([A-Za-z/]*)\s*", re.ASCII)
 
 
 MAX_SPEED = 150.0
-"""Metres per second; no vehicle's limit is higher."""
+"""Maximum valid speed limit, in metres per second."""
 
 
 def parse_speed(text: str | None) -> float | None:
-    """Metres per second, or None for what is no speed."""
+    """Parse a speed to metres per second, or None if it is invalid."""
     match = _SPEED.fullmatch(text or "")
     if match is None:
         return None
@@ -79,7 +79,7 @@ def parse_speed(text: str | None) -> float | None:
 
 
 def decimal(text: Any) -> float:
-    """A finite number within the bound of local coordinates, else NaN."""
+    """Parse a finite number within the bound of local coordinates, else return NaN."""
     try:
         value = float(text)
     except (TypeError, ValueError):
@@ -88,18 +88,18 @@ def decimal(text: Any) -> float:
 
 
 def positive(text: Any) -> float | None:
-    """A number above 0, else None."""
+    """Parse a number above 0, else return None."""
     value = decimal(text)
     return value if value > 0 else None
 
 
 def metres_per_second(properties: Properties) -> float | None:
-    """The speed limit of an edge; None where it is no number from 0."""
+    """Return the speed limit of an edge; None if it is not a number from 0."""
     value = properties.get("speed_limit")
     valid = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < 1e9
     return float(value) if valid and value is not None else None
 
 
 def kmh(speed: float) -> str:
-    """As Autoware reads it: kilometres an hour without a unit."""
+    """Format a speed as Autoware reads it: km/h without a unit."""
     return xml_text.plain(repr(round(speed * 3.6, 9) + 0.0)).removesuffix(".0")

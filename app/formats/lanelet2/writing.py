@@ -1,4 +1,4 @@
-"""Writing Lanelet2: stored elements as they were, and new lanelets for edges from elsewhere."""
+"""Write Lanelet2: stored elements unchanged, and new lanelets for edges of other formats."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from app.model.layers import Layers
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``lanelet2.osm``, and ``map_projector_info.yaml`` where the source had one or it is asked for.
+    """Write ``lanelet2.osm``, and ``map_projector_info.yaml`` if the source had one or the options request it.
 
-    Raises MissingDatum where a network is in metres and there is no datum.
+    Raises MissingDatum if a network is in metres and there is no datum.
     """
     out = Document(layers, context)
     stored = StoredElements(out)
@@ -22,9 +22,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     NewLanelets(out).add_network()
     files = {MAIN: out.text()}
     for item, times in sorted(out.lost.items()):
-        context.drop(item, times, "a Lanelet2 map has no place for them")
+        context.drop(item, times, "Lanelet2 maps cannot express them")
     if layers.datum is not None:
-        context.drop("datum", 1, "a Lanelet2 map stands on earth and has no local frame of its own")
+        context.drop("datum", 1, "Lanelet2 positions are in wgs84, without a local frame")
     if out.projector is not None:
         files[PROJECTOR] = out.projector.encode()
     elif context.options.projector_info:

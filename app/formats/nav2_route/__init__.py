@@ -1,19 +1,19 @@
-"""nav2_route: the graphs of Nav2's route server, GeoJSON by its shape, metres in a robot's frame by its meaning.
+"""nav2_route: graphs of Nav2's route server: GeoJSON in form, but with coordinates in metres in a robot's frame.
 
 A Point is a node {id, frame, metadata, operations}, a LineString or MultiLineString a directed edge {id, startid,
-endid, cost, overridable, metadata, operations} whose shape the server does not look at. Ids are numbers: 32 bit in a
-graph, 16 bit in the server's actions and services. The server tells integers from floats: what it asks for as a float
-must be written as one (``85.0``), else it throws; so a metadata word that it reads so is always served as a float, and
-all others keep the type they came with. Setting a new graph clears the old one before it is loaded: a bad file leaves
-none.
+endid, cost, overridable, metadata, operations} whose shape the server ignores. Ids are numbers: 32 bit in a graph, 16
+bit in the server's actions and services. The server distinguishes integers from floats: a value that it reads as float
+must be written as one (``85.0``), else it throws; so such a metadata value is always written as a float, and all others
+keep their type. Setting a new graph clears the old one before it is loaded: an invalid file leaves the robot without
+graph.
 Source: navigation2, nav2_route/src/plugins/graph_file_loaders/geojson_graph_file_loader.cpp and the edge scorers.
 
-Canonical: an item's id is its number as a text; ``properties.nav2_route`` holds its ``id``, ``properties`` (the
-feature's, less what is canonical), ``members`` (further ones of the feature), ``line`` where an edge is no
-MultiLineString, and ``geometry`` where its shape is none of ours. The metadata words ``abs_speed_limit`` (metres per
-second), ``name``, ``action`` and ``width`` are the canonical ``speed_limit``, ``name`` … The document's ``nav2_route``
-holds the file's ``members``, the ``ignored`` features that are neither node nor edge, and the ``dangling`` edges
-between unknown nodes (an edge with one known end is kept with that node).
+Canonical: an item's id is its number as a text; ``properties.nav2_route`` contains its ``id``, ``properties`` (the
+feature's, without the canonical ones), ``members`` (further ones of the feature), ``line`` if an edge is not a
+MultiLineString, and ``geometry`` if its shape differs from the canonical one. The metadata keys ``abs_speed_limit``
+(metres per second), ``name``, ``action`` and ``width`` are the canonical ``speed_limit``, ``name`` … The document's
+``nav2_route`` contains the file's ``members``, the ``ignored`` features that are neither node nor edge, and the
+``dangling`` edges between unknown nodes (an edge with one existing end is stored with that node).
 """
 
 from __future__ import annotations
@@ -27,13 +27,15 @@ from app.model.layers import Layers
 
 
 def lacks(layers: Layers) -> str | None:
-    """Nodes and edges must both be there."""
+    """Return what to supply if the network has no node or no edge, else None."""
     kinds = {p.get("kind") for part in layers.vector("topology").values() for p in part.properties}
-    return None if {"node", "edge"} <= kinds else "the network has no edge between its nodes: supply one with edges"
+    return (
+        None if {"node", "edge"} <= kinds else "the network has no edge between its nodes: supply a network with edges"
+    )
 
 
 def detect(name: str, data: bytes) -> bool:  # noqa: ARG001 - one signature for all formats
-    """A JSON object of features with the route server's own words."""
+    """Detect a JSON object of features with the route server's own properties."""
     if data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
         return False
     return b'"startid"' in data and b'"endid"' in data and b'"features"' in data

@@ -1,4 +1,4 @@
-"""Reading a route graph: its features as a network."""
+"""Read a route graph: its features as a network."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from app.syntax import json
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The graph as topology, local metres. Raises UnreadableFile naming the feature; TooLarge beyond the limits."""
+    """Read the graph as topology, local metres. Raises UnreadableFile naming the feature, or TooLarge."""
     if not context.wants("topology"):
         return Layers()
     top = json.load(files[context.main or next(iter(files))], context.limits)
     rows = top.get("features") if isinstance(top, dict) else None
     if not isinstance(top, dict) or not isinstance(rows, list):
         raise UnreadableFile(
-            "a route graph is one object with an array of features", [Problem("no array", where="features")]
+            "a route graph must be an object with an array of features", [Problem("no array", where="features")]
         )
     if len(rows) > context.limits.features:
         raise TooLarge(f"the file has {len(rows)} features; the limit is {context.limits.features}")
@@ -65,11 +65,13 @@ class _Reader:
             elif kind in LINES:
                 self.edges.append(k)
             else:
-                context.warn("is neither a point nor a line: the route server ignores it; it is kept", where=location)
+                context.warn(
+                    "neither a point nor a line; it is stored, but the route server ignores it", where=location
+                )
                 self.ignored.append(row)
         if not self.nodes or not self.edges:
             noun = "point (node)" if not self.nodes else "line (edge)"
-            reason = f"there is no {noun}: the route server takes graphs with one node and one edge at least"
+            reason = f"no {noun}: the route server needs at least one node and one edge"
             raise UnreadableFile(reason, [Problem(reason, where="features")])
 
     def layers(self) -> Layers:
@@ -77,7 +79,7 @@ class _Reader:
         ids = unique_ids(map(str, numbers))
         if repeats := duplicates(list(map(str, numbers))):
             self.context.warn(
-                f"{len(repeats)} nodes share an id: {shorten_list(repeats)}; edges go to the last one, as in Nav2"
+                f"{len(repeats)} nodes share an id: {shorten_list(repeats)}; edges connect to the last one, as in Nav2"
             )
         index_by_number = {n: k for k, n in enumerate(numbers)}
         xyz: Array = np.array([self.position(k) for k in self.nodes], np.float64).reshape(-1, 3)
@@ -88,7 +90,7 @@ class _Reader:
         edges = unique_ids(map(str, numbers), set(ids))
         if repeats := duplicates(list(map(str, numbers))):
             self.context.warn(
-                f"{len(repeats)} edges share an id: {shorten_list(repeats)}; later ones are served with a new one"
+                f"{len(repeats)} edges share an id: {shorten_list(repeats)}; later ones are exported with a new one"
             )
         lines = edge_lines(xyz, sources, targets)
         for j, (k, n) in enumerate(zip(indices, numbers, strict=True)):
@@ -97,8 +99,8 @@ class _Reader:
             properties.append(p)
         if self.is_complete["integers"]:
             self.context.warn(
-                f"{self.is_complete['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, at which "
-                "Nav2 throws; they are served as floats"
+                f"{self.is_complete['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, at "
+                "which Nav2 throws; they are exported as floats"
             )
         document: dict[str, Any] = {"members": {w: v for w, v in self.top.items() if w not in ("type", "features")}}
         credit = [self.top[w] for w in ("attribution", "license", "copyright") if isinstance(self.top.get(w), str)]
@@ -110,26 +112,24 @@ class _Reader:
         return Layers({PartKey("topology", self.context.level, NETWORK): part})
 
     def properties_of(self, k: int) -> dict[str, Any]:
-        """The properties of a feature."""
+        """Return the properties of a feature."""
         properties = self.rows[k].get("properties")
         if not isinstance(properties, dict):
             raise_unreadable("needs properties with an id", f"features[{k}]")
         return properties
 
     def read_id(self, k: int, key: str = "id") -> int:
-        """A node's or edge's number."""
+        """Return a node's or edge's number."""
         value = self.properties_of(k).get(key)
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
             shown = "is missing" if value is None else f"is {str(value)[:40]!r}"
-            raise_unreadable(
-                f"{shown}; it must be a whole number from 0 to {MAX_ID}", f"features[{k}].properties.{key}"
-            )
+            raise_unreadable(f"{shown}; must be an integer from 0 to {MAX_ID}", f"features[{k}].properties.{key}")
         return value
 
     def position(self, k: int) -> tuple[float, float, float]:
-        """x, y, z in metres."""
+        """Return x, y, z in metres."""
         location = f"features[{k}].geometry.coordinates"
         at = self.rows[k]["geometry"].get("coordinates")
         if not isinstance(at, list) or len(at) < 2:
@@ -137,13 +137,15 @@ class _Reader:
         x, y, z = (number(v, location) for v in [*at[:3], 0.0][:3])
         frame = self.properties_of(k).get("frame", FRAME)
         if frame != FRAME:
-            self.context.warn(f"its frame is {str(frame)[:60]!r}: its coordinates are taken as local", where=location)
+            self.context.warn(
+                f"the node's frame is {str(frame)[:60]!r}; its coordinates are read as local", where=location
+            )
         return x, y, z
 
     def ends(
         self, index_by_number: Mapping[int, int], properties: list[dict[str, Any]]
     ) -> tuple[list[int], list[int], list[int], list[int]]:
-        """(features of edges between nodes, their numbers, the places of their ends); others are kept with a node."""
+        """Return (features of edges between nodes, their numbers, indexes of their ends); store others with a node."""
         indices, numbers, sources, targets = [], [], [], []
         for k in self.edges:
             n, start, end = self.read_id(k), self.read_id(k, "startid"), self.read_id(k, "endid")
@@ -151,8 +153,8 @@ class _Reader:
             if a is None or b is None:
                 missing = start if a is None else end
                 self.context.warn(
-                    f"the edge {n} begins or ends at {missing}, which is no node: Nav2 refuses such a graph; it is "
-                    "kept, but not served",
+                    f"the edge {n} begins or ends at the missing node {missing}, and Nav2 rejects such a graph; "
+                    "it is stored, but not exported",
                     where=f"features[{k}]",
                 )
                 edge_properties = {
@@ -174,7 +176,7 @@ class _Reader:
         return indices, numbers, sources, targets
 
     def canonical(self, k: int, n: int) -> dict[str, Any]:
-        """The properties of an item that come from its feature."""
+        """Return an item's properties from its feature."""
         row = self.rows[k]
         extra_members = {w: v for w, v in self.properties_of(k).items() if w not in ("id", "startid", "endid")}
         out: dict[str, Any] = {}
@@ -198,7 +200,7 @@ class _Reader:
         return {**out, NAME: source_properties}
 
     def shape(self, k: int, straight: Any, source_properties: dict[str, Any]) -> Any:
-        """An edge's line: as drawn where that is one line of its own, else from node to node."""
+        """Return an edge's line: as drawn if that is a valid line, else from node to node."""
         geometry = self.rows[k]["geometry"]
         parts = geometry.get("coordinates")
         if geometry["type"] == "LineString":
@@ -213,14 +215,14 @@ class _Reader:
 
 
 def fits(key: str, value: Any) -> bool:
-    """Whether a metadata word stands for a canonical one, with a value of its type."""
+    """Whether a metadata key is canonical, with a value of its type."""
     if key in TEXTS:
         return isinstance(value, str) and value != ""
     return key in NUMBERS and isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _line(coordinates: Any) -> list[tuple[float, ...]] | None:
-    """Two positions or more, two-dimensional where all heights are 0; None where it is no line."""
+    """Return at least two positions, 2-D if all heights are 0; None if it is not a line."""
     if not isinstance(coordinates, list) or len(coordinates) < 2:
         return None
     out: list[tuple[float, ...]] = []
@@ -239,7 +241,7 @@ def _is_integer(key: str, value: Any) -> bool:
 
 
 def _integers(value: Any) -> int:
-    """How many values that Nav2 wants as floats are integers, at any depth."""
+    """Count the integers among values that Nav2 reads as floats, at any depth."""
     if isinstance(value, list):
         return sum(map(_integers, value))
     if not isinstance(value, dict):
@@ -248,7 +250,7 @@ def _integers(value: Any) -> int:
 
 
 def as_floats(value: Any) -> Any:
-    """The same with these values as floats."""
+    """Convert these values to floats."""
     if isinstance(value, list):
         return [as_floats(v) for v in value]
     if not isinstance(value, dict):
@@ -257,7 +259,7 @@ def as_floats(value: Any) -> Any:
 
 
 def loader_problems(properties: Mapping[str, Any]) -> Iterator[str]:
-    """What the route server's loader would throw at in a feature's properties."""
+    """Check a feature's properties for values at which the route server's loader throws."""
     metadata, operations = properties.get("metadata"), properties.get("operations")
     if "metadata" in properties:
         yield from _metadata_problems(metadata, "metadata")
@@ -275,7 +277,7 @@ def loader_problems(properties: Mapping[str, Any]) -> Iterator[str]:
     if not isinstance(properties.get("overridable", True), bool):
         yield f"overridable must be true or false, got {str(properties['overridable'])[:40]!r}"
     if not isinstance(properties.get("frame", ""), str):
-        yield f"frame must be a text, got {str(properties['frame'])[:40]!r}"
+        yield f"frame must be a string, got {str(properties['frame'])[:40]!r}"
 
 
 def _metadata_problems(value: Any, location: str) -> Iterator[str]:
@@ -286,4 +288,4 @@ def _metadata_problems(value: Any, location: str) -> Iterator[str]:
         if isinstance(inner, dict):
             yield from _metadata_problems(inner, f"{location}.{key[:60]}")
         elif any(v is None or isinstance(v, (dict, list)) for v in (inner if isinstance(inner, list) else [inner])):
-            yield f"{location}.{key[:60]}: Nav2 reads numbers, texts, booleans and lists of these only"
+            yield f"{location}.{key[:60]}: Nav2 reads only numbers, strings, booleans and lists of these"

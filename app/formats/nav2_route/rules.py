@@ -1,8 +1,8 @@
-"""What Nav2's route server wants of a graph.
+"""Consumer checks for Nav2's route server.
 
 Sources: nav2_route, geojson_graph_file_loader.cpp (nlohmann::json: a missing or wrongly typed member throws),
 types.hpp (Metadata::getValue<float> throws bad_any_cast at an integer), the scorers' parameters, nav2_msgs (uint16 ids
-in DynamicEdges, ComputeRoute). A bad graph is noticed after the old one is cleared: the robot has none then.
+in DynamicEdges, ComputeRoute). The server notices an invalid graph after it cleared the old one: the robot has none.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MAX_EXACT_METRES = 16_384.0
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A graph as the route server loads it."""
+    """Check a graph by the route server's rules."""
     main = next(iter(files))
     top = orjson.loads(files[main])
     rows = top.get("features") if isinstance(top, dict) else None
@@ -35,7 +35,7 @@ def check(files: Files) -> Iterator[Problem]:
         yield error_finding("there is no array of features", main, where="features")
         return
     if not isinstance(top.get("crs", {}), dict) or any(name in str(top.get("crs")) for name in ON_EARTH):
-        reason = "says longitude and latitude; the route server ignores it and takes the numbers for metres"
+        reason = "names longitude and latitude, but the route server ignores that and reads the numbers as metres"
         yield warning_finding(reason, main, where="crs")
     nodes: list[int] = []
     edges: list[tuple[int, Any, Any]] = []
@@ -48,12 +48,12 @@ def check(files: Files) -> Iterator[Problem]:
             continue
         kind = geometry.get("type")
         if kind != "Point" and kind not in LINES:
-            continue  # the route server passes over it
+            continue  # the route server skips it
         if not isinstance(properties, dict):
             yield error_finding("has no properties", main, where=location)
             continue
         if not _is_id(properties.get("id")):
-            reason = f"must be a whole number from 0 to {MAX_ID}, is {shown(properties.get('id'))}"
+            reason = f"must be an integer from 0 to {MAX_ID}, is {shown(properties.get('id'))}"
             yield error_finding(reason, main, where=f"{location}.properties.id")
             continue
         if kind == "Point":
@@ -73,17 +73,17 @@ def check(files: Files) -> Iterator[Problem]:
     yield from _graph(nodes, edges, main)
     if far:
         reason = (
-            f"{far} nodes lie more than {MAX_EXACT_METRES:g} m from the origin; the server's 32 bit floats step by "
-            "2 mm there"
+            f"{far} nodes are more than {MAX_EXACT_METRES:g} m from the origin, where the server's 32-bit floats "
+            "are 2 mm apart"
         )
         yield warning_finding(reason, main)
 
 
 def _types(properties: Mapping[str, Any], main: str, location: str, *, is_node: bool) -> Iterator[Problem]:
-    """What a node or an edge may say, with values of the types that the loader asks for."""
+    """Check the types of a node's or edge's members against the loader."""
     if is_node:
         if not isinstance(properties.get("frame", ""), str):
-            reason = f"must be a text, is {shown(properties['frame'])}"
+            reason = f"must be a string, is {shown(properties['frame'])}"
             yield error_finding(reason, main, where=f"{location}.properties.frame")
         return
     if not is_number(properties.get("cost", 0.0)):
@@ -100,21 +100,21 @@ def _is_id(value: Any) -> bool:
 
 def _graph(nodes: list[int], edges: list[tuple[int, Any, Any]], main: str) -> Iterator[Problem]:
     if not nodes:
-        yield error_finding("there is no node (a Point with an id)", main, where="features")
+        yield error_finding("no node (a Point with an id)", main, where="features")
     if not edges:
-        yield error_finding("there is no edge (a LineString with an id)", main, where="features")
+        yield error_finding("no edge (a LineString with an id)", main, where="features")
     node_ids = set(nodes)
     dangling = [n for n, *ends in edges if not all(_is_id(end) and end in node_ids for end in ends)]
     if dangling:
-        yield error_finding(f"{len(dangling)} edges begin or end at a node that is not there: {names(dangling)}", main)
+        yield error_finding(f"{len(dangling)} edges begin or end at missing nodes: {names(dangling)}", main)
     for noun, ids in (("nodes", nodes), ("edges", [n for n, _, _ in edges])):
         if repeats := [n for n, count in Counter(ids).items() if count > 1]:
             yield warning_finding(
-                f"{len(repeats)} ids are given to several {noun}; one of them wins: {names(repeats)}", main
+                f"{len(repeats)} ids belong to several {noun}; only one of these is used: {names(repeats)}", main
             )
         if large := [n for n in ids if n > MAX_SHORT_ID]:
             use = "ComputeRoute and ComputeAndTrackRoute" if noun == "nodes" else "DynamicEdges"
-            reason = f"{len(large)} {noun} have an id above {MAX_SHORT_ID}, which {use} cannot name: {names(large)}"
+            reason = f"{len(large)} {noun} have an id above {MAX_SHORT_ID}, which {use} cannot transmit: {names(large)}"
             yield warning_finding(reason, main)
 
 
@@ -128,10 +128,10 @@ def _metadata(metadata: Any, main: str, location: str) -> Iterator[Problem]:
             yield from _metadata(value, main, inside)
         elif any(v is None or isinstance(v, (dict, list)) for v in (value if isinstance(value, list) else [value])):
             yield error_finding(
-                "the loader takes numbers, texts, truth values and lists of these only", main, where=inside
+                "must be a number, string, boolean or list of these: the loader reads nothing else", main, where=inside
             )
         elif key in FLOATS and isinstance(value, int):
-            reason = f"is read as a float, at which the integer {shown(value)} throws: write it with a point"
+            reason = f"is read as a float, at which the integer {shown(value)} throws: write it with a decimal point"
             yield error_finding(reason, main, where=inside)
 
 
@@ -144,7 +144,7 @@ def _operations(operations: Any, main: str, location: str) -> Iterator[Problem]:
         if not isinstance(one, dict) or not isinstance(one.get("type"), str):
             yield error_finding("an operation needs a type", main, where=inside)
         elif one.get("trigger") not in TRIGGERS:
-            reason = f"its trigger must be one of {', '.join(TRIGGERS)}, is {shown(one.get('trigger'))}"
+            reason = f"trigger must be one of {', '.join(TRIGGERS)}, is {shown(one.get('trigger'))}"
             yield error_finding(reason, main, where=inside)
         elif "metadata" in one:
             yield from _metadata(one["metadata"], main, f"{inside}.metadata")

@@ -1,4 +1,4 @@
-"""The words of Nav2's route graphs: what a file holds."""
+"""Names in Nav2's route graphs, and the shape of a file."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ FRAME = "map"
 LINES = ("LineString", "MultiLineString")
 MAX_ID = 2**32 - 1
 MAX_USED_ID = 2**16 - 1
-"""Of ComputeRoute's start and goal, and of the edges that DynamicEdges closes."""
+"""Largest id in ComputeRoute's start and goal, and in the edges that DynamicEdges closes."""
 
 FLOATS = frozenset({"speed_limit", "abs_speed_limit", "penalty", "abs_time_taken"})
-"""Metadata that Nav2's own plugins ask for as floats."""
+"""Metadata that Nav2's own plugins read as floats."""
 
 TEXTS: Mapping[str, str] = {"name": "name", "action": "action"}
 NUMBERS: Mapping[str, str] = {"abs_speed_limit": "speed_limit", "width": "width"}
 CANONICAL_METADATA: Mapping[str, str] = {**TEXTS, **NUMBERS}
-"""Metadata word -> the canonical word, for values that are texts and numbers."""
+"""Canonical properties by metadata key, for values that are texts and numbers."""
 
 TRIGGERS = ("NODE", "ON_ENTER", "ON_EXIT")
 
@@ -45,7 +45,7 @@ _FEATURE = record(
     ),
 )
 SHAPE = record(is_open=True, type=OneOf(("FeatureCollection",)), features=[_FEATURE])
-"""What a graph holds. Source: nav2_route, GeoJsonGraphFileLoader; members beside these are GeoJSON's or QGIS'."""
+"""Shape of a graph. Source: nav2_route, GeoJsonGraphFileLoader; further members belong to GeoJSON or QGIS."""
 
 CANONICAL_NODE = frozenset({"kind", "name", "action", "speed_limit", "width", NAME}) | CROSS_PART_PROPERTIES
 CANONICAL_EDGE = CANONICAL_NODE | {"source", "target"}

@@ -1,4 +1,4 @@
-"""Writing a route graph: nodes and edges with the numbers that they had."""
+"""Write a route graph: nodes and edges with their original numbers."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ from app.syntax.decimals import METRES
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What the file says where no source does."""
+    """Values to write if no source has them."""
 
-    graph_name: str | None = parameter(None, "name of a graph that no source names; default: the map's")
-    frame_id: str = parameter(FRAME, "frame of nodes whose source names none")
+    graph_name: str | None = parameter(None, "name of a graph without name in its source; default: the map's")
+    frame_id: str = parameter(FRAME, "frame of nodes without frame in their source")
 
 
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
-"""What Nav2's own graphs say, so that QGIS shows their metres; the route server does not look at it."""
+"""CRS in Nav2's own graphs, with which QGIS shows their metres; the route server ignores it."""
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``graph.geojson``: all networks of the environment as one graph, nodes and then edges by their numbers.
+    """Write ``graph.geojson``: all networks of the environment as one graph, nodes and then edges by their numbers.
 
-    Numbers of a source come back; any other item gets one that follows from its id alone (unless that is taken), so
-    that it stays the same when others come and go. Wgs84 items are brought to local metres (MissingDatum without a
-    datum). CannotConvert where there is no node or no edge.
+    Items keep the numbers of their source; any other item gets one that follows from its id alone (unless that is
+    taken), so that it does not depend on other items. Wgs84 items are converted to local metres. Raises MissingDatum
+    without a datum, CannotConvert if there is no node or no edge.
     """
     return {"graph.geojson": _Writer(layers, context).data()}
 
@@ -80,14 +80,16 @@ class _Writer:
         self.net: MergedNetwork = merge_networks(layers, context)
         if not self.net.nodes or not self.net.edges:
             noun = "no node" if not self.net.nodes else "no edge between its nodes"
-            raise CannotConvert(f"the network has {noun}; the route server needs both: supply a network with edges")
+            raise CannotConvert(
+                f"the network has {noun}, but the route server needs nodes and edges: supply a network with edges"
+            )
         self.nodes, self.edges = self._numbers()
         self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
         self.framed = 0
         self.lost: Counter[str] = Counter()
 
     def _numbers(self) -> tuple[list[int], list[int]]:
-        """The numbers of nodes and edges, apart from each other where there are enough."""
+        """Return the numbers of nodes and edges, different from each other if enough are available."""
         net, context = self.net, self.context
         nodes, edges = _stored_numbers(net.nodes), _stored_numbers(net.edges)
         own_nodes, own_edges = set(nodes.values()), set(edges.values())
@@ -98,12 +100,13 @@ class _Writer:
         duplicate_count += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
         if duplicate_count:
             context.warn(
-                f"{duplicate_count} numbers stood for several items, which Nav2 would mix up: the others got new ones"
+                f"{duplicate_count} items shared the number of another one, which Nav2 would confuse; they got "
+                "new numbers"
             )
         return [nodes[k] for k in range(len(nodes))], [edges[k] for k in range(len(edges))]
 
     def data(self) -> bytes:
-        """The whole text, one line for each feature."""
+        """Return the complete text, one line for each feature."""
         net, context = self.net, self.context
         at = np.array([(n.x, n.y, 0.0 if n.z is None else n.z) for n in net.nodes], np.float64)
         places = (np.round(at, METRES) + 0.0).tolist()
@@ -119,7 +122,11 @@ class _Writer:
         ignored = self.document.get("ignored")
         rows += [_dump(row) for row in ignored if isinstance(row, dict)] if isinstance(ignored, list) else []
         self.lost["dangling"] += count(self.document.get("dangling"))
-        context.drop("edges to nowhere", self.lost["dangling"], "Nav2 refuses a graph with one, and loses the old one")
+        context.drop(
+            "edges without both end nodes",
+            self.lost["dangling"],
+            "Nav2 rejects a graph that contains one, and loses the old graph",
+        )
         return _dump(head)[:-1] + b',"features":[\n' + b",\n".join(rows) + b"\n]}\n"
 
     def _head(self) -> dict[str, Any]:
@@ -128,14 +135,14 @@ class _Writer:
         if not self.document:
             title = self.options.graph_name or self.context.title
             head = {"name": title, "crs": CRS}
-            self.context.fill("name", title, "no source names the graph", "graph_name")
-            self.context.fill("crs", CRS["properties"], "QGIS shows metres by it; the route server ignores it")
+            self.context.fill("name", title, "not in any source", "graph_name")
+            self.context.fill("crs", CRS["properties"], "QGIS displays metres with it; the route server ignores it")
         if self.context.attribution and not head.keys() & {"attribution", "license", "copyright"}:
             head["attribution"] = "; ".join(self.context.attribution)
         return head
 
     def _feature(self, item: Node | Edge, n: int, geometry: dict[str, Any], ends: dict[str, int]) -> bytes:
-        """One line of the file."""
+        """Return one line of the file."""
         p = item.properties
         source_members = get_source_properties(p, NAME)
         extra_properties = source_members.get("properties")
@@ -163,7 +170,7 @@ class _Writer:
         return _dump(row)
 
     def _metadata(self, p: Properties, number: str) -> dict[str, Any]:
-        """The canonical words among the metadata."""
+        """Return the canonical properties in the metadata."""
         out: dict[str, Any] = {}
         for key, canonical in CANONICAL_METADATA.items():
             value: Any = p.get(canonical)
@@ -195,16 +202,18 @@ class _Writer:
             context.drop("levels of nodes", len(net.nodes), "all networks are joined into one graph")
         foreign = sum(NAME not in n.properties for n in net.nodes) + sum(NAME not in e.properties for e in net.edges)
         if self.framed:
-            context.fill("frame", self.options.frame_id, f"{self.framed} nodes name none", "frame_id")
+            context.fill("frame", self.options.frame_id, f"{self.framed} nodes have none", "frame_id")
         if foreign:
-            context.fill("id", "a number made from each id", f"{foreign} nodes and edges have no number of their own")
+            context.fill(
+                "id", "a number computed from each id", f"{foreign} nodes and edges have no number of their own"
+            )
         context.drop(
-            "items with attributes that Nav2 has no word for", counts["attributes"], "other formats' own knowledge"
+            "items with attributes that Nav2 cannot express", counts["attributes"], "source properties of other formats"
         )
 
 
 def _claim(item: Node | Edge) -> int | None:
-    """The number that an item has from its source."""
+    """Return an item's number in its source."""
     source_id = get_source_properties(item.properties, NAME).get("id")
     return (
         source_id
@@ -214,7 +223,7 @@ def _claim(item: Node | Edge) -> int | None:
 
 
 def _stored_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
-    """Place -> number of the items that have one; of several with the same, the one whose id still says it."""
+    """Map index to number of items that have one; of several with the same number, the one with a matching id."""
     claims: dict[int, list[int]] = defaultdict(list)
     for k, item in enumerate(items):
         n = _claim(item)
@@ -224,7 +233,7 @@ def _stored_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
 
 
 def _assign_numbers(items: Sequence[Node | Edge], claims: Mapping[int, int], taken: set[int]) -> dict[int, int]:
-    """Place -> number of all items; ``taken`` grows. Ids that are numbers come before those that one is made from."""
+    """Map index to number of all items; ``taken`` grows. Numeric ids are assigned before computed numbers."""
     out = dict(claims)
     remaining = sorted((k for k in range(len(items)) if k not in out), key=lambda k: items[k].id)
     for k in remaining:
@@ -244,7 +253,7 @@ def _is_number(text: str) -> bool:
 
 
 def _candidates(text: str, size: int) -> Iterable[int]:
-    """Numbers below ``size`` that follow from a text, one after the other."""
+    """Yield numbers below ``size`` that follow from a text, each once."""
     first = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
-    step = first >> 32 | 1  # odd, so that all numbers come
+    step = first >> 32 | 1  # odd, so that every number occurs
     return ((first + k * step) % size for k in range(size))

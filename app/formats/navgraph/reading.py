@@ -1,4 +1,4 @@
-"""Reading a navgraph: its nodes and connections as a network."""
+"""Read a navgraph: its nodes and connections as a network."""
 
 from __future__ import annotations
 
@@ -42,21 +42,21 @@ from app.syntax import yaml
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The graph as topology, local metres. Raises UnreadableFile naming the node or connection."""
+    """Read the graph as topology, local metres. Raises UnreadableFile naming the node or connection."""
     if not context.wants("topology"):
         return Layers()
     data = files[context.main or next(iter(files))]
     top = yaml.load(data, context.limits, tags=TAGS, typed=False)
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
-        raise UnreadableFile("there is no list of nodes: not a navgraph", [Problem("no list", where="nodes")])
+        raise UnreadableFile("not a navgraph: a list of nodes is missing", [Problem("no list", where="nodes")])
     nodes = [_ParsedNode(item, k, context) for k, item in enumerate(top["nodes"])]
     _fields.check(top, SHAPE, context)
     names = [node.name for node in nodes]
     ids = unique_ids(map(identifier, names))
     if repeats := duplicates(names):
         context.warn(
-            f"{len(repeats)} names stand twice or more: {shorten_list(repeats)}; Fawkes refuses that; the first is "
-            "meant"
+            f"{len(repeats)} duplicate node names: {shorten_list(repeats)}; Fawkes rejects them, and connections "
+            "use the first"
         )
     index_by_name = {name: k for k, name in reversed(list(enumerate(names)))}
     rows, dangling = _connections(top.get("connections"), index_by_name, context)
@@ -92,7 +92,7 @@ class _ParsedNode:
         self.name = check_name(_name(entry["name"], f"{location}.name"), f"{location}.name")
         self.location = self.name
         if self.tag not in (None, UNCONNECTED):
-            context.warn(f"Fawkes does not know the tag !{self.tag} of a node", where=self.location)
+            context.warn(f"Fawkes does not support the tag !{self.tag} of a node", where=self.location)
         at = entry.get("pos")
         if not isinstance(at, list) or len(at) != 2:
             raise_unreadable("pos must be [x, y]", f"{self.location}.pos")
@@ -104,14 +104,14 @@ class _ParsedNode:
         }
 
     def canonical(self, i: str) -> dict[str, Any]:
-        """Its properties in the canonical layer."""
+        """Return its canonical properties."""
         source_properties: dict[str, Any] = {}
         out: dict[str, Any] = {"kind": "node", "name": self.name, NAME: source_properties}
         properties = dict(self.properties)
         display = properties.get("name")
         if isinstance(display, str) and display not in ("", self.name) and "name" not in self.words:
             out["name"] = display
-            source_properties["name"] = self.name  # also where the item is found again under another id
+            source_properties["name"] = self.name  # also if the item later has another id
             del properties["name"]
         turned = properties.get("orientation")
         if isinstance(turned, (int, float)) and not isinstance(turned, bool):
@@ -124,33 +124,33 @@ class _ParsedNode:
 
 
 def _untag(item: Any, location: str, context: ReadContext) -> tuple[str | None, Any]:
-    """(the tag's own name, the value)."""
+    """Return the tag's own name and the value."""
     if not isinstance(item, yaml.Tagged):
         return None, item
     tag = item.tag.removeprefix(PREFIX) if item.tag.startswith(PREFIX) else item.tag[1:]
     if not WORD.match(tag):
-        raise_unreadable(f"{item.tag[:80]!r} cannot be a tag: letters, digits, - and _ can", location)
+        raise_unreadable(f"invalid tag {item.tag[:80]!r}: use letters, digits, - and _", location)
     if not item.tag.startswith(PREFIX):
-        context.warn(f"the tag !{tag} needs the line '%TAG ! {PREFIX}' for Fawkes to know it", where=location)
+        context.warn(f"the tag !{tag} has no effect in Fawkes without the line '%TAG ! {PREFIX}'", where=location)
     return tag, item.value
 
 
 def _name(value: Any, location: str) -> str:
-    """A scalar as the text that it is for Fawkes."""
+    """Return a scalar as the text that Fawkes reads."""
     if not isinstance(value, str):
-        raise_unreadable("must be a text", location)
+        raise_unreadable("must be a string", location)
     return str.__str__(value)
 
 
 def _plain(value: Any, location: str) -> Any:
-    """A value as JSON-like data; scalars without quotes get their meaning."""
+    """Convert a value to JSON-like data; unquoted scalars are parsed."""
     if isinstance(value, yaml.PlainScalar):
         try:
             return yaml.scalar(str.__str__(value))
         except ValueError as error:
             raise_unreadable(str(error), location)
     if isinstance(value, yaml.Tagged):
-        raise_unreadable(f"the tag {value.tag[:80]} has no meaning here", location)
+        raise_unreadable(f"unsupported tag {value.tag[:80]}", location)
     if isinstance(value, dict):
         return {key: _plain(v, location) for key, v in value.items()}
     if isinstance(value, list):
@@ -159,11 +159,11 @@ def _plain(value: Any, location: str) -> Any:
 
 
 def _properties(listing: Any, location: str, context: ReadContext) -> tuple[dict[str, Any], list[str]]:
-    """(a list of one-key mappings and bare words as a mapping, the bare words, sorted)."""
+    """Convert a list of one-key mappings and bare words to a mapping; also return the bare words, sorted."""
     if listing is None or listing == "":
         return {}, []
     if isinstance(listing, dict):
-        context.warn("must be a list of one-key mappings for Fawkes; a list is served", where=location)
+        context.warn("must be a list of one-key mappings for Fawkes; it is exported as a list", where=location)
         listing = [listing]
     if not isinstance(listing, list):
         raise_unreadable("must be a list of words and one-key mappings", location)
@@ -179,9 +179,9 @@ def _properties(listing: Any, location: str, context: ReadContext) -> tuple[dict
             raise_unreadable("must be a list of words and one-key mappings", location)
         for key, value in pairs:
             if key in out:
-                context.warn("stands twice; the last value counts", where=f"{location}.{key}")
+                context.warn("duplicate key; the last value is used", where=f"{location}.{key}")
             if isinstance(value, (dict, list)):
-                context.warn("is no scalar, which Fawkes refuses; it is kept", where=f"{location}.{key}")
+                context.warn("not a scalar, which Fawkes rejects; it is stored", where=f"{location}.{key}")
             out[key] = value
             flags.discard(key)
         if isinstance(item, str):
@@ -195,8 +195,10 @@ Row = tuple[int, int, dict[str, Any]]
 def _connections(
     entries: Any, index_by_name: Mapping[str, int], context: ReadContext
 ) -> tuple[list[Row], dict[int, list[dict[str, Any]]]]:
-    """((source, target, what only this format knows) of each edge; the connections to nowhere by their known node, by
-    -1 where both are unknown)."""
+    """Return the edges as (source, target, source properties), and the dangling connections.
+
+    Dangling connections are grouped by their existing node, by -1 if there is none.
+    """
     if entries is None or entries == "":
         return [], {}
     if not isinstance(entries, list):
@@ -206,10 +208,10 @@ def _connections(
         location = f"connections[{k}]"
         tag, pair = _untag(item, location, context)
         if not isinstance(pair, list) or len(pair) != 2:
-            raise_unreadable("a connection is a pair of names: [from, to]", location)
+            raise_unreadable("a connection must be a pair of names: [from, to]", location)
         items.append((tag, _name(pair[0], location), _name(pair[1], location), location))
         if tag is not None and tag not in KNOWN_TAGS:
-            context.warn(f"Fawkes does not know the tag !{tag} of a connection", where=location)
+            context.warn(f"Fawkes does not support the tag !{tag} of a connection", where=location)
     ordered = any(tag in MODES for tag, _, _, _ in items)
     rows: list[Row] = []
     dangling: dict[int, list[dict[str, Any]]] = defaultdict(list)
@@ -219,15 +221,17 @@ def _connections(
         if a not in index_by_name or b not in index_by_name:
             missing = a if a not in index_by_name else b
             home = index_by_name.get(a, index_by_name.get(b))
-            reason = f"{a} - {b}: there is no node {missing!r}, which Fawkes refuses; it is kept, but not served"
+            reason = (
+                f"{a} - {b}: unknown node {missing!r}, which Fawkes rejects; the connection is stored, but not exported"
+            )
             context.warn(reason, where=location)
             dangling[-1 if home is None else home].append({**extra_members, "ends": [a, b]})
             continue
         if (a, b) in seen:
-            context.warn(f"{a} - {b} stands twice, which Fawkes refuses", where=location)
+            context.warn(f"duplicate connection {a} - {b}, which Fawkes rejects", where=location)
         seen |= {(a, b)} if tag == DIRECTED else {(a, b), (b, a)}
         if a == b:
-            context.warn(f"{a} is connected with itself", where=location)
+            context.warn(f"{a} is connected to itself", where=location)
         if ordered:
             extra_members["order"] = k
         rows.append((index_by_name[a], index_by_name[b], extra_members))
@@ -237,16 +241,16 @@ def _connections(
 
 
 def _document(top: Mapping[str, Any], names: set[str], context: ReadContext) -> dict[str, Any]:
-    """What the file says as a whole."""
+    """Return the collection document."""
     extra_members = {
         key: str.__str__(value) if value and isinstance(value, str) and key in NAME_KEYS else _plain(value, key)
         for key, value in top.items()
         if key not in TOP_KEYS
     }
     if "graph-name" not in extra_members:
-        context.warn("is missing; Fawkes asks for it", where="graph-name")
+        context.warn("missing, but required by Fawkes", where="graph-name")
     if isinstance(extra_members.get("root"), str) and extra_members["root"] and extra_members["root"] not in names:
-        context.warn(f"{extra_members['root']!r} is no node", where="root")
+        context.warn(f"{extra_members['root']!r} is not a node", where="root")
     out: dict[str, Any] = {"top": extra_members}
     defaults, flags = _properties(top.get("default-properties"), "default-properties", context)
     if defaults:

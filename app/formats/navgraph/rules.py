@@ -1,7 +1,8 @@
-"""What Fawkes wants of a navigation graph.
+"""Consumer checks for navigation graphs: Fawkes.
 
-Source: fawkesrobotics/fawkes, src/libs/navgraph/yaml_navgraph.cpp and navgraph.cpp (add_node and add_edge refuse what
-is there already or not there; calc_reachability asserts that each node is connected unless it is ``!unconnected``).
+Source: fawkesrobotics/fawkes, src/libs/navgraph/yaml_navgraph.cpp and navgraph.cpp (add_node and add_edge reject
+duplicate nodes and missing ones; calc_reachability asserts that each node is connected unless it is
+``!unconnected``).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ EDGE_TAGS = frozenset({"dir", "bidir", "allow-intersection", "no-intersection", 
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A graph as Fawkes loads it."""
+    """Check a graph by Fawkes' rules."""
     main = next(iter(files))
     if is_brief(files[main]):
         return
@@ -40,7 +41,7 @@ def check(files: Files) -> Iterator[Problem]:
         return
     top = yaml.load(files[main], LIMITS, tags=OURS, typed=False)
     if not isinstance(top, dict):
-        yield error_finding("a graph is a mapping", main)
+        yield error_finding("a graph must be a mapping", main)
         return
     if not isinstance(top.get("graph-name"), str):
         yield error_finding("a graph needs a name", main, where="graph-name")
@@ -54,14 +55,14 @@ def check(files: Files) -> Iterator[Problem]:
         tags += [tag] if tag else []
         location = f"nodes[{k}]"
         if not isinstance(node, dict) or not isinstance(node.get("name"), str):
-            yield error_finding("a node is a mapping with a name", main, where=location)
+            yield error_finding("a node must be a mapping with a name", main, where=location)
             continue
         called.append(node["name"])
         if tag == PREFIX + "unconnected":
             alone.add(node["name"])
         elif tag and tag.removeprefix(PREFIX) not in NODE_TAGS and tag.startswith(PREFIX):
             yield warning_finding(
-                f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a node", main, where=location
+                f"Fawkes does not support the tag {shown(tag.removeprefix(PREFIX))} of a node", main, where=location
             )
         at = node.get("pos")
         if not isinstance(at, list) or len(at) != 2 or any(cpp_number(v) is None for v in at):
@@ -69,12 +70,10 @@ def check(files: Files) -> Iterator[Problem]:
         if "properties" in node:
             yield from _properties(node["properties"], main, f"{location}.properties")
     if repeats := duplicates(called):
-        yield error_finding(f"{len(repeats)} nodes have a name that is taken: {names(repeats)}", main, where="nodes")
+        yield error_finding(f"{len(repeats)} duplicate node names: {names(repeats)}", main, where="nodes")
     yield from _connections(top.get("connections"), set(called), alone, tags, main)
     if foreign := [tag for tag in tags if not tag.startswith(PREFIX)]:
-        reason = (
-            f"without the line %TAG ! {PREFIX} the tags are not Fawkes' and mean nothing: {names(sorted(set(foreign)))}"
-        )
+        reason = f"tags have no effect in Fawkes without the line %TAG ! {PREFIX}: {names(sorted(set(foreign)))}"
         yield error_finding(reason, main)
 
 
@@ -89,7 +88,9 @@ def _properties(properties: Any, main: str, location: str) -> Iterator[Problem]:
     for k, one in enumerate(properties):
         values = one.values() if isinstance(one, dict) else [one]
         if not all(isinstance(v, str) for v in values):
-            yield error_finding("a property is a word or a key with a single value", main, where=f"{location}[{k}]")
+            yield error_finding(
+                "a property must be a word or a key with a single value", main, where=f"{location}[{k}]"
+            )
 
 
 def _connections(
@@ -102,21 +103,21 @@ def _connections(
         tag, ends = _split_tag(item)
         tags += [tag] if tag else []
         if not isinstance(ends, list) or len(ends) != 2 or not all(isinstance(end, str) for end in ends):
-            yield error_finding("a connection is a list of two names", main, where=f"connections[{k}]")
+            yield error_finding("a connection must be a list of two names", main, where=f"connections[{k}]")
             continue
         if tag.startswith(PREFIX) and tag.removeprefix(PREFIX) not in EDGE_TAGS:
-            reason = f"Fawkes knows no tag {shown(tag.removeprefix(PREFIX))} of a connection"
+            reason = f"Fawkes does not support the tag {shown(tag.removeprefix(PREFIX))} of a connection"
             yield warning_finding(reason, main, where=f"connections[{k}]")
         dangling += [str(end) for end in ends if end not in node_names]
         reached.update(map(str, ends))
         pairs.append((str(ends[0]), str(ends[1])))
     if dangling:
         yield error_finding(
-            f"{len(dangling)} ends of connections are no nodes: {names(dangling)}", main, where="connections"
+            f"{len(dangling)} ends of connections are not nodes: {names(dangling)}", main, where="connections"
         )
     if repeats := duplicates(pairs):
         pair_names = names("-".join(pair) for pair in repeats)
-        yield warning_finding(f"{len(repeats)} connections stand there twice: {pair_names}", main, where="connections")
+        yield warning_finding(f"{len(repeats)} duplicate connections: {pair_names}", main, where="connections")
     if lonely := sorted(node_names - reached - alone):
-        reason = f"{len(lonely)} nodes have no connection and are not !unconnected: {names(lonely)}"
+        reason = f"{len(lonely)} isolated nodes are not tagged !unconnected: {names(lonely)}"
         yield error_finding(reason, main, where="nodes")

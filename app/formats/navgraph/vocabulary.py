@@ -1,4 +1,4 @@
-"""The words of Fawkes' navgraphs: what a file holds."""
+"""Names in Fawkes' navgraphs, and the shape of a file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from app.formats._network import CROSS_PART_PROPERTIES
 NAME = "navgraph"
 PREFIX = "tag:fawkesrobotics.org,navgraph/"
 TAGS = (PREFIX, "!")
-"""Our tags with Fawkes' %TAG line, and without it (then Fawkes does not know them)."""
+"""Prefixes of tags with Fawkes' %TAG line, and without it (then Fawkes ignores them)."""
 
 DIRECTED, UNCONNECTED, CROSSING = "dir", "unconnected", "allow-intersection"
 MODES = frozenset({CROSSING, "no-intersection", "split-intersection"})
@@ -43,4 +43,4 @@ SHAPE = Record(
         "nodes": [record("name", pos=(COORDINATE, COORDINATE), properties=_PROPERTIES)],
     }
 )
-"""What a navgraph holds. Source: Fawkes, libs/navgraph/yaml_navgraph.cpp."""
+"""Shape of a navgraph. Source: Fawkes, libs/navgraph/yaml_navgraph.cpp."""

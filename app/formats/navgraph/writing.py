@@ -1,4 +1,4 @@
-"""Writing a navgraph: in the order and with the tags that keep Fawkes' connections as they are stored."""
+"""Write a navgraph, with an order and tags with which Fawkes loads the stored connections."""
 
 from __future__ import annotations
 
@@ -46,28 +46,28 @@ from app.syntax import yaml
 from app.syntax.decimals import METRES, numbers
 
 MANY_CROSSINGS = 50
-"""Crossings a connection on average: a network with more is a scribble, and each is taken for crossing."""
+"""Crossings per connection on average, beyond which the remaining connections all count as crossing."""
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``navgraph.yaml``: all networks of the environment as one graph, nodes sorted by length and text of their names.
+    """Write ``navgraph.yaml``: all networks of the environment as one graph, nodes in natural order of names.
 
-    Edges of both directions between two nodes are one connection. Wgs84 items are brought to local metres (MissingDatum
-    without a datum).
+    Edges of both directions between two nodes are one connection. Wgs84 items are converted to local metres. Raises
+    MissingDatum without a datum.
     """
     return {"navgraph.yaml": _Writer(layers, context).file().encode()}
 
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What the file says where no source does."""
+    """Values to write if no source has them."""
 
-    graph_name: str | None = parameter(None, "name of a graph that no source names; default: the map's")
+    graph_name: str | None = parameter(None, "name of a graph without name in its source; default: the map's")
 
 
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """A line of the file: its tag, its ends (places of nodes), whether another format's network has it."""
+    """A connection to write: its tag, its end nodes (indexes), whether it comes from another format."""
 
     tag: str | None
     a: int
@@ -89,11 +89,9 @@ class _Writer:
         return source_name if isinstance(source_name, str) and is_name(source_name) else node.id
 
     def file(self) -> str:
-        """The whole text."""
+        """Return the complete text."""
         if repeats := duplicates(self.names):
-            self.context.warn(
-                f"{len(repeats)} names stand twice or more, which Fawkes refuses: {shorten_list(repeats)}"
-            )
+            self.context.warn(f"{len(repeats)} duplicate node names, which Fawkes rejects: {shorten_list(repeats)}")
         connections = self._with_tags(list(self._connections()))
         order = self._node_order(connections)
         out = [f"%YAML 1.2\n%TAG ! {PREFIX}\n---\n", self._head(), "nodes:" if order else "nodes: []"]
@@ -111,13 +109,13 @@ class _Writer:
         return "".join(out)
 
     def _head(self) -> str:
-        """The keys before the nodes."""
+        """Return the keys before the nodes."""
         source_value = self.document.get("top")
         top = {w: v for w, v in source_value.items() if w not in TOP_KEYS} if isinstance(source_value, dict) else {}
         if not isinstance(top.get("graph-name"), str) or not top["graph-name"]:
             source_value = getattr(self.context.options, "graph_name", None)
             top["graph-name"] = source_value or self.context.title
-            self.context.fill("graph-name", top["graph-name"], "no source names it", "graph_name")
+            self.context.fill("graph-name", top["graph-name"], "not in any source", "graph_name")
         first = {key: top.pop(key) for key in ("graph-name", "root") if key in top}
         out = [yaml.mapping({key: value}, 0) for key, value in first.items()]
         if top:
@@ -128,7 +126,7 @@ class _Writer:
         return "".join(out)
 
     def _node(self, k: int, x: str, y: str, *, linked: bool) -> str:
-        """The text of a node, with the line break before it."""
+        """Return the text of a node, with a line break before it."""
         node, name = self.net.nodes[k], self.names[k]
         p = node.properties
         source_members = get_source_properties(p, NAME)
@@ -138,7 +136,7 @@ class _Writer:
             self.lost["unconnected"] += 1
         elif tag == UNCONNECTED and linked:
             tag = None
-            self.context.warn("was !unconnected and is connected now: it is served without the tag", where=name)
+            self.context.warn("was !unconnected and is now connected; exported without the tag", where=name)
         extra_properties = source_members.get("properties")
         properties = dict(extra_properties) if isinstance(extra_properties, dict) else {}
         turned = yaw_or_source(properties.get("orientation"), p.get("orientation"))
@@ -164,7 +162,7 @@ class _Writer:
         return text[:-1]
 
     def _connections(self) -> Iterator[_Connection]:
-        """Edges as connections: both directions of a pair as one."""
+        """Convert edges to connections: both directions of a pair become one."""
         edges = sorted(self.net.edges, key=lambda e: (NAME not in e.properties, natural_sort_key(e.id)))
         waiting: dict[tuple[int, int, str | None], list[tuple[Edge, dict[str, Any]]]] = defaultdict(list)
         covered: set[tuple[int, int]] = set()
@@ -194,14 +192,14 @@ class _Writer:
                 yield _Connection(DIRECTED, a, b, NAME not in edge.properties, order)
 
     def _leads(self, a: Edge, its: Mapping[str, Any], b: Edge, other: Mapping[str, Any]) -> bool:
-        """Whether edge a is the one that a connection of both directions is named by."""
+        """Whether edge a, not its reverse, gives a connection of both directions its direction in the file."""
         backward = (bool(its.get("backward")), bool(other.get("backward")))
         if backward[0] != backward[1]:
             return backward[1]
         return natural_sort_key(self.names[a.source]) < natural_sort_key(self.names[b.source])
 
     def _with_tags(self, connections: list[_Connection]) -> list[_Connection]:
-        """The connections in the order that Fawkes shall add them, those of other formats tagged where they cross."""
+        """Sort the connections in the order for Fawkes, and tag crossing ones of other formats."""
         crossing = self._crossing(connections)
         out = []
         for k, c in enumerate(connections):
@@ -214,8 +212,8 @@ class _Writer:
         stuck = sum(c.tag == DIRECTED and bool(crossing[k]) for k, c in enumerate(connections) if c.foreign)
         if stuck:
             self.context.warn(
-                f"{stuck} one-way connections cross others; a connection has one tag only, so Fawkes refuses them "
-                "where two of them cross each other"
+                f"{stuck} one-way connections cross others; they cannot have a second tag, so Fawkes rejects "
+                "those that cross each other"
             )
         names = self.names
         out.sort(
@@ -224,7 +222,7 @@ class _Writer:
         return [c for _, _, c in out]
 
     def _crossing(self, connections: Sequence[_Connection]) -> Sequence[bool]:
-        """Which connections touch another one that they share no node with; not looked at in Fawkes' own graphs."""
+        """Return for each connection whether it touches one without a common node; skipped for Fawkes' own graphs."""
         n = len(connections)
         crossing = np.zeros(n, bool)
         if not any(c.foreign for c in connections):
@@ -246,7 +244,7 @@ class _Writer:
         return crossing.tolist()
 
     def _node_order(self, connections: Sequence[_Connection]) -> list[int]:
-        """Places of the nodes in the file's order. Fawkes wants all of them to be reachable from the first one."""
+        """Return node indexes in the file's order. Fawkes requires that all are reachable from the first one."""
         names, nodes = self.names, self.net.nodes
         order = sorted(range(len(names)), key=lambda k: natural_sort_key(names[k]))
         onward: dict[int, list[int]] = defaultdict(list)
@@ -263,7 +261,7 @@ class _Writer:
         seen: set[int] = set()
         starts = [k for k in needed if _reach(k, onward, seen)]
         if len(starts) > 1:
-            # Where any node reaches all, the last one that a search had to begin at does.
+            # If any node reaches all others, it is the last start of a search.
             everything: set[int] = set()
             _reach(starts[-1], onward, everything)
             if len(everything) == len(needed):
@@ -271,8 +269,8 @@ class _Writer:
                 order.insert(0, starts[-1])
             else:
                 self.context.warn(
-                    f"no node reaches all others (from {names[starts[0]]!r} not {names[starts[1]]!r}): Fawkes refuses "
-                    "that unless it allows several graphs in one"
+                    f"no node reaches all others ({names[starts[0]]!r} does not reach {names[starts[1]]!r}); "
+                    "Fawkes rejects such a graph unless multi-graphs are allowed"
                 )
         return order
 
@@ -280,32 +278,36 @@ class _Writer:
         context, counts = self.context, self.lost
         report_3d_loss(self.net, context, "Fawkes' nodes are two-dimensional")
         if counts["unconnected"]:
-            why = "Fawkes asks for the tag where no connection leads"
+            why = "Fawkes requires the tag for nodes without connections"
             context.fill("nodes: !unconnected", f"{counts['unconnected']} nodes", why)
         edges = [e for e in self.net.edges if NAME not in e.properties]
         unnamed = sum(e.id != f"{self.net.nodes[e.source].id}_{self.net.nodes[e.target].id}" for e in edges)
-        context.drop("ids of edges", unnamed, "a connection has no name; its ends say which one it is")
+        context.drop("ids of edges", unnamed, "a connection has no name, only its ends")
         context.drop(
-            "edges with attributes (action, speed limit …)", counts["edge attributes"], "connections have none"
+            "edges with attributes (action, speed limit …)", counts["edge attributes"], "connections have no attributes"
         )
-        context.drop("parallel edges", counts["parallel"], "Fawkes refuses a second connection of the same nodes")
+        context.drop("parallel edges", counts["parallel"], "Fawkes rejects a second connection between two nodes")
         context.drop(
-            "attributes of nodes that are no scalars", counts["node attributes"], "Fawkes' properties are texts"
+            "attributes of nodes that are not scalars", counts["node attributes"], "properties in Fawkes are texts"
         )
         context.drop("tilts of nodes", counts["tilted"], "an orientation is one angle")
-        context.drop("intersection tags", counts["one-way modes"], "the connection is one-way now and has one tag only")
+        context.drop(
+            "intersection tags", counts["one-way modes"], "the connection is now one-way and cannot have a second tag"
+        )
         counts["dangling"] += count(self.document.get("dangling"))
-        context.drop("connections to nowhere", counts["dangling"], "Fawkes refuses a graph with one")
+        context.drop(
+            "connections without both end nodes", counts["dangling"], "Fawkes rejects a graph that contains one"
+        )
 
 
 def _tag(source_members: Mapping[str, Any]) -> str | None:
-    """The tag that an item's source gave it, where it can be written."""
+    """Return the tag of an item's source, if it can be written."""
     tag = source_members.get("tag")
     return tag if isinstance(tag, str) and WORD.match(tag) else None
 
 
 def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> bool:
-    """Add all that can be reached from a node; False where it had been seen already."""
+    """Add all nodes that can be reached from a node; return False if it had been added already."""
     if start in seen:
         return False
     seen.add(start)
@@ -319,7 +321,7 @@ def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> b
 
 
 def _list_text(properties: Mapping[str, Any], flags: Any, column: int) -> str:
-    """A mapping as a list of one-key mappings, sorted, and bare words where the value still is true."""
+    """Write a mapping as a list of one-key mappings, sorted; bare words if their value is still true."""
     bare = frozenset(w for w in flags if isinstance(w, str)) if isinstance(flags, list) else frozenset()
     pad = " " * column
     out = []

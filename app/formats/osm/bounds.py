@@ -1,4 +1,4 @@
-"""The boxes that an OSM file says it covers."""
+"""Bounding boxes in OSM files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.syntax.decimals import DEGREES, numbers
 
 
 def read_box(attributes: Mapping[str, str]) -> tuple[float, float, float, float] | None:
-    """[west, south, east, north] of a ``<bounds>``, or of the older ``<bound box="s,w,n,e">``."""
+    """Return [west, south, east, north] of a ``<bounds>``, or of the older ``<bound box="s,w,n,e">``."""
     names = ("minlon", "minlat", "maxlon", "maxlat")
     if all(k in attributes for k in names):
         texts = [attributes[k] for k in names]
@@ -24,7 +24,7 @@ def read_box(attributes: Mapping[str, str]) -> tuple[float, float, float, float]
         return None
     west_, south_, east_, north_ = (float(t) for t in texts)
     if not (-180 <= west_ <= 180 and -180 <= east_ <= 180 and -90 <= south_ <= north_ <= 90):
-        reason = f"the bounds {', '.join(texts)} are no box on earth"
+        reason = f"the bounds {', '.join(texts)} are not a valid box in degrees"
         raise UnreadableFile(reason, [Problem(reason, where="<bounds>")])
     return west_, south_, east_, north_
 
@@ -32,12 +32,16 @@ def read_box(attributes: Mapping[str, str]) -> tuple[float, float, float, float]
 def written_bounds(
     source_bounds: Sequence[Mapping[str, str]], boxes: Sequence[Sequence[float]]
 ) -> Sequence[Mapping[str, str]]:
-    """The attributes of ``<bounds>``: those that were read, while they are still the box around these boxes, else of
-    that one box. What they say besides (their origin) stays with them."""
+    """Return the attributes of ``<bounds>``.
+
+    The stored ones if they still enclose these boxes exactly, else those of the box around them.
+
+    Further stored attributes (their origin) are kept.
+    """
     extent = bounding_box(boxes)
     try:
         old_boxes = [box for one in source_bounds if (box := read_box(one)) is not None]
-    except (UnreadableFile, ValueError):  # edits can put anything there
+    except (UnreadableFile, ValueError):  # edits can store anything
         old_boxes = []
     if len(old_boxes) != len(source_bounds) or not old_boxes or bounding_box(old_boxes) != extent:
         old_boxes, source_bounds = [extent], source_bounds if len(source_bounds) == 1 else [NO_ATTRIBUTES]
@@ -51,13 +55,13 @@ def written_bounds(
 
 
 def bounding_box(boxes: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:
-    """The box around boxes, each [west, south, east, north]."""
+    """Return the box around boxes, each [west, south, east, north]."""
     west, south, east, north = zip(*boxes, strict=True)
     return min(west), min(south), max(east), max(north)
 
 
 def is_box(value: Any) -> bool:
-    """Whether these are four numbers."""
+    """Whether a value is a list of four numbers."""
     return (
         isinstance(value, list | tuple)
         and len(value) == 4

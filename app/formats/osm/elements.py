@@ -1,4 +1,4 @@
-"""What an OSM file says, as columns of nodes, ways and relations."""
+"""Content of an OSM file as columns of nodes, ways and relations."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ Tags = dict[str, str]
 INT64 = 2**63
 
 EXTRAS = frozenset({"note", "meta", "remark", "MetaInfo", "changeset"})
-"""Elements beside the data that Overpass, JOSM and Autoware's editor write. Any other is refused, as osmcode's tests
-ask."""
+"""Non-data elements that Overpass, JOSM and Autoware's editor write. Any other is rejected, as osmcode's tests require.
+"""
 
 DATA = frozenset({"node", "way", "relation"})
 
 MAX_UNKNOWN_DEPTH = 8
-"""Levels of unknown elements inside each other."""
+"""Maximum nesting depth of unknown elements."""
 
 Unknown = list[Any]
-"""An element that is kept as it is: [name, attributes, text, elements in it], without empty ones at the end."""
+"""Element stored as it is: [name, attributes, text, children], without empty items at the end."""
 
 
 @dataclass(slots=True)
 class Way:
-    """A way: its nodes by id, in order. children: elements that OSM does not know."""
+    """A way: node ids in order. children: elements that OSM does not define."""
 
     id: int
     refs: list[int]
@@ -54,11 +54,11 @@ class Relation:
 
 @dataclass(slots=True)
 class Data:
-    """What an OSM file says.
+    """Content of an OSM file.
 
-    ids: of the nodes, in the file's order. lonlat: float64 [n, 2] degrees, NaN where a node has no place. tags: by the
-    node's place in ``ids``, only for those that have any. attributes(k): the further attributes of node k, one shared
-    mapping for equal ones. root, bounds, elements: what the file says as a whole.
+    ids: of the nodes, in the file's order. lonlat: float64 [n, 2] degrees, NaN for nodes without a position. tags: by
+    the node's index in ``ids``, only for those that have any. attributes(k): further attributes of node k, one shared
+    mapping for equal ones. root, bounds, elements: of the file as a whole.
     """
 
     ids: list[int]
@@ -75,7 +75,7 @@ class Data:
 
 
 def check_values(osm_data: Data, line: Callable[[int], int | None]) -> None:
-    """Ids within 64 bits, places on earth."""
+    """Check that ids fit into 64 bits and positions are on earth."""
     refs = chain.from_iterable(way.refs for way in osm_data.ways)
     other_ids = chain((w.id for w in osm_data.ways), (r.id for r in osm_data.relations))
     members = (m[1] for r in osm_data.relations for m in r.members)
@@ -94,7 +94,7 @@ def check_values(osm_data: Data, line: Callable[[int], int | None]) -> None:
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
         lon, lat = osm_data.lonlat[k].tolist()
-        reason = f"lat {lat:g}, lon {lon:g} is no place on earth: latitude must be within ±90, longitude within ±180"
+        reason = f"invalid position lat {lat:g}, lon {lon:g}: latitude must be within ±90, longitude within ±180"
         raise UnreadableFile(
             f"node {osm_data.ids[k]}: {reason}", [Problem(reason, line=line(k), where=f"node {osm_data.ids[k]}")]
         )

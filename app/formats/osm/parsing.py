@@ -1,9 +1,9 @@
-"""OpenStreetMap files -> nodes, ways and relations as columns, whatever the container: XML, compressed XML, PBF.
+"""Parse OpenStreetMap files into columns of nodes, ways and relations: XML, compressed XML, PBF.
 
-Two ways through XML. Files as the OSM tools write them (double quotes, one attribute order, no comments) are checked
-by expat, which needs no memory, and scanned by regular expressions whose matches are counted against the tags that
-are there (``scanning``). Anything else goes through lxml's event parser (``strict``), which is slower and
-authoritative: whatever the quick way does not understand, it leaves to that one.
+There are two XML parsers. Files in the form of the OSM tools (double quotes, one attribute order, no comments) are
+checked by expat, which needs no memory, and scanned by regular expressions whose matches are compared with the number
+of tags (``scanning``). Everything else goes through lxml's event parser (``strict``), which is slower and
+authoritative: the fast parser leaves to it everything that it does not support.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from app.syntax import xml
 
 
 def parse(data: bytes, limits: Limits, *, highways_only: bool = False) -> Data:
-    """Any OSM container. highways_only: leave out ways without a ``highway`` tag, and relations.
+    """Parse any OSM container. highways_only: skip ways without a ``highway`` tag, and relations.
 
-    Raises UnreadableFile (with a line where there is one) or TooLarge.
+    Raises UnreadableFile (with a line if known) or TooLarge.
     """
     if is_pbf(data):
         return read_pbf(data, limits)
@@ -38,7 +38,7 @@ def parse(data: bytes, limits: Limits, *, highways_only: bool = False) -> Data:
 
 
 def unpack(data: bytes, limits: Limits, limit: int | None = None) -> bytes:
-    """The content of a ``.gz`` or ``.bz2``, else the bytes as they are; most: stop there (to look at the beginning)."""
+    """Decompress ``.gz`` or ``.bz2``, else return the bytes unchanged. limit: stop after that many bytes."""
     if data[:2] == b"\x1f\x8b":
         new: Callable[[], Any] = lambda: zlib.decompressobj(wbits=31)  # noqa: E731
     elif data[:3] == b"BZh":
@@ -62,7 +62,7 @@ def unpack(data: bytes, limits: Limits, limit: int | None = None) -> bytes:
                 if not piece and not remainder and not stream.eof:
                     if limit is not None:
                         return b"".join(out)
-                    raise UnreadableFile("the compressed file ends before its end", [Problem("truncated")])
+                    raise UnreadableFile("the compressed file is truncated", [Problem("truncated")])
             remainder = stream.unused_data
     except (zlib.error, OSError) as error:
         if limit is not None:

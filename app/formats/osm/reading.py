@@ -1,4 +1,4 @@
-"""Reading OSM: the network of highways, and all features as objects."""
+"""Read OSM: the network of highways, and all features as objects."""
 
 from __future__ import annotations
 
@@ -36,13 +36,16 @@ from app.model.osm_areas import multipolygon_areas
 from app.syntax import xml
 
 PROLOG_BYTES = 2**14
-"""Of a file's beginning, where stylesheets are named; elements of other formats are refused anywhere."""
+"""Number of bytes at the start of a file that are searched for stylesheets.
+
+Elements of other formats are rejected anywhere.
+"""
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """A highway network and all other elements as objects, on earth.
+    """Read a highway network, and all other elements as objects, in wgs84.
 
-    Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
+    Raises UnreadableFile, with a line if known, for files that are not OSM and for positions that are not on earth.
     """
     topology, objects = context.wants("topology"), context.wants("objects")
     xml.report_active_content(files[context.main][:PROLOG_BYTES], context.warn, has_scripts=True)
@@ -95,7 +98,7 @@ def _document(data: Data) -> dict[str, Any]:
 
 
 def _warn_of_values(data: Data, context: ReadContext) -> None:
-    """Report the values that would say a size or a speed and are none, each with how often; the tags are kept."""
+    """Warn about tags with an invalid size or speed, each with its number of occurrences; the tags are stored."""
     occurrences: dict[tuple[str, str], list[Any]] = {}
     tagged = chain(((f"way {w.id}", w.tags) for w in data.ways), ((k, tags) for k, tags in data.tags.items()))
     for place, tags in tagged:
@@ -115,9 +118,9 @@ _OF_WAYS = frozenset({"lanes", "maxspeed", "maxspeed:forward", "maxspeed:backwar
 
 
 class _Network:
-    """Which nodes and ways are the highway network.
+    """Nodes and ways of the highway network.
 
-    place: node id -> its place in the columns, of the last node with that id. used: ids of the network's nodes.
+    place: node id -> its index in the columns, of the last node with that id. used: ids of the network's nodes.
     """
 
     def __init__(self, data: Data, context: ReadContext) -> None:
@@ -140,7 +143,7 @@ class _Network:
             if "highway" not in way.tags:
                 continue
             if is_deleted(way.attributes):
-                context.warn("the way is marked as deleted, so it is no part of the network", where=f"way {way.id}")
+                context.warn("the way is marked as deleted; it is not part of the network", where=f"way {way.id}")
                 continue
             self._report_doubts(way, context)
             present = [r for r in way.refs if r in self.placed]
@@ -152,16 +155,17 @@ class _Network:
         if absent_ids:
             examples = ", ".join(map(str, sorted(absent_ids)[:5]))
             context.warn(
-                f"highways use {len(absent_ids)} nodes that have no place in the file ({examples}); gaps are left there"
+                f"highways refer to {len(absent_ids)} nodes that have no position in the file ({examples}); the "
+                "network has gaps there"
             )
 
     def _report_doubts(self, way: Way, context: ReadContext) -> None:
         location = f"way {way.id}"
         if not is_loop(way.refs, way.tags) and any(a == b for a, b in pairwise(way.refs)):
-            context.warn("the way goes from a node to itself; that segment is no edge", where=location)
+            context.warn("the way repeats a node directly; that segment is skipped", where=location)
         oneway = str(way.tags.get("oneway", "no")).strip().lower()
         if oneway not in FORWARD and oneway not in BACKWARD and oneway not in BOTH:
-            context.warn(f"oneway={oneway[:40]} is not known; the way is taken as two-way", where=location)
+            context.warn(f"unknown value oneway={oneway[:40]}; the way is read as bidirectional", where=location)
 
     def features(self, document: Properties) -> Features:
         data = self.data
@@ -215,7 +219,7 @@ def _warn_twice(noun: str, ids: list[int], context: ReadContext) -> None:
     seen: set[int] = set()
     for identity in ids:
         if identity in seen:
-            context.warn("the id stands more than once in the file; the last one counts", where=f"{noun} {identity}")
+            context.warn("duplicate id in the file; the last element is used", where=f"{noun} {identity}")
         seen.add(identity)
 
 
@@ -244,7 +248,7 @@ def _properties(source_properties: dict[str, Any], tags: Tags, otherwise: str) -
 
 
 def _objects(data: Data, network: _Network, context: ReadContext, document: Properties) -> Features:
-    """Tagged and lone nodes, ways and relations as features, in the file's order."""
+    """Convert tagged and isolated nodes, ways and relations to features, in the file's order."""
     relations = {r.id: r for r in data.relations}
     if len(relations) != len(data.relations):
         _warn_twice("relation", [r.id for r in data.relations], context)
@@ -268,7 +272,7 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
 
 
 def _object_nodes(data: Data, network: _Network, bent: set[int], context: ReadContext) -> list[int]:
-    """The rows of nodes that are objects: no nodes of the network, and no mere bends (``bent``: those of ways)."""
+    """Return the rows of nodes that are objects: not in the network, and not only bends of ways (``bent``)."""
     members = {i for r in data.relations for kind, i, _ in r.members if kind == "node"}
     nodes = []
     for identity, k in network.place.items():
@@ -278,7 +282,7 @@ def _object_nodes(data: Data, network: _Network, bent: set[int], context: ReadCo
         if lone or k in data.node_children or is_deleted(data.attributes(k)):
             nodes.append(k)
             if identity not in network.placed:
-                context.warn("the node has no place", where=f"node {identity}")
+                context.warn("the node has no position", where=f"node {identity}")
     return nodes
 
 
@@ -299,7 +303,10 @@ def _way_properties(
     features: set[int],
     context: ReadContext,
 ) -> list[Properties]:
-    """index, absent: of all ways' references one after the other, the row of each node and whether it has no place."""
+    """Build the properties of ways.
+
+    index, absent: for all ways' references in sequence, each node's row and whether it has no position.
+    """
     out = []
     dangling = 0
     begin = 0
@@ -321,7 +328,9 @@ def _way_properties(
         out.append(_properties(source_properties, way.tags, "line"))
         begin = end
     if dangling:
-        context.warn(f"ways refer {dangling} times to nodes that have no place in the file; the references are kept")
+        context.warn(
+            f"ways contain {dangling} references to nodes without a position in the file; the references are stored"
+        )
     return out
 
 
@@ -335,12 +344,12 @@ def _relation_properties(relation: Relation) -> Properties:
 
 
 def _with_areas(part: Features, relations: range, context: ReadContext) -> Features:
-    """The part with the areas of multipolygons, whose rows are among ``relations``."""
+    """Add the areas of multipolygons, whose rows are among ``relations``."""
     areas = multipolygon_areas(part, relations)
     if open_ := [part.ids[k][1:] for k, area in areas.items() if area is None]:
         examples = ", ".join(open_[:5]) + (" …" if len(open_) > 5 else "")
         context.warn(
-            f"{len(open_)} multipolygons have no area, since ways are missing or rings do not close: {examples}"
+            f"{len(open_)} multipolygons have no area because ways are missing or rings are not closed: {examples}"
         )
     geometry = part.geometry.copy()
     for k, area in areas.items():
@@ -349,7 +358,10 @@ def _with_areas(part: Features, relations: range, context: ReadContext) -> Featu
 
 
 def _vertices(data: Data, refs: list[int], index: list[int], features: set[int]) -> Any:
-    """The attributes of a way's nodes that are no features: one mapping where all agree, else a list like refs."""
+    """Return the attributes of a way's nodes that are not features.
+
+    One mapping if all are equal, else a list parallel to refs.
+    """
     rows = [None if k < 0 or r in features else data.attributes(k) for r, k in zip(refs, index, strict=True)]
     entries = [row for row in rows if row is not None]
     if not entries or not any(entries):
@@ -359,7 +371,7 @@ def _vertices(data: Data, refs: list[int], index: list[int], features: set[int])
 
 
 def _way_geometries(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[np.bool_]) -> NDArray[np.object_]:
-    """For each way the line, area, point or nothing that its nodes with a place make."""
+    """Build each way's geometry from its nodes with a position: line, area, point or none."""
     owner = np.repeat(np.arange(len(ways)), [len(way.refs) for way in ways])[~absent]
     lonlat = lonlat[~absent]
     size = np.bincount(owner, minlength=len(ways))

@@ -1,4 +1,4 @@
-"""What osmium, GDAL, JOSM and editors of OpenStreetMap want of an OSM XML file.
+"""Consumer checks for OSM XML: osmium, GDAL, JOSM and OpenStreetMap editors.
 
 Sources: libosmium's XML input (``version`` 0.6, nodes, ways, relations), osmium-tool's manual (files are sorted by type
 and id; ids and versions are positive in data of the database), GDAL's OSM driver (negative ids need
@@ -23,11 +23,11 @@ from app.syntax import xml
 
 KINDS = ("node", "way", "relation")
 MAX_WAY_NODES = 2000
-"""Of a way: the API's limit."""
+"""Maximum number of nodes of a way: the API's limit."""
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """An XML file (also packed) as its readers take it; a .pbf has its own strict layout and is left alone."""
+    """Check an XML file, also compressed, by its readers' rules; PBF has a strict layout and is not checked."""
     main = next(iter(files))
     if parsing.is_pbf(files[main]):
         return
@@ -45,25 +45,25 @@ def check(files: Files) -> Iterator[Problem]:
     try:
         elements.read_element(root)
     except (TypeError, ValueError):
-        yield error_finding("an id or a ref is missing or no whole number", main, line=elements.line)
+        yield error_finding("an id or ref is missing or not an integer", main, line=elements.line)
         return
     for kind, ids in elements.ids.items():
         if repeats := duplicates(ids):
-            yield warning_finding(f"{len(repeats)} ids are given to several {kind}s: {names(repeats)}", main)
+            yield warning_finding(f"{len(repeats)} duplicate {kind} ids: {names(repeats)}", main)
         if new := [i for i in ids if i < 0]:
             reason = (
-                f"{len(new)} {kind}s have negative ids, as JOSM gives them to what is new: GDAL reads them with "
+                f"{len(new)} new {kind}s have negative ids, as in JOSM; GDAL reads them only with "
                 "OSM_USE_CUSTOM_INDEXING=NO"
             )
             yield warning_finding(reason, main)
         if bare := elements.bare[kind]:
             yield warning_finding(
-                f"{bare} {kind}s have no version from 1: osmium's merging of changes needs them", main
+                f"{bare} {kind}s have no version of at least 1, which osmium needs to merge changes", main
             )
     if elements.nowhere:
-        yield error_finding(f"{len(elements.nowhere)} nodes have no place: {names(elements.nowhere)}", main)
+        yield error_finding(f"{len(elements.nowhere)} nodes have no position: {names(elements.nowhere)}", main)
     if absent := sorted(elements.refs - set(elements.ids["node"])):
-        yield warning_finding(f"{len(absent)} nodes of ways are not in the file: {names(absent)}", main)
+        yield warning_finding(f"{len(absent)} nodes of ways are missing in the file: {names(absent)}", main)
     if elements.long:
         yield warning_finding(
             f"{len(elements.long)} ways have more than {MAX_WAY_NODES} nodes: {names(elements.long)}", main
@@ -74,7 +74,7 @@ def check(files: Files) -> Iterator[Problem]:
 
 @dataclass(slots=True)
 class _ElementScan:
-    """What one walk through the elements found. kinds: in the order in which they stand, each run once."""
+    """Findings of one pass over the elements. kinds: in order of occurrence, once per run."""
 
     ids: dict[str, list[int]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
     bare: Counter[str] = field(default_factory=Counter)
@@ -85,7 +85,10 @@ class _ElementScan:
     line: int | None = None
 
     def read_element(self, parent: etree._Element) -> None:
-        """All elements below; a change file has blocks of them. TypeError or ValueError for what is no number."""
+        """Collect all elements below the root; a change file has blocks of them.
+
+        Raises TypeError or ValueError for values that are not numbers.
+        """
         for element in parent:
             kind = element.tag
             if kind not in self.ids:
@@ -118,12 +121,10 @@ class _ElementScan:
 def _order(elements: _ElementScan, main: str) -> Iterator[Problem]:
     if elements.kinds != [kind for kind in KINDS if kind in elements.kinds]:
         yield warning_finding(
-            "types are mixed: GDAL and osmium want all nodes, then all ways, then all relations", main
+            "types are mixed; GDAL and osmium require all nodes, then all ways, then all relations", main
         )
         return
     for kind, ids in elements.ids.items():
         if any(b < a for a, b in pairwise(i for i in ids if i > 0)):
-            yield warning_finding(
-                f"the {kind}s are not sorted by id: some of osmium's commands need `osmium sort`", main
-            )
+            yield warning_finding(f"{kind}s are not sorted by id; some osmium commands need `osmium sort` first", main)
             return

@@ -1,4 +1,4 @@
-"""The quick way through OSM XML, for files as the OSM tools write them."""
+"""Fast parser for OSM XML in the form of the OSM tools."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from app.model.features import shared_key_dict
 
 
 def unescape(text: bytes) -> str:
-    """An attribute's value as text."""
+    """Attribute value as text."""
     return _ENTITY.sub(_character, text.decode()) if b"&" in text else text.decode()
 
 
@@ -46,7 +46,7 @@ _ND = re.compile(rb'<nd ref="(-?\d{1,19})" ?/>')
 _TAG = re.compile(rb'<tag k="([^"<\t\r\n]*)" v="([^"<\t\r\n]*)" ?/>')
 _MEMBER = re.compile(
     rb'<member type="(node|way|relation)" (?:ref="(-?\d{1,19})" role="([^"<\t\r\n]*)"'
-    rb'|role="([^"<\t\r\n]*)" ref="(-?\d{1,19})") ?/>'  # as Autoware's editors write it
+    rb'|role="([^"<\t\r\n]*)" ref="(-?\d{1,19})") ?/>'  # form of Autoware's editors
 )
 _BOUNDS = re.compile(rb'<bounds((?>(?: [\w:.-]+="[^"<\t\r\n]*")*)) ?/>')
 
@@ -56,10 +56,10 @@ def _pair(two: bytes) -> int:
 
 
 SCAN_BYTES = 2**20
-"""Bytes of nodes that are looked at together."""
+"""Number of bytes of nodes that are scanned at once."""
 
 MAX_CACHED_TEXTS, PATTERNS = 2**14, 64
-"""Attribute values, and lists of attribute names, that are kept for the next element."""
+"""Maximum number of attribute values, and of lists of attribute names, that are cached for the next elements."""
 
 _TAG_STARTS = {
     _pair(p) for p in (b"?x", b"os", b"/o", b"bo", b"no", b"/n", b"wa", b"/w", b"re", b"/r", b"nd", b"ta", b"me")
@@ -67,7 +67,7 @@ _TAG_STARTS = {
 
 
 def scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
-    """The quick way, or None where the file is not regular. Raises where it is not well-formed or holds bad numbers."""
+    """Parse regular OSM XML fast; return None for irregular files. Raises if not well-formed or numbers are invalid."""
     encoding = _ENCODING.search(data[:256])
     root = _ROOT.match(data)
     if not root or (encoding and encoding[1].lower() not in (b"utf-8", b"utf8", b"us-ascii", b"ascii")):
@@ -107,16 +107,14 @@ def scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
 
 
 def _count_elements(data: bytes, limits: Limits) -> dict[bytes, int] | None:
-    """How many elements begin, by the first two bytes of their names; None where the file is not regular."""
+    """Count elements by the first two bytes of their names; None if the file is irregular."""
     buffer = np.frombuffer(data, np.uint8)
     opened = np.flatnonzero(buffer[:-2] == ord("<"))
-    # No "<" stands inside an attribute, so the longest stretch without one bounds them all.
+    # No attribute contains "<", so the longest stretch without one bounds the length of all attributes.
     if len(opened) and int(np.diff(opened, append=len(data)).max()) > limits.xml_attribute_bytes:
         return None
     if len(opened) > 8 * limits.features:
-        raise TooLarge(
-            f"the file has {len(opened)} elements; with {limits.features} features as the limit that is too much"
-        )
+        raise TooLarge(f"the file has {len(opened)} elements, more than a limit of {limits.features} features allows")
     codes = np.bincount(buffer[opened + 1].astype(np.int32) * 256 + buffer[opened + 2], minlength=65536)
     if (
         not {int(c) for c in np.flatnonzero(codes)} <= _TAG_STARTS
@@ -129,7 +127,10 @@ def _count_elements(data: bytes, limits: Limits) -> dict[bytes, int] | None:
 
 @dataclass(slots=True)
 class _Nodes:
-    """lonlat: [k, 2] of a piece of the file each. texts: further attributes. tagged: indexes of those with tags."""
+    """Columns of nodes.
+
+    lonlat: [k, 2] per piece of the file. texts: further attributes. tagged: indexes of nodes with tags.
+    """
 
     ids: list[int] = field(default_factory=list)
     lonlat: list[NDArray[np.float64]] = field(default_factory=list)
@@ -140,7 +141,7 @@ class _Nodes:
 def _scan_nodes(data: bytes) -> _Nodes:
     nodes = _Nodes()
     at = 0
-    while at < len(data):  # a piece at a time: the matches take far more memory than what is kept of them
+    while at < len(data):  # by pieces: matches need far more memory than their results
         end = data.find(b"<node ", at + SCAN_BYTES)
         end = len(data) if end < 0 else end
         rows = _NODE.findall(data, at, end)
@@ -153,7 +154,7 @@ def _scan_nodes(data: bytes) -> _Nodes:
 
 
 def _scan_node_tags(data: bytes, tagged: list[int], children: _Children) -> dict[int, Tags] | None:
-    """The tags of these nodes, by index; None where the file is not regular."""
+    """Return the tags of these nodes, by index; None if the file is irregular."""
     pieces = data.split(b"</node>")
     pieces.pop()
     if len(pieces) != len(tagged):
@@ -163,7 +164,7 @@ def _scan_node_tags(data: bytes, tagged: list[int], children: _Children) -> dict
     for k, piece in zip(tagged, pieces, strict=True):
         seen += piece.count(b"<node ")
         if seen != k + 1:
-            # A node inside another one: the careful way tells of it.
+            # A node inside another one: the strict parser reports it.
             return None
         body = piece[piece.rfind(b"<node ") :]
         tags[k] = children.tags(body, 1)
@@ -186,7 +187,7 @@ def _check_well_formed(data: bytes) -> None:
 
 
 class _Texts(dict[bytes, str]):
-    """Raw attribute values -> text, the repeated ones worked out once: keys and values of tags repeat a lot."""
+    """Cache of raw attribute values decoded to text: keys and values of tags repeat a lot."""
 
     def __missing__(self, raw: bytes) -> str:
         if len(self) >= MAX_CACHED_TEXTS:
@@ -196,7 +197,10 @@ class _Texts(dict[bytes, str]):
 
 
 class _Children:
-    """Reads the elements inside nodes, ways and relations, counting them; ``regular`` falls at the first odd one."""
+    """Reader and counter of the elements inside nodes, ways and relations.
+
+    ``regular`` becomes False at the first irregular element.
+    """
 
     __slots__ = ("alike", "members", "nds", "regular", "tagged", "texts")
 
@@ -207,11 +211,11 @@ class _Children:
         self.alike: dict[tuple[bytes, ...], Attributes] = {}
 
     def attributes(self, text: bytes) -> Attributes:
-        """The attributes in this part of a tag."""
+        """Return the attributes in this part of a tag."""
         return self.mapping(_ATTRIBUTE.findall(text))
 
     def cached_attributes(self, texts: list[bytes]) -> Callable[[int], Attributes]:
-        """The attributes in each of these texts, by index; equal texts share one mapping."""
+        """Return the attributes in each of these texts, by index; equal texts share one mapping."""
         cache: dict[bytes, Attributes] = {}
 
         def attributes(k: int) -> Attributes:
@@ -224,7 +228,7 @@ class _Children:
         return attributes
 
     def mapping(self, pairs: list[tuple[bytes, bytes]]) -> dict[str, str]:
-        """Keys and values as texts. Mappings of the same keys share their table of keys."""
+        """Return keys and values as texts. Mappings with equal keys share their key table."""
         texts = self.texts
         keys = tuple([k for k, _ in pairs])
         pattern = self.alike.get(keys)
@@ -238,14 +242,14 @@ class _Children:
         return out
 
     def tags(self, body: bytes, other_count: int) -> Tags:
-        """The tags in an element's body that has ``other_count`` further elements."""
+        """Return the tags in an element's body that has ``other_count`` further elements."""
         pairs = _TAG.findall(body)
         self.tagged += len(pairs)
         if body.count(b"<") != len(pairs) + other_count:
             self.regular = False
         out = self.mapping(pairs)
         if len(out) != len(pairs):
-            # A key twice: the careful way tells of it.
+            # A repeated key: the strict parser reports it.
             self.regular = False
         return out
 
@@ -260,7 +264,7 @@ def _scan_ways(data: bytes, children: _Children, highways_only: bool) -> list[Wa
         refs = [int(r) for r in _ND.findall(part, end)]
         children.nds += len(refs)
         tags = children.tags(part[end:], len(refs))
-        # For the network alone it matters only whether the way is still there.
+        # For the network alone only the deletion mark matters.
         needed = not highways_only or b'action="delete"' in head[2] or b'visible="false"' in head[2]
         out.append(Way(int(head[1]), refs, tags, children.attributes(head[2]) if needed else {}))
     return out
@@ -282,14 +286,14 @@ def _scan_relations(data: bytes, children: _Children) -> list[Relation] | None:
 
 
 def _parts(data: bytes, name: bytes, holding: bytes = b"") -> Iterator[bytes]:
-    """What stands after each ``<name `` up to its end: its attributes and body; only those with ``holding`` in them."""
+    """Return attributes and body of each ``<name `` element; only of those that contain ``holding``."""
     close = b"</" + name + b">"
     for part in data.split(b"<" + name + b" ")[1:]:
         tag = part.find(b">")
         if part[tag - 1 : tag] == b"/":
             cut = part[: tag + 1]
         elif close not in part:
-            # One inside another: nothing that this way can read.
+            # Nested elements are irregular.
             yield b""
             continue
         elif holding not in part:

@@ -1,4 +1,4 @@
-"""The careful way through OSM: any legal XML, every odd thing that real files have, and PBF."""
+"""Strict parser for OSM: any valid XML with the irregularities of real files, and PBF."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DECIMAL = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?\s*", re
 
 
 def read_events(data: bytes, limits: Limits) -> Data:
-    """Event by event with lxml: any legal XML, and every odd thing that real files have."""
+    """Parser for any valid OSM XML, event by event with lxml."""
     reader = _StrictParser(limits)
     events = etree.iterparse(
         BytesIO(data.lstrip(b"\xef\xbb\xbf \t\r\n")),
@@ -79,14 +79,14 @@ class _StrictParser:
 
     def read_root(self, root: etree._Element) -> None:
         if root.tag != "osm":
-            _raise_unreadable(f"this is not an OSM file: its root is <{root.tag}>, not <osm>", root)
+            _raise_unreadable(f"not an OSM file: its root is <{root.tag}>, not <osm>", root)
         if root.getroottree().docinfo.internalDTD is not None:
             _raise_unreadable("DOCTYPE and entity declarations are not accepted: remove them", root)
         self.root = self.attributes(root)
 
     def check_name(self, element: etree._Element) -> None:
         if element.tag not in DATA | EXTRAS | {"bounds", "bound"}:
-            _raise_unreadable(f"<{element.tag}> is no element of an OSM file", element)
+            _raise_unreadable(f"<{element.tag}> is not an element of OSM files", element)
 
     def attributes(self, element: etree._Element) -> Attributes:
         out = xml.attributes(element)
@@ -113,9 +113,7 @@ class _StrictParser:
             child_attributes = self.attributes(child)
             if child.tag == "tag" and "k" in child_attributes:
                 if child_attributes["k"] in tags:
-                    self.warn(
-                        f"the tag {child_attributes['k']} stands twice; the last one counts", child, element, identity
-                    )
+                    self.warn(f"duplicate tag {child_attributes['k']}; the last one is used", child, element, identity)
                 tags[child_attributes["k"]] = child_attributes.get("v", "")
             elif child.tag == "nd" and element.tag == "way":
                 refs.append(_integer(child_attributes.get("ref"), child, "ref"))
@@ -128,7 +126,7 @@ class _StrictParser:
                 )
             else:
                 children.append(self.unknown(child))
-                self.warn(f"<{child.tag}> inside <{element.tag}> is not known to OSM", child, element, identity)
+                self.warn(f"<{child.tag}> inside <{element.tag}> is not defined by OSM", child, element, identity)
         if element.tag == "node":
             self.node(element, identity, attributes, tags, children)
         elif element.tag == "way":
@@ -136,12 +134,14 @@ class _StrictParser:
         else:
             self.relations.append(Relation(identity, members, tags, attributes, children))
         if len(self.ids) + len(self.ways) + len(self.relations) > self.limits.features:
-            raise TooLarge(f"the file has more than {self.limits.features} elements, which is the limit")
+            raise TooLarge(f"the file has more elements than the limit of {self.limits.features}")
 
     def unknown(self, element: etree._Element, depth: int = 1) -> Unknown:
-        """An element as it stands, and those in it. Data inside other data is refused."""
+        """Return an element as stored, with its children. Raises UnreadableFile for data inside other data."""
         if (element.tag in DATA and len(element)) or depth > MAX_UNKNOWN_DEPTH:
-            _raise_unreadable(f"<{element.tag}> inside <{element.getparent().tag}> is no part of an OSM file", element)
+            _raise_unreadable(
+                f"<{element.tag}> inside <{element.getparent().tag}> is not allowed in an OSM file", element
+            )
         inner = [self.unknown(child, depth + 1) for child in element]
         row: Unknown = [str(element.tag), self.attributes(element), (element.text or "").strip(), inner]
         while not row[-1] and len(row) > 2:
@@ -199,18 +199,18 @@ def _raise_unreadable(reason: str, element: etree._Element) -> NoReturn:
 
 def _integer(text: str | None, element: etree._Element, name: str) -> int:
     if text is None or not _INTEGER.fullmatch(text):
-        _raise_unreadable(f"<{element.tag}> needs a whole number as its {name}, not {str(text)[:40]!r}", element)
+        _raise_unreadable(f"<{element.tag}> needs an integer as its {name}, not {str(text)[:40]!r}", element)
     return int(text)
 
 
 def _degrees(text: str, element: etree._Element) -> float:
     if len(text) > 64 or not _DECIMAL.fullmatch(text):
-        _raise_unreadable(f"a node's place must be a finite number of degrees, not {text[:40]!r}", element)
+        _raise_unreadable(f"a node's position must be a finite number of degrees, not {text[:40]!r}", element)
     return float(text)
 
 
 def read_pbf(data: bytes, limits: Limits) -> Data:
-    """A ``.pbf`` through the OSM project's own library, which bounds each block to 32 MiB; we bound their number."""
+    """Parser for ``.pbf``, based on the OSM project's library, which limits blocks to 32 MiB; we limit the elements."""
     import osmium
 
     out = _StrictParser(limits)
@@ -232,14 +232,14 @@ def read_pbf(data: bytes, limits: Limits) -> Data:
             if size > bound:
                 limits.check_unpacked(size, len(data))
             if len(out.ids) + len(out.ways) + len(out.relations) > limits.features:
-                raise TooLarge(f"the file has more than {limits.features} elements, which is the limit")
+                raise TooLarge(f"the file has more elements than the limit of {limits.features}")
     except (RuntimeError, ValueError) as error:
         raise UnreadableFile(f"not a readable PBF file: {error}", [Problem(str(error))]) from error
     return out.finish()
 
 
 def _read_pbf_object(out: _StrictParser, item: Any) -> int:
-    """Keep one object; roughly how many bytes it takes."""
+    """Store one object and return its approximate size in bytes."""
     attributes: Attributes = {}
     if item.version:
         attributes["version"] = str(item.version)

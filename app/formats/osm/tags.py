@@ -1,4 +1,4 @@
-"""What OSM's tags mean in our words, and back: kinds, measures, speeds, directions, the edges of a way."""
+"""Convert OSM tags to canonical properties and back: kinds, sizes, speeds, directions, the edges of a way."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ MAIN_TAGS = (
     "boundary",
     "route",
 )
-"""The keys that say what an element is, most telling first (OSM wiki: Map features)."""
+"""Keys that determine an element's kind, most specific first (OSM wiki: Map features)."""
 
 AREAS = frozenset(
     {
@@ -60,10 +60,10 @@ AREAS = frozenset(
         "boundary",
     }
 )
-"""A closed way with one of these is an area (OSM wiki: Area), unless it says ``area=no``."""
+"""Keys that make a closed way an area (OSM wiki: Area), unless it has ``area=no``."""
 
 LINES = frozenset({"coastline", "cliff", "tree_row", "ridge", "arete", "valley", "track", "slipway", "citywalls"})
-"""Values of such keys that are lines all the same."""
+"""Values of such keys that are lines nevertheless."""
 
 Direction = Literal["both", "forward", "backward"]
 
@@ -73,10 +73,10 @@ BOTH = frozenset({"no", "false", "0"})
 
 
 def direction(tags: Mapping[str, Any]) -> Direction:
-    """Which way along its nodes a way may be used.
+    """Return the directions in which a way may be used, relative to its nodes.
 
-    ``oneway`` decides. Without it roundabouts and motorways are one-way, their links too: to drive against a link's
-    traffic is worse than not to drive there. A reversible way is taken as it was drawn, never in both directions.
+    ``oneway`` decides. Without it roundabouts and motorways are one-way, and so are their links: driving against a
+    link's traffic is worse than not using it. A reversible way is one-way as drawn, never bidirectional.
     """
     oneway = str(tags.get("oneway", "")).strip().lower()
     if oneway in FORWARD:
@@ -90,7 +90,7 @@ def direction(tags: Mapping[str, Any]) -> Direction:
 
 
 def is_deleted(attributes: Mapping[str, Any]) -> bool:
-    """Whether an element is only there to say that it is gone."""
+    """Whether an element is marked as deleted."""
     return attributes.get("action") == "delete" or attributes.get("visible") == "false"
 
 
@@ -101,11 +101,11 @@ KINDS: Mapping[str, Mapping[Any, str]] = {
     ),
     "landuse": {"basin": "water", "reservoir": "water"},
 }
-"""By a main tag's key and value, the kind where the key itself tells too little."""
+"""Kinds by a main tag's key and value, if the key alone is too general."""
 
 
 def object_kind(tags: Mapping[str, Any], otherwise: str) -> str:
-    """The key of the main tag, or what its value says more plainly."""
+    """Return the key of the main tag, or a more specific kind from its value."""
     main_key = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
     if main_key is None:
         return str(tags["type"]) if otherwise == "relation" and tags.get("type") else otherwise
@@ -117,14 +117,14 @@ def object_kind(tags: Mapping[str, Any], otherwise: str) -> str:
 _MEASURES = frozenset({"height", "building:levels", "min_height", "building:min_level", "width", "est_width"})
 _MEASURES |= {"diameter", "circumference"}
 _SPOKEN = {"name": "name", "height": "height", "base": "min_height", "width": "width"}
-"""Canonical words of objects, and the tag that says each."""
+"""Canonical properties of objects, and their tags."""
 
 _EDGE_TAGS = frozenset({"maxspeed", "maxspeed:forward", "maxspeed:backward", "width", "est_width", "lanes"})
 _EDGE_TAGS |= {"surface", "access"}
 
 
 def object_properties(tags: Mapping[str, Any]) -> dict[str, Any]:
-    """The canonical words that an object's tags say, but for its kind. A highway's measures are its edges'."""
+    """Return the canonical properties from an object's tags, except its kind. A highway's sizes belong to its edges."""
     out: dict[str, Any] = {}
     if name := tags.get("name"):
         out["name"] = name
@@ -135,7 +135,7 @@ def object_properties(tags: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def edge_properties(tags: Mapping[str, Any], heading: Literal["forward", "backward"]) -> dict[str, Any]:
-    """The canonical words that a highway's tags say of its edges in one direction."""
+    """Return the canonical properties of a highway's edges in one direction."""
     out: dict[str, Any] = {}
     if not _EDGE_TAGS.isdisjoint(tags):
         if limit := osm_tags.speed_limit(tags, heading):
@@ -149,7 +149,7 @@ def edge_properties(tags: Mapping[str, Any], heading: Literal["forward", "backwa
 
 
 def differs(now: Any, source_value: Any) -> bool:
-    """Whether a canonical value says something else than the tags; one that is absent says nothing."""
+    """Whether a canonical value differs from the tags; an absent value does not."""
     if isinstance(now, str):
         return now not in ("", source_value)
     if isinstance(now, bool) or not isinstance(now, int | float) or now <= 0:
@@ -162,12 +162,12 @@ def _number(value: Any) -> str:
 
 
 def kmh(value: float) -> str:
-    """A speed in m/s as a tag says it."""
+    """Format a speed in m/s as a tag's value."""
     return plain(f"{value * 3.6:.6g}")
 
 
 def is_area(tags: Mapping[str, Any]) -> bool:
-    """Whether a closed way encloses something rather than going around it."""
+    """Whether a closed way is an area rather than a closed line."""
     if "area" in tags:
         return bool(tags["area"] != "no")
     return any(k in AREAS and tags[k] not in LINES and tags[k] != "no" for k in tags) and "barrier" not in tags
@@ -175,7 +175,7 @@ def is_area(tags: Mapping[str, Any]) -> bool:
 
 @dataclass(slots=True)
 class Edges:
-    """The directed edges of one way: parallel lists. segment: index of the first of the two refs."""
+    """Directed edges of one way: parallel lists. segment: index of the first of the two refs."""
 
     segment: list[int] = field(default_factory=list)
     ids: list[str] = field(default_factory=list)
@@ -184,16 +184,16 @@ class Edges:
 
 
 LOOP = "self_loop"
-"""The tag of ways that are an edge from a node to itself, ``yes``. Without it a node twice in a row is a mistake."""
+"""Tag of ways that are an edge from a node to itself, ``yes``. Without it a repeated node is a data error."""
 
 
 def is_loop(refs: Sequence[int], tags: Mapping[str, Any]) -> bool:
-    """Whether a way is an edge from a node to itself, and not a mistake in the data."""
+    """Whether a way is an edge from a node to itself, and not a data error."""
     return len(refs) == 2 and refs[0] == refs[1] and tags.get(LOOP) == "yes"
 
 
 def way_edges(way: int, refs: Sequence[int], tags: Mapping[str, Any], absent: Set[int]) -> Edges:
-    """The edges that a way means: reader and writer must agree on them, ids included. absent: nodes without a place."""
+    """Return the edges of a way, for reader and writer alike, ids included. absent: nodes without a position."""
     out = Edges()
     seen: dict[str, int] = {}
     heading = direction(tags)
@@ -217,7 +217,7 @@ EDGE_WORDS = ("speed_limit", "width", "surface", "access")
 
 
 def object_tags(source_properties: Mapping[str, Any], p: Properties, i: str) -> Mapping[str, Any]:
-    """An object's own words with the tags that its name and measures say now. A highway's are its edges'."""
+    """Update an object's stored tags to its current name and sizes. A highway's belong to its edges."""
     tags = as_texts(source_properties.get("tags"))
     if "highway" in tags:
         return source_properties
@@ -232,7 +232,10 @@ def object_tags(source_properties: Mapping[str, Any], p: Properties, i: str) -> 
 def way_tags(
     tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], headings: Set[str]
 ) -> Mapping[str, str]:
-    """A highway's tags with the words that its edges say now. changes: by direction; ways: those that are there."""
+    """Update a highway's tags to its edges' current properties.
+
+    changes: by direction; headings: the existing directions.
+    """
     out = dict(tags)
     limits = {heading: new["speed_limit"] for heading, new in changes.items() if "speed_limit" in new}
     if limits and limits.keys() == headings and len(set(limits.values())) == 1:

@@ -1,4 +1,4 @@
-"""Writing OSM: stored nodes, ways and relations as they were, and everything else as new ones."""
+"""Write OSM: stored nodes, ways and relations unchanged, and everything else as new ones."""
 
 from __future__ import annotations
 
@@ -39,15 +39,14 @@ GENERATOR = "Fleet Map Server"
 
 
 MAX_WAY_NODES = 2000
-"""Nodes a way may have (OSM API 0.6)."""
+"""Maximum number of nodes of a way (OSM API 0.6)."""
 
 NO_POSITION = (float("nan"), float("nan"))
 
 
 @dataclass(slots=True)
 class _Level:
-    """What is being written of one level. nodes: feature id -> OSM id. edges: id -> (source, target, tags,
-    properties)."""
+    """Writer state of one level. nodes: feature id -> OSM id. edges: id -> (source, target, tags, properties)."""
 
     name: str
     nodes: dict[str, int] = field(default_factory=dict)
@@ -60,16 +59,16 @@ class _Level:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.osm``. Raises MissingDatum where anything is in metres and there is no datum."""
+    """Write ``map.osm``. Raises MissingDatum if anything is in metres and there is no datum."""
     out = _Writer(layers, context)
     levels = list(dict.fromkeys(key.level for key in sorted(layers.parts)))
     for level in sorted(levels, key=lambda name: (name != GROUND, name)):
         out.level(level)
     for key, part in sorted(layers.parts.items()):
         if key.layer not in CARRIES and isinstance(part, Features) and key.layer == "location":
-            context.drop("GNSS fence", len(part), "OSM has no word for it; its box is the map's bounds")
+            context.drop("GNSS fence", len(part), "OSM cannot express it; its box is written as the map's bounds")
     if layers.datum is not None:
-        context.drop("datum", 1, "OSM places stand on earth and have no local frame")
+        context.drop("datum", 1, "OSM positions are in wgs84, without a local frame")
     return {"map.osm": out.text()}
 
 
@@ -96,7 +95,7 @@ class _Writer:
         return new
 
     def unknown(self, kind: str, number: int, source_properties: Mapping[str, Any]) -> None:
-        """Keep the elements inside an element that OSM does not know."""
+        """Store the elements inside an element that OSM does not define."""
         if source_properties.get("children"):
             self.children[kind, number] = source_properties["children"]
 
@@ -124,7 +123,7 @@ class _Writer:
                         current = object_tags(source_properties, properties, i)
                         own_items.append((number[0], number[1], geometry, current, properties))
                     elif i in drawn and shapely.get_type_id(geometry) in (0, 1, 2, 5):
-                        # The network made from this drawing is written; the line would lie on it a second time.
+                        # The network derived from this drawing is written; this line would duplicate it.
                         continue
                     else:
                         new_items.append((i, geometry, properties, layer == "zones"))
@@ -174,7 +173,7 @@ class _Writer:
                 )
                 self.unknown("node", new, source_properties)
             else:
-                # A street node that went through another format is called by its id there: that is no name.
+                # A street node that was converted by another format has its id as name, which is not a real name.
                 nameless = is_own and properties.get("name", i) == i
                 tags, attributes = NO_ATTRIBUTES if nameless else self.tags(i, properties, ("name",)), NO_ATTRIBUTES
             if geometry.has_z and geometry.geom_type == "Point" and not geometry.is_empty and "ele" not in tags:
@@ -208,7 +207,7 @@ class _Writer:
         self.unknown("node", new, source_properties)
 
     def write_way(self, level: _Level, number: int, geometry: Any, source_properties: Mapping[str, Any]) -> bool:
-        """Write an OSM way; False where its properties or its geometry are no longer those of one."""
+        """Write an OSM way; False if its properties or geometry are not valid for one."""
         refs = integers(source_properties.get("refs"))
         at = _course(geometry)
         if refs is None or at is None:
@@ -237,9 +236,12 @@ class _Writer:
     def runs(
         self, level: _Level, number: int, refs: list[int], tags: Mapping[str, str], absent: set[int]
     ) -> list[tuple[int, int, Mapping[str, str]]]:
-        """The pieces of a highway way that the network still has: (first, one past the last index of refs, tags)."""
+        """Return the pieces of a highway way that are still in the network.
+
+        Each piece is (first, one past the last index of refs, tags).
+        """
         expected = way_edges(number, refs, tags, absent)
-        # Of each segment: the directions that are there, of those that the way means, and the tags if they differ.
+        # For each segment: its existing directions among the way's, and its tags if they differ.
         headings_by_segment: dict[int, tuple[set[str], Any]] = {}
         edited: dict[int, dict[str, dict[str, Any]]] = {}
         cache: dict[tuple[int, str], Mapping[str, Any]] = {}
@@ -302,7 +304,7 @@ class _Writer:
         vertices: Any,
         span: range,
     ) -> list[int]:
-        """The node ids of (part of) a way, making those that exist nowhere but in the way."""
+        """Return the node ids of (part of) a way, creating nodes that exist only in the way."""
         located = len(refs) - len(missing)
         if located != len(at):
             return self.redraw(level, refs, at)
@@ -324,14 +326,14 @@ class _Writer:
                         position[0], position[1], NO_ATTRIBUTES, as_texts(attributes[k]), vertex=True
                     )
                 elif node.vertex and (node.lon != position[0] or node.lat != position[1]):
-                    # Two ways no longer agree where their common node is: each keeps its course.
+                    # Two ways disagree on the position of their common node: each keeps its course.
                     new = self.next_id("node")
                     self.nodes[new] = Node(position[0], position[1], vertex=True)
             out.append(new)
         return out
 
     def redraw(self, level: _Level, refs: list[int], at: NDArray[np.float64]) -> list[int]:
-        """Nodes for a way whose geometry was edited: its own where one stands at a vertex, else new ones."""
+        """Create nodes for a way with edited geometry: its own node if one is at a vertex, else new ones."""
         node_ids = {}
         for ref in refs:
             node = self.nodes.get(level.moved.get(ref, ref))
@@ -368,7 +370,7 @@ class _Writer:
         self.relations[level.relations[number]] = (members, tags, attributes)
 
     def add_ways(self, part: Features, level: _Level) -> None:
-        """Edges that no way explains, joined to lines where they follow each other and say the same."""
+        """Write edges without a stored way, joined to lines if consecutive ones have equal tags."""
         left = [
             k
             for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True))
@@ -402,7 +404,7 @@ class _Writer:
                     course = features.in_wgs84(self.layers.frame)
                 nodes = [a, *self.inner(course[k] if course is not None else None), b]
                 sign = (*signs[k], twin)
-                if nodes == [a, a]:  # by itself: within a line it would be a node that stands twice
+                if nodes == [a, a]:  # alone: within a line it would be a repeated node
                     self.ways[self.next_id("way")] = (
                         nodes,
                         {**dict(signs[k][1]), "oneway": "yes", LOOP: "yes"},
@@ -422,7 +424,7 @@ class _Writer:
                     self.ways[self.next_id("way")] = (line, tags, NO_ATTRIBUTES)
 
     def inner(self, geometry: Any) -> list[int]:
-        """New nodes for what an edge bends over between its ends."""
+        """Create nodes for an edge's bends between its ends."""
         if geometry is None or geometry.geom_type != "LineString":
             return []
         out = []
@@ -456,13 +458,13 @@ class _Writer:
             tags["level"] = level.name
         more = {"kind", "source", "target", "drawn_from", "name", "action", *EDGE_WORDS, "stairs"}
         if p.keys() - more:
-            self.lose("edges' further properties")
+            self.lose("further properties of edges")
         return tags
 
     # --- items of other formats ---
 
     def tags(self, i: str, p: Properties, keys: Iterable[str] = (), level: str = GROUND) -> dict[str, str]:
-        """Tags for an item that OSM does not know: its name, and the plain values among these words (or all)."""
+        """Build tags for an item of another format: its name, and the plain values of these properties (or of all)."""
         tags = {"name": str(p.get("name") or i)}
         names = list(keys) or [k for k in p if k not in ("drawn_from",)]
         for k in names:
@@ -506,7 +508,7 @@ class _Writer:
             self.relations[self.next_id("relation")] = (members, {**tags, "type": "multipolygon"}, NO_ATTRIBUTES)
 
     def line(self, geometry: Any, tags: Mapping[str, str]) -> int:
-        """A way along a line or ring, with nodes of its own. A line too long for one way goes on in further ones."""
+        """Write a line or ring as a way with new nodes; a line with too many nodes continues in further ways."""
         at = shapely.get_coordinates(geometry).tolist()
         nodes = []
         for x, y in at[:-1]:
@@ -527,7 +529,7 @@ class _Writer:
 
     def text(self) -> bytes:
         for item, times in sorted(self.lost.items()):
-            self.context.drop(item, times, "OSM has no place for them")
+            self.context.drop(item, times, "OSM cannot express them")
         return xml_text.document(self.head(), self.nodes, self.ways, self.relations, self.children)
 
     def head(self) -> list[str]:
@@ -551,7 +553,7 @@ class _Writer:
         return lines
 
     def fence(self) -> list[list[float]]:
-        """The boxes of the sites, where they can be had on earth."""
+        """Return the boxes of the sites that can be converted to wgs84."""
         out: list[list[float]] = []
         for part in self.layers.vector("location").values():
             if self.layers.frame is not None or not part.local.any():
@@ -561,7 +563,7 @@ class _Writer:
 
 
 def _course(geometry: Any) -> NDArray[np.float64] | None:
-    """The vertices of a way's geometry; None where it is not of one piece."""
+    """Return the vertices of a way's geometry; None if it has several parts."""
     is_path = geometry.geom_type in ("LineString", "LinearRing", "Point") or geometry.is_empty
     if is_path or (geometry.geom_type == "Polygon" and not len(geometry.interiors)):
         return np.asarray(shapely.get_coordinates(geometry), np.float64)
@@ -569,7 +571,7 @@ def _course(geometry: Any) -> NDArray[np.float64] | None:
 
 
 def _simple(geometry: Any) -> list[Any]:
-    """Points, lines and polygons of a geometry, however deep."""
+    """Yield points, lines and polygons of a geometry, at any depth."""
     todo, out = [geometry], []
     while todo:
         one = todo.pop()

@@ -1,7 +1,7 @@
-"""OpenStreetMap XML as text: nodes, ways and relations as the OSM tools write them, for all formats on top of OSM.
+"""Write OpenStreetMap XML in the form of the OSM tools, for all formats based on OSM.
 
-Values come from stored properties, which anybody can edit: what is not of the right type is turned into text or told
-to be none, and what XML cannot say becomes the replacement character.
+Values come from stored properties, which anyone can edit: values of a wrong type are converted to text or skipped, and
+characters that XML cannot contain become the replacement character.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from app.formats.osm.elements import INT64, MAX_UNKNOWN_DEPTH
 from app.syntax.decimals import DEGREES, numbers
 
 MAX_CACHED_ATTRIBUTES = 4096
-"""Mappings of attributes whose text is kept for the next element."""
+"""Maximum number of attribute mappings whose text is cached for the next elements."""
 
 NO_ATTRIBUTES: Mapping[str, str] = {}
 
 LINES = 10_000
-"""That are turned into bytes at once."""
+"""Number of lines that are encoded at once."""
 
 Way = tuple[Sequence[int], Mapping[str, str], Mapping[str, str]]
-"""The ids of its nodes, tags, attributes."""
+"""A way: the ids of its nodes, tags, attributes."""
 
 Relation = tuple[Sequence[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]
-"""Members as (type, id, role), tags, attributes."""
+"""A relation: members as (type, id, role), tags, attributes."""
 
 
 @dataclass(slots=True)
 class Node:
-    """A node in degrees, NaN where it has no place. vertex: it is there only as a bend of a way."""
+    """A node in degrees, NaN if it has no position. vertex: it is only a bend of a way."""
 
     lon: float
     lat: float
@@ -42,7 +42,7 @@ class Node:
 
 
 Children = Mapping[tuple[str, int], Any]
-"""Elements that OSM does not know, by the type and id of the one that they stand in (see ``element_lines``)."""
+"""Elements that OSM does not define, by the type and id of their parent element (see ``element_lines``)."""
 
 
 def document(
@@ -52,11 +52,11 @@ def document(
     relations: Mapping[int, Relation],
     children: Children,
 ) -> bytes:
-    """The file: the lines of ``head`` (the root element first), then nodes, ways and relations, each by id.
+    """Write the file: the lines of ``head`` (the root element first), then nodes, ways and relations, each by id.
 
-    Lines become bytes a few at a time: as texts all of them would take four times the memory.
+    Lines are encoded in batches: all lines as texts would need four times the memory.
     """
-    done = BytesIO()  # whose content is taken out without a copy
+    done = BytesIO()  # its content is moved out without a copy
     lines: list[str] = []
     for line in _lines(head, nodes, ways, relations, children):
         lines.append(line)
@@ -82,7 +82,7 @@ def _lines(
             return ""
         cached = cache.get(id(values))
         if cached is None:
-            # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
+            # Keyed by identity: thousands of elements of one changeset share one mapping, referenced here.
             if len(cache) >= MAX_CACHED_ATTRIBUTES:
                 cache.clear()  # a file in which every element has its own history
             cached = cache[id(values)] = attribute_text(values, RESERVED)
@@ -129,9 +129,9 @@ def _element_with(kind: str, i: int, attributes: str, inner: list[str]) -> Itera
 
 
 def element_lines(rows: Any, indent: str = " ", depth: int = 1) -> list[str]:
-    """Lines for elements that OSM does not know or that stand beside the data (``note``, ``meta``, ``changeset``).
+    """Write lines for elements that OSM does not define or that are not map data (``note``, ``meta``, ``changeset``).
 
-    rows: [name, attributes], then the text and a list of such rows where there are any. What is none is left out.
+    rows: [name, attributes], then text and a list of such rows, if any. Other values are skipped.
     """
     lines = []
     for row in rows if isinstance(rows, list) and depth <= MAX_UNKNOWN_DEPTH else []:
@@ -147,7 +147,7 @@ def element_lines(rows: Any, indent: str = " ", depth: int = 1) -> list[str]:
 
 
 def is_row(row: Any) -> bool:
-    """Whether this is an unknown element as it is stored."""
+    """Whether a value is an unknown element in stored form."""
     return isinstance(row, list) and 2 <= len(row) <= 4
 
 
@@ -159,12 +159,12 @@ _ESCAPES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "\t": "&#9;",
 
 
 def escape(text: str) -> str:
-    """Text as it may stand in an attribute; what XML cannot say at all becomes the replacement character."""
+    """Escape text for an attribute; characters that XML cannot contain become the replacement character."""
     return _SPECIAL.sub(lambda m: _ESCAPES.get(m[0], "\ufffd"), text) if _SPECIAL.search(text) else text
 
 
 def element_id(i: str) -> tuple[str, int] | None:
-    """``n12`` as ("n", 12), ``w…`` and ``r…`` alike; None for any other text."""
+    """Parse ``n12`` to ("n", 12), ``w…`` and ``r…`` alike; None for any other text."""
     match = _ID.fullmatch(i)
     if match is None or abs(int(match[2])) >= INT64 or str(int(match[2])) != match[2]:
         return None
@@ -172,19 +172,19 @@ def element_id(i: str) -> tuple[str, int] | None:
 
 
 def rank(i: int) -> tuple[bool, int]:
-    """The order of the OSM tools: negative ids first, by magnitude."""
+    """Return the sort key of the OSM tools: negative ids first, by magnitude."""
     return i > 0, abs(i)
 
 
 def integers(value: Any) -> list[int] | None:
-    """A list of 64 bit integers, or None where it is not one (properties can be edited by anybody)."""
+    """Return a list of 64-bit integers, or None if it is not one (properties can be edited by anyone)."""
     if not isinstance(value, list | tuple):
         return None
     return list(value) if all(type(v) is int and abs(v) < INT64 for v in value) else None
 
 
 def as_texts(value: Any) -> Mapping[str, str]:
-    """A mapping of texts to texts, whatever was stored."""
+    """Convert any stored value to a mapping of texts to texts."""
     if not isinstance(value, Mapping):
         return NO_ATTRIBUTES
     try:
@@ -197,20 +197,20 @@ def as_texts(value: Any) -> Mapping[str, str]:
 
 
 def degrees(values: list[float]) -> list[str | None]:
-    """Degrees as text, None for NaN."""
+    """Format degrees as text, None for NaN."""
     return [None if v == "nan" else plain(v) for v in numbers(values, DEGREES)]
 
 
 def plain(text: str) -> str:
-    """Never an exponent: not all readers of OSM know one."""
+    """Format a number without exponent: some OSM readers do not support one."""
     return f"{float(text):.12f}".rstrip("0") if "e" in text else text
 
 
 def attribute_text(attributes: Mapping[str, str], without: frozenset[str]) -> str:
-    """XML attributes, each with a space before it; those that XML could not name are left out."""
+    """Write XML attributes, each with a space before it; names that are invalid in XML are skipped."""
     return "".join(f' {k}="{escape(v)}"' for k, v in attributes.items() if k not in without and _NAME.fullmatch(k))
 
 
 def tag_lines(tags: Mapping[str, str]) -> list[str]:
-    """A ``<tag>`` for each."""
+    """Write a ``<tag>`` for each."""
     return [f'  <tag k="{escape(k)}" v="{escape(v)}"/>' for k, v in tags.items()]

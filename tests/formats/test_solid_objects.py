@@ -1,4 +1,4 @@
-"""What is solid is the same in worlds, grids and drawings: multipolygons, lifts, and the law that ties them."""
+"""Solid objects are equal in worlds, grids and drawings: multipolygons, lifts, and slices of worlds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ AREA = 40 * 30 - 20 * 14 + 4 * 4 + 10 * 10
 
 
 def courtyard(without: int | None = None) -> bytes:
-    """A building with a courtyard as an OpenStreetMap file, about metres from the datum; without one of its ways."""
+    """Build a house with a courtyard as an OpenStreetMap file, in metres from the datum; optionally without one way."""
     metre = 1 / 111_320
     narrow = metre / np.cos(np.radians(DATUM.latitude))
     out = ['<osm version="0.6">']
@@ -71,7 +71,7 @@ def written(layers: Layers, to: str, **options: Any) -> dict[str, bytes]:
 
 
 def cut(layers: Layers, **options: Any) -> dict[str, OccupancyGrid]:
-    """The derived grid of each level."""
+    """Return the derived grid of each level."""
     derived_layers = objects_to_occupancy(layers, Parameters(outside_free=True, **options), DerivationNotes())
     return {key.level: grid for key, grid in derived_layers.grids().items()}
 
@@ -123,14 +123,14 @@ def test_multipolygon_equals_the_area_that_osmium_assembles(tmp_path: Path) -> N
     assert area.is_valid
 
 
-def test_multipolygon_without_one_of_its_ways_is_warned_of() -> None:
+def test_multipolygon_with_missing_way_is_warned_about() -> None:
     bundle = read({"map.osm": courtyard(without=3)})
     assert any("1 multipolygons have no area" in w.problem and w.problem.endswith(": 7") for w in bundle.warnings)
     part = next(iter(bundle.layers(DATUM).vector("objects").values()))
     assert part.geometry[part.index()["r7"]].is_empty
 
 
-def test_rings_that_do_not_close_make_no_area() -> None:
+def test_open_rings_make_no_area() -> None:
     line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     assert osm_areas.assemble_area([line]) is None
     assert osm_areas.assemble_area([]) is None
@@ -163,7 +163,7 @@ def test_lift_has_walls_a_free_cabin_and_open_doors(shared: Path) -> None:
 
 
 def content(path: Path) -> Layers | None:
-    """The objects of a map with their files; None where it has none."""
+    """Return the objects of a map with their files; None if it has none."""
     every = [path] if path.is_file() else [p for p in sorted(path.rglob("*")) if p.is_file()]
     files = {p.relative_to(path.parent).as_posix(): p.read_bytes() for p in every if p.name != "facts.json"}
     if not files:
@@ -174,7 +174,7 @@ def content(path: Path) -> Layers | None:
 
 
 def assert_law(layers: Layers, label: str, **options: Any) -> int:
-    """The slice of the written world, read back, equals the derived grid of each level; how many levels have one."""
+    """Assert that the slice of the written world equals the derived grid of each level; return the number of levels."""
     try:
         grids = cut(layers, **options)
     except CannotConvert:  # nothing solid, or places too far from the datum
@@ -198,7 +198,7 @@ def assert_law(layers: Layers, label: str, **options: Any) -> int:
 
 
 def test_slice_of_a_written_world_equals_the_derived_grid(shared: Path) -> None:
-    """The law, for every sample that has solid objects, and for real buildings, a town and a world."""
+    """The slice law for every sample with solid objects, and for real buildings, a town and a world."""
     counts = {p.relative_to(SAMPLES).as_posix(): 0 for p in sorted(SAMPLES.glob("*/*")) if p.name != "facts.json"}
     for name in counts:
         layers = content(SAMPLES / name)
