@@ -111,8 +111,8 @@ ROWS = [
     Row("kml/orchard.kml", "<Point>", INCLUDE, warned="XInclude"),
     Row("osm/quarter.osm", "<osm ", "<?xml-stylesheet href='x.xsl'?><osm ", warned="'<?xml-stylesheet'"),
     Row("gazebo/cart/cart/model.sdf", r"<radius>[\d.]+", "<radius>0", warned="the shape has no extent"),
-    Row("gazebo/yard/worlds/yard.world", r"<static>\w+", "<static>maybe", warned="taken for false"),
-    Row("gazebo/cart/cart/model.sdf", r"<pose>(\S+ \S+ \S+) \S+", r"<pose>\1 90", warned="are its angles in radians?"),
+    Row("gazebo/yard/worlds/yard.world", r"<static>\w+", "<static>maybe", warned="it is read as false"),
+    Row("gazebo/cart/cart/model.sdf", r"<pose>(\S+ \S+ \S+) \S+", r"<pose>\1 90", warned="angles must be in radians"),
     Row("lanelet2/local/lanelet2_map.osm", r'k="speed_limit" v="[^"]*', 'k="speed_limit" v="nan', warned="no speed"),
     Row("lanelet2/junction.osm", r"k='speed_limit' v='[^']*", "k='speed_limit' v='1000000", warned="no speed"),
 ]

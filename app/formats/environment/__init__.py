@@ -313,7 +313,7 @@ class _Writer:
             if inner is None:
                 continue
             # What one world lacks of another one stands in that one's file here.
-            others_ = {f"ask with world={other}" for other in worlds}
+            others_ = {f"request it with world={other}" for other in worlds}
             inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d.why not in others_))
             self.reported.update(own_parts)
             self.reported.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
