@@ -1,4 +1,4 @@
-"""rmf_nav_graph: graphs come back the same, and those made of a building equal what the official generator makes."""
+"""rmf_nav_graph: graphs round-trip, and graphs of a building equal those of the official generator."""
 
 from __future__ import annotations
 
