@@ -171,7 +171,7 @@ def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
         return data[:at] + struct.pack("<H", 65281) + data[at + 2 :]
 
     return [
-        ("octomap/shelf.ot", infinite, "no finite number"),
+        ("octomap/shelf.ot", infinite, "must be a finite number"),
         ("satellite/heights.tif", many_bands, "the limit is 1024"),
         ("satellite/orchard.tif", unknown_code, "EPSG:9999"),
     ]
