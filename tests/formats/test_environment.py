@@ -120,9 +120,7 @@ def check_paths(values: dict[str, str], root: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
-def test_real_environments_come_back_and_their_scripts_work(
-    shared: Path, same: Same, tmp_path: Path, name: str
-) -> None:
+def test_real_environments_round_trip_with_working_scripts(shared: Path, same: Same, tmp_path: Path, name: str) -> None:
     files = folder(shared, name)
     literals = json.loads((shared / "data/facts.json").read_text())["_environment_sh"][name]["literal_assignments"]
     # The script itself is not among the samples; its literals are in the facts.
@@ -150,7 +148,7 @@ def test_real_environments_come_back_and_their_scripts_work(
     assert {"DATUM_FILE", "TMAP_FILE", "COSTMAP_YAML_FILE", "GAZEBO_WORLD_FILE"} <= values.keys(), "empty, not unset"
 
 
-def test_the_archive_means_what_the_folder_means(shared: Path) -> None:
+def test_archive_gives_same_layers_as_directory(shared: Path) -> None:
     name = TEMPLATES[-1]
     files = folder(shared, name)
     archive = archives.pack({n: d for n, d in files.items() if d})
@@ -166,7 +164,7 @@ def test_the_archive_means_what_the_folder_means(shared: Path) -> None:
     assert other.datum == loose.datum
 
 
-def test_the_paths_of_the_archive_are_the_template_s(shared: Path) -> None:
+def test_archive_paths_equal_template(shared: Path) -> None:
     files = folder(shared, "riseholme_park_farm_strawberry_polytunnels")
     inner = unzipped(offline(files, "environment").files[MAIN])
     assert {
@@ -187,7 +185,7 @@ def test_the_paths_of_the_archive_are_the_template_s(shared: Path) -> None:
 # --- our own sample ------------------------------------------------------------------------------------------------
 
 
-def test_the_sample_is_detected_read_and_written_whole() -> None:
+def test_sample_is_detected_read_and_written() -> None:
     assert detect("yard.zip", SAMPLE)
     assert not detect("yard.kmz", SAMPLE)
     assert not detect("a.zip", archives.pack({"doc.kml": b"<kml/>"}))
@@ -207,7 +205,7 @@ def test_the_sample_is_detected_read_and_written_whole() -> None:
             assert sorted(part.ids) == sorted(other.ids), key
 
 
-def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
+def test_variables_round_trip_and_are_never_executed(tmp_path: Path) -> None:
     converted = offline({"yard.zip": SAMPLE}, "environment")
     inner = unzipped(converted.files[MAIN])
     values = sourced(inner, tmp_path)
@@ -234,7 +232,7 @@ def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
     }, "what names files is worked out each time, also where there is none"
 
 
-def test_the_report_tells_of_every_map_in_it() -> None:
+def test_report_covers_every_map() -> None:
     report = offline({"yard.zip": SAMPLE}, "environment").report.as_dict()
     lines = {(line["layer"], line["name"]): line for line in report["layers"]}
     assert lines["topology", "network"]["sources"] == ["config/topological/network.tmap2.yaml"]
@@ -248,7 +246,7 @@ def test_the_report_tells_of_every_map_in_it() -> None:
 # --- what is put in ------------------------------------------------------------------------------------------------
 
 
-def test_grids_get_folders_that_no_script_stumbles_over(tmp_path: Path) -> None:
+def test_grid_directories_are_safe_in_scripts(tmp_path: Path) -> None:
     names = ["map", "a b", "a/b", "../../etc", "$(rm -rf)", ".hidden", "Größe", "x" * 200]
     parts: dict[PartKey, Part] = {PartKey("occupancy", "ground", n): grid(k) for k, n in enumerate(names)}
     parts[PartKey("occupancy", "upstairs", "map")] = grid(50)
@@ -263,7 +261,7 @@ def test_grids_get_folders_that_no_script_stumbles_over(tmp_path: Path) -> None:
     assert {"levels of grids and pictures", "elevations of levels"} <= {d["what"] for d in report["dropped"]}
 
 
-def test_which_grid_is_the_costmap() -> None:
+def test_costmap_variable_selects_grid() -> None:
     for names, chosen in (
         (["lab"], "lab"),
         (["lab", "map"], "map"),
@@ -279,7 +277,7 @@ def test_which_grid_is_the_costmap() -> None:
         assert ("NOGO_COSTMAP_YAML_FILE" in script) == ("keepout" in names)
 
 
-def test_objects_stand_in_the_format_they_came_from() -> None:
+def test_objects_are_written_in_their_source_format() -> None:
     box = shapely.box(0.0, 0.0, 1.0, 1.0)
     parts: dict[PartKey, Part] = {
         PartKey("objects", "ground", "kml"): features([("a", shapely.Point(-0.5, 53.2), {"kind": "poi"})], "wgs84"),
@@ -298,7 +296,7 @@ def test_objects_stand_in_the_format_they_came_from() -> None:
         assert (part.local == other.local).all()
 
 
-def test_maps_that_would_have_one_path_get_paths_of_their_own() -> None:
+def test_maps_with_same_path_get_unique_paths() -> None:
     def wall(name: str) -> Features:
         return features([(name, shapely.LineString([(0, 0), (5, 0)]), {"kind": "wall", "name": name})], "local")
 
@@ -327,7 +325,7 @@ def test_maps_that_would_have_one_path_get_paths_of_their_own() -> None:
     assert hashes(read_upload({"a.zip": archives.pack(inner)}).parts) == hashes(parts)
 
 
-def test_worlds_of_one_name_get_files_of_their_own() -> None:
+def test_worlds_with_same_name_get_unique_files() -> None:
     def world(name: str, size: int) -> bytes:
         shape = f"<geometry><box><size>{size} 1 1</size></box></geometry>"
         link = f"<link name='l'><collision name='c'>{shape}</collision></link>"
@@ -338,7 +336,7 @@ def test_worlds_of_one_name_get_files_of_their_own() -> None:
     assert {"config/world/yard.world.xml", "config/world/yard_2.world.xml"} <= inner.keys()
 
 
-def test_pictures_and_clouds_have_their_places() -> None:
+def test_images_and_clouds_are_in_their_directories() -> None:
     samples = Path(__file__).resolve().parents[1] / "samples"
     paths = [samples / "satellite/orchard.tif", samples / "pcd/shelf.pcd", samples / "octomap/shed.bt"]
     files = {p.name: p.read_bytes() for p in paths}
@@ -351,7 +349,7 @@ def test_pictures_and_clouds_have_their_places() -> None:
     assert set(read_upload(files).parts) <= read_upload(converted.files).parts.keys()
 
 
-def test_a_missing_map_is_told_and_the_others_are_there() -> None:
+def test_failed_map_is_reported_and_others_are_written() -> None:
     """A network in metres without a datum: no drawing of it on earth, but the network itself."""
     line = shapely.LineString([(0.0, 0.0), (5.0, 0.0)])
     rows: list[tuple[str, Any, dict[str, Any]]] = [
@@ -363,11 +361,11 @@ def test_a_missing_map_is_told_and_the_others_are_there() -> None:
     assert maps_of(inner).keys() == {
         f"config/{n}" for n in ("environment.sh", "properties.sh", "topological/network.tmap2.yaml")
     }
-    assert any(w["problem"].startswith("no kml is in it: ") for w in report["warnings"])
+    assert any(w["problem"].startswith("the package contains no kml: ") for w in report["warnings"])
     assert b"DATUM_FILE=''" in inner["config/environment.sh"]
 
 
-def test_complete_derives_what_is_missing_and_says_so() -> None:
+def test_complete_derives_missing_maps_and_reports_them() -> None:
     lines = [("l", shapely.LineString([(0.0, 0.0), (5.0, 0.0), (5.0, 5.0)]), {"kind": "path"})]
     layers = Layers({PartKey("objects", "ground", "geojson"): features(lines, "local")}, DATUM)
     inner, report = written(layers)
@@ -381,7 +379,7 @@ def test_complete_derives_what_is_missing_and_says_so() -> None:
     assert [step["step"] for step in topology_lines[0]["steps"]] == ["objects_to_topology"]
 
 
-def test_nothing_is_no_environment() -> None:
+def test_empty_environment_raises_missing_layer() -> None:
     with pytest.raises(MissingLayer, match="supply"):
         written(Layers())
     inner, _ = written(Layers({VARIABLES: variables_of({"FARM_NAME": "x"})}))
@@ -390,7 +388,7 @@ def test_nothing_is_no_environment() -> None:
         formats.write(FORMAT, Layers({VARIABLES: variables_of({"A": "x"})}), WriteContext())
 
 
-def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
+def test_invalid_variables_are_dropped_and_reported(tmp_path: Path) -> None:
     odd = {
         "LD_PRELOAD": "/evil.so",
         "A B": "x",
@@ -410,7 +408,7 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
     assert not (set("xyz") & {p.name for p in tmp_path.iterdir()})
 
 
-def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_writer_of_inner_map_changes_the_recipe(monkeypatch: pytest.MonkeyPatch) -> None:
     version: Any = SimpleNamespace(environment="e", datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
     chain = recipe.DerivationChain((), ())
 
@@ -428,7 +426,7 @@ def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.Mo
 # --- bad input -----------------------------------------------------------------------------------------------------
 
 
-def test_bad_packages_are_refused_with_file_and_reason() -> None:
+def test_invalid_package_raises_bad_upload_with_file_and_reason() -> None:
     inside = {"config/location/datum.yaml": b"datum_latitude: north\n"}
     for upload in ({"a.zip": archives.pack(inside)}, {"a.bin": archives.pack(inside)}):
         with pytest.raises(BadUpload) as caught:
@@ -441,7 +439,7 @@ def test_bad_packages_are_refused_with_file_and_reason() -> None:
         read_upload({"a.zip": archives.pack({"readme.txt": b"hello"})}, "environment")
 
 
-def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> None:
+def test_package_restores_exact_layers_until_a_map_is_edited() -> None:
     rows = [("7", shapely.Point(1 / 3, 2 / 3, 0.1), {"kind": "node", "note": [1, 1.0, None], "name": "Größe"})]
     picture = GeoImage(np.arange(24, dtype=np.uint16).reshape(2, 4, 3), (0.1, 0, 0, 0, -0.1, 0), properties={"a": 1})
     voxels = VoxelMap(0.1, np.array([16], np.uint8), np.array([7], np.uint64), np.array([0.5], np.float32))
@@ -511,7 +509,7 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
 
 
 @pytest.mark.parametrize("root", ["", "yard/"])
-def test_files_that_are_no_maps_do_not_make_the_maps_of_a_package_count(root: str) -> None:
+def test_added_files_without_format_keep_exact_layers(root: str) -> None:
     files = {f"{root}{name}": data for name, data in written(offline_layers())[0].items()}
     content = f"{root}config/fleet_map/content.json"
     mac = b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        "
@@ -539,7 +537,7 @@ def test_files_that_are_no_maps_do_not_make_the_maps_of_a_package_count(root: st
     ]
 
 
-def test_what_macos_packs_beside_a_drawing_is_no_drawing(shared: Path) -> None:
+def test_macos_resource_forks_are_no_drawings(shared: Path) -> None:
     drawing = next(path for path in sorted((shared / "data/kml").rglob("*.kml"))).read_bytes()
     files = {"a.kml": drawing, "__MACOSX/._a.kml": b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        "}
     for name in (None, "kml"):
@@ -558,7 +556,7 @@ def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:
     return {key: part.hash for key, part in encoded_parts.items() if part is not None}
 
 
-def test_packages_in_packages_are_opened_once() -> None:
+def test_nested_packages_are_opened_one_level_deep() -> None:
     middle = archives.pack({"config/inner.pkg": SAMPLE, "config/properties.sh": b"export A='1'\n"})
     once = read_upload({"a.zip": middle})
     assert PartKey("topology", "ground", "network") in once.parts
@@ -567,7 +565,7 @@ def test_packages_in_packages_are_opened_once() -> None:
         read_upload({"a.pkg": archives.pack({"config/metric/x/deep.pkg": outer})}, "environment")
 
 
-def test_of_files_are_the_variables_that_the_script_sets() -> None:
+def test_file_variables_equal_those_of_the_script() -> None:
     inner = unzipped(offline({"yard.zip": SAMPLE}, "environment").files[MAIN])
     lines = inner["config/environment.sh"].decode().splitlines()
     set_here = {line.removeprefix("export ").partition("=")[0] for line in lines if "=" in line}

@@ -54,7 +54,7 @@ def plain(value: Any) -> Any:
     return float(value) if isinstance(value, int) else value
 
 
-def test_sample_matches_expected_facts() -> None:
+def test_sample_matches_known_facts() -> None:
     fact = json.loads((SAMPLES / "facts.json").read_text())["yard.ffr.yaml"]
     assert formats.detect("network.ffr.yaml", YARD) is FORMAT
     part, context = read(YARD)
@@ -70,7 +70,7 @@ def test_sample_matches_expected_facts() -> None:
     assert "without lines: well" in warnings
 
 
-def test_every_key_round_trips() -> None:
+def test_all_members_round_trip() -> None:
     part, _ = read(YARD)
     back, context = write(part)
     assert context.dropped == context.warnings == []
@@ -78,7 +78,7 @@ def test_every_key_round_trips() -> None:
     assert reference_lines({**back, "network_lines": back["network_lines"][:2]}) == {("gate", "barn"), ("12", "gate")}
 
 
-def test_parallel_and_reverse_lines_stay_separate() -> None:
+def test_parallel_and_opposite_edges_stay_separate() -> None:
     ends = "{start: {x: %s, y: 0}, end: {x: %s, y: 0}, n: %d}"
     lines = [ends % (0, 1, 1), ends % (1, 0, 2), ends % (0, 1, 3), ends % (1, 1, 4)]
     text = "internal_points: [{name: a, x: 0, y: 0}, {name: b, x: 1, y: 0}]\nnetwork_lines: [" + ", ".join(lines) + "]"
@@ -89,7 +89,7 @@ def test_parallel_and_reverse_lines_stay_separate() -> None:
     assert context.warnings == []
 
 
-def test_network_of_another_format_is_written() -> None:
+def test_network_of_other_format_is_written() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0.1, 0.2), {"kind": "node", "name": "Gate"}),
         ("b", shapely.Point(1 / 3, 2.0), {"kind": "node"}),
@@ -110,7 +110,7 @@ def test_network_of_another_format_is_written() -> None:
     }
 
 
-def test_network_becomes_tmap2_with_both_directions() -> None:
+def test_network_exports_to_tmap2_with_both_directions() -> None:
     top = yaml.safe_load(offline({"network.ffr.yaml": YARD}, "tmap2").files["network.tmap2.yaml"])
     edges = {(n["node"]["name"], e["node"]) for n in top["nodes"] for e in n["node"]["edges"]}
     assert edges == {("gate", "barn"), ("barn", "gate"), ("12", "gate"), ("gate", "12")}
@@ -130,7 +130,7 @@ def test_network_becomes_tmap2_with_both_directions() -> None:
         ("internal_points: []\nnetwork_lines: [[1, 2]]", "network_lines[0]"),
     ],
 )
-def test_invalid_values_are_refused_with_location(text: str, where: str) -> None:
+def test_invalid_network_raises_unreadable_file_with_location(text: str, where: str) -> None:
     with pytest.raises(BadUpload) as caught:
         read(text.encode())
     assert [p.where for p in caught.value.problems] == [where]

@@ -122,7 +122,7 @@ def tree(files: dict[str, bytes]) -> etree._Element:
 
 
 # --- our own samples ---------------------------------------------------------------------------------------------
-def test_a_yard_worked_out_by_hand() -> None:
+def test_yard_matches_values_computed_by_hand() -> None:
     bundle = read_upload(folder(SAMPLES / "yard"))
     part = objects(bundle)
     assert {(i, p["kind"]) for i, p in zip(part.ids, part.properties, strict=True)} == {
@@ -149,7 +149,7 @@ def test_a_yard_worked_out_by_hand() -> None:
     assert by["crate"].geometry.bounds == pytest.approx((-3.5, -5.0, -2.5, -3.0))
     # An include without a pose stands where its model says.
     assert by["spare crate"].properties["pose"] == [7.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    assert by["oak"].geometry == shapely.Point(5, 5), "nothing is known of it but its place"
+    assert by["oak"].geometry == shapely.Point(5, 5), "only its position is in the upload"
     # The gate stands 1 m north of its model at (0, 8), its right post 4 m right of the left one.
     assert by["entrance"].geometry.bounds == pytest.approx((-2.1, 8.9, 2.1, 9.1))
     assert by["entrance"].geometry.area == pytest.approx(0.08)
@@ -157,15 +157,15 @@ def test_a_yard_worked_out_by_hand() -> None:
     assert bundle.datum == Datum(53.2686, -0.5245, 12.5, heading=-30.0)
     problems = [w.problem for w in bundle.warnings]
     assert any("moves 1 of 8 objects (post)" in p for p in problems)
-    assert any("names 1 that are not there: ghost" in p for p in problems)
-    assert any("Oak tree is not fetched: supply" in p for p in problems)
+    assert any("names 1 unknown objects: ghost" in p for p in problems)
+    assert any("Oak tree is remote and not fetched" in p for p in problems)
     assert by["post"].properties["gazebo"]["state"] == [1.0, 2.5, 0.5, 0.0, 0.0, 0.0]
     files = folder(SAMPLES / "yard")
     assert resources(bundle) == {n: d for n, d in files.items() if n.startswith("models/")}
     assert all(use.used for use in bundle.files.values())
 
 
-def test_a_yard_comes_back(same: Same) -> None:
+def test_yard_round_trips(same: Same) -> None:
     files = folder(SAMPLES / "yard")
     out = offline(files, "gazebo").files
     assert next(iter(out)) == "world.sdf"
@@ -183,7 +183,7 @@ def test_a_yard_comes_back(same: Same) -> None:
         assert sorted(check(out)) == sorted(f"Error Code 13: Msg: Unable to find uri[{uri}]" for uri in missing_uris)
 
 
-def test_heading_runs_the_other_way_round() -> None:
+def test_heading_is_negated_in_datum() -> None:
     """heading_deg 30 in a world: libignition-math puts a point 100 m along the world's x axis 86.603 m east and 50 m
     north of the origin, and one along its y axis 50 m west and 86.603 m north (LOCAL2 to SPHERICAL, version 6.10)."""
     datum = read_upload(folder(SAMPLES / "yard")).datum
@@ -196,7 +196,7 @@ def test_heading_runs_the_other_way_round() -> None:
     assert north_up.to_local(earth) == pytest.approx(np.array([[86.6025, 50.0], [-50.0, 86.6025]]), abs=1e-3)
 
 
-def test_a_place_as_libignition_math_finds_it() -> None:
+def test_coordinates_match_libignition_math() -> None:
     """Latitude 53.27, longitude -0.52, heading_deg 30: (100, 0) lies at 53.2704492641, -0.5187019410 and (0, 100) at
     53.2707781582, -0.5207494405 (libignition-math 6.10, LOCAL2 to SPHERICAL)."""
     place = (
@@ -211,7 +211,7 @@ def test_a_place_as_libignition_math_finds_it() -> None:
     assert np.abs(earth - truth).max() < 1e-8
 
 
-def test_an_orchard_from_a_list() -> None:
+def test_orchard_list_becomes_a_world() -> None:
     bundle = read_upload(folder(SAMPLES / "orchard"))
     part = objects(bundle)
     assert part.ids == ("grass", "tree", "tree#2", "shed", "barrow")
@@ -242,7 +242,7 @@ def test_an_orchard_from_a_list() -> None:
     ]
 
 
-def test_a_lone_model_is_a_world_of_one() -> None:
+def test_single_model_becomes_a_world() -> None:
     bundle = read_upload(folder(SAMPLES / "cart"))
     (cart,) = objects(bundle)
     assert cart.properties["pose"] == [2.0, 3.0, 0.0, 0.0, 0.0, 0.0]
@@ -255,7 +255,7 @@ def test_a_lone_model_is_a_world_of_one() -> None:
     assert check(out) == []
 
 
-def test_a_lone_model_keeps_its_meshes() -> None:
+def test_single_model_keeps_its_meshes() -> None:
     cube = (SAMPLES / "yard/models/crate/meshes/crate.stl").read_bytes()
     for uri, served in (("meshes/a.stl", "meshes/a.stl"), ("model://cart/meshes/a.stl", "models/cart/meshes/a.stl")):
         mesh = f"<collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision>"
@@ -273,7 +273,7 @@ def test_a_lone_model_keeps_its_meshes() -> None:
 LINK = "<link name='l'><collision name='c'><geometry><box><size>2 1 1</size></box></geometry></collision></link>"
 
 
-def test_poses_of_every_kind() -> None:
+def test_poses_of_every_kind_are_read() -> None:
     quarter = round(math.pi / 2, 9)
     turned = "0 0 0.7071067811865476 0.7071067811865476"
     for xml, pose in {
@@ -294,7 +294,7 @@ def test_poses_of_every_kind() -> None:
         read_upload(world("<model name='m'><pose rotation_format='quat_xyzw'>0 0 0 0 0 0 0</pose></model>"))
 
 
-def test_frames_in_a_world_and_in_models() -> None:
+def test_frames_in_worlds_and_models_are_resolved() -> None:
     part = objects(
         read_upload(
             world(
@@ -329,7 +329,7 @@ def test_frames_in_a_world_and_in_models() -> None:
     assert {(s["radius"], *s["pose"][:3]) for s in inside["shapes"]} == {(1.0, 3.0, 0.0, 2.5), (2.0, 1.0, 0.0, 2.0)}
 
 
-def test_frames_that_are_not_there_or_run_in_a_circle_are_warned_of() -> None:
+def test_unknown_and_cyclic_frames_give_a_warning() -> None:
     bundle = read_upload(
         world(
             "<model name='a'><pose relative_to='b'>1 0 0 0 0 0</pose></model>"
@@ -339,11 +339,11 @@ def test_frames_that_are_not_there_or_run_in_a_circle_are_warned_of() -> None:
     )
     assert len(objects(bundle)) == 3
     problems = " ".join(w.problem for w in bundle.warnings)
-    assert "circle" in problems
-    assert "'nowhere' is not known" in problems
+    assert "cycle" in problems
+    assert "'nowhere' is unknown" in problems
 
 
-def test_shapes_of_every_kind() -> None:
+def test_shapes_of_every_kind_are_read() -> None:
     def shape(inner: str) -> Any:
         link = f"<link name='l'><collision name='c'><geometry>{inner}</geometry></collision></link>"
         return one(f"<model name='m'>{link}</model>", version="1.11").get("shapes")
@@ -373,7 +373,7 @@ def test_shapes_of_every_kind() -> None:
         shape("<box><size>1 2</size></box>")
 
 
-def test_each_shape_is_written_as_it_was_read() -> None:
+def test_shapes_round_trip() -> None:
     shapes = [
         {"type": "box", "size": [1.0, 2.0, 3.0], "pose": [1.0, 0.0, 0.0, 0.0, 0.0, 0.5]},
         {"type": "cylinder", "radius": 2.0, "length": 3.0},
@@ -402,7 +402,7 @@ def test_each_shape_is_written_as_it_was_read() -> None:
 
 
 # --- uploads -----------------------------------------------------------------------------------------------------
-def test_several_worlds_lie_side_by_side() -> None:
+def test_several_worlds_share_one_part() -> None:
     """Each world keeps its own objects and settings; asking for one gives nothing of the others."""
     first = b'<sdf version="1.5"><world name="one"><gravity>0 0 -1</gravity><model name="m"><link name="l"/></model></world></sdf>'
     second = b'<sdf version="1.6"><world name="two"><wind/><model name="m"><link name="k"/></model></world></sdf>'
@@ -416,7 +416,7 @@ def test_several_worlds_lie_side_by_side() -> None:
     assert [m.find("link").get("name") for m in tree(answer.files).iterchildren("model")] == ["l"]
     assert any("longer" in w["problem"] for w in answer.report.as_dict()["warnings"])
     assert answer.report.as_dict()["dropped"] == [
-        {"what": "objects of the world w/longer", "count": 1, "why": "ask with world=w/longer"}
+        {"what": "objects of the world w/longer", "count": 1, "why": "request it with world=w/longer"}
     ]
     for name in ("longer", "w/longer"):
         other = offline(files, "gazebo", options={"world": name}).files
@@ -427,7 +427,7 @@ def test_several_worlds_lie_side_by_side() -> None:
         offline(files, "gazebo", options={"world": "none"})
 
 
-def test_the_four_worlds_of_the_limo_track(shared: Path, same: Same) -> None:
+def test_limo_track_worlds_round_trip(shared: Path, same: Same) -> None:
     root = shared / "data/environment_template/indoor-agilex-limo-track"
     files = folder(root)
     bundle = read_upload(files)
@@ -446,7 +446,7 @@ def test_the_four_worlds_of_the_limo_track(shared: Path, same: Same) -> None:
         assert {n.split("/")[1] for n in out if n.startswith("models/")} == model_names, "only what this world needs"
 
 
-def test_a_model_is_a_world_only_without_one() -> None:
+def test_model_becomes_a_world_when_upload_has_none() -> None:
     model = b'<sdf version="1.6"><model name="%s">%s<link name="l"/></model></sdf>'
     files = {"models/a/model.sdf": model % (b"a", b""), "models/b/model.sdf": model % (b"b", b"")}
     assert set(objects(read_upload(files)).ids) == {"a", "b"}
@@ -458,7 +458,7 @@ def test_a_model_is_a_world_only_without_one() -> None:
     assert any(w.file == "models/b/model.sdf" for w in bundle.warnings)
 
 
-def test_what_belongs_to_a_world_is_nothing_else() -> None:
+def test_files_of_a_world_are_no_other_maps() -> None:
     """A mesh, a texture or a list in a model's folder is no map of its own."""
     kml = (
         b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>p</name></Placemark></Document></kml>'
@@ -488,7 +488,7 @@ def test_what_belongs_to_a_world_is_nothing_else() -> None:
         ("model://b/c/m.stl", "models/b/c/m.stl", "models/b/c/m.stl"),
     ],
 )
-def test_meshes_are_found_in_the_upload(uri: str, file: str, served: str) -> None:
+def test_meshes_are_found_in_upload(uri: str, file: str, served: str) -> None:
     cube = (SAMPLES / "yard/models/crate/meshes/crate.stl").read_bytes()
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), file: cube}
@@ -507,7 +507,7 @@ def test_meshes_are_found_in_the_upload(uri: str, file: str, served: str) -> Non
         "model://a/%2e%2e/m.stl", "$HOME/m.stl", "a\\m.stl", "package://p/m.stl", "", "model://", "model://gone/m.stl",
     ],
 )  # fmt: skip
-def test_nothing_else_is_looked_for(uri: str) -> None:
+def test_library_never_reads_outside_upload(uri: str) -> None:
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
     bundle = read_upload(files)
@@ -516,7 +516,7 @@ def test_nothing_else_is_looked_for(uri: str) -> None:
     assert uri in offline(files, "gazebo").files["world.sdf"].decode()
 
 
-def test_includes_that_go_round_are_refused_with_the_file() -> None:
+def test_cyclic_includes_raise_an_error_with_file() -> None:
     model = b'<sdf version="1.6"><model name="%s"><include><uri>model://%s</uri></include></model></sdf>'
     files = {"models/a/model.sdf": model % (b"a", b"b"), "models/b/model.sdf": model % (b"b", b"a")}
     for upload in (files, {**files, **world("<include><uri>model://a</uri></include>")}):
@@ -525,7 +525,7 @@ def test_includes_that_go_round_are_refused_with_the_file() -> None:
         assert caught.value.problems[0].file
 
 
-def test_includes_that_unfold_to_very_much_are_refused() -> None:
+def test_exponential_includes_raise_too_large() -> None:
     files = world("<include><uri>model://m0</uri></include>")
     for k in range(8):
         inner = "".join(f"<include><name>n{j}</name><uri>model://m{k + 1}</uri></include>" for j in range(10))
@@ -535,27 +535,27 @@ def test_includes_that_unfold_to_very_much_are_refused() -> None:
         read_upload(files)
 
 
-def test_a_broken_mesh_is_warned_of() -> None:
-    lies = b"\0" * 80 + struct.pack("<I", 2**31) + bytes(50)
+def test_broken_mesh_gives_a_warning() -> None:
+    broken = b"\0" * 80 + struct.pack("<I", 2**31) + bytes(50)
     mesh = "<link name='l'><collision name='c'><geometry><mesh><uri>model://m.stl</uri></mesh></geometry></collision></link>"
-    bundle = read_upload({**world(f"<model name='m'><pose>1 2 0 0 0 0</pose>{mesh}</model>"), "m.stl": lies})
+    bundle = read_upload({**world(f"<model name='m'><pose>1 2 0 0 0 0</pose>{mesh}</model>"), "m.stl": broken})
     assert objects(bundle).geometry[0] == shapely.Point(1, 2)
-    assert any(w.file and w.file.endswith("m.stl") and "solids are not known" in w.problem for w in bundle.warnings)
+    assert any(w.file and w.file.endswith("m.stl") and "solids are unknown" in w.problem for w in bundle.warnings)
 
 
-def test_zero_zero_is_no_place_and_a_known_datum_stays() -> None:
+def test_default_coordinates_give_no_datum_and_existing_datum_stays() -> None:
     place = "<spherical_coordinates><latitude_deg>{}</latitude_deg><longitude_deg>{}</longitude_deg><elevation>0</elevation><heading_deg>{}</heading_deg></spherical_coordinates><model name='m'><link name='l'/></model>"
     assert read_upload(world(place.format(0, 0, 0))).datum is None
     assert read_upload(world(place.format(10, 20, 270))).datum == Datum(10, 20, heading=90.0)
     datum = Datum(10.0, 20.5)
     bundle = read_upload(world(place.format(10, 20, 0)), context=EnvironmentContext(datum))
     assert bundle.datum is None
-    assert any("not the environment's datum" in w.problem for w in bundle.warnings)
+    assert any("differs from the environment's datum" in w.problem for w in bundle.warnings)
     files = world(place.format(10, 20, 0))
     parts = read_upload(files).parts
     assert "<longitude_deg>20.5<" in write(parts, datum)["world.sdf"].decode(), "the environment's datum is written"
     text = write(parts, Datum(10.0, 20.0))["world.sdf"].decode()
-    assert "<longitude_deg>20<" in text, "what means the same stays as it was"
+    assert "<longitude_deg>20<" in text, "equivalent coordinates stay unchanged"
     default = read_upload(world(place.format(0, 0, 0))).parts
     out, context = report(default, datum)
     assert "<longitude_deg>0<" in out["world.sdf"].decode()
@@ -567,7 +567,7 @@ def test_zero_zero_is_no_place_and_a_known_datum_stays() -> None:
     assert any("MOON_SCS" in w.problem for w in bundle.warnings)
 
 
-def test_an_object_that_is_moved_or_renamed_is_written_so() -> None:
+def test_moved_and_renamed_objects_are_written() -> None:
     bundle = read_upload(folder(SAMPLES / "yard"))
     part = objects(bundle)
     moved = {"sign": [1.0, 1.0, 0.0, 0.0, 0.0, 0.0], "spare crate": [0.0] * 6, "crate": [9.0, 9.0, 0.0, 0.0, 0.0, 0.0]}
@@ -630,7 +630,7 @@ def test_objects_of_other_formats_become_static_models() -> None:
     assert write(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0) == files
 
 
-def test_what_no_source_tells_can_be_said() -> None:
+def test_options_set_missing_measures_and_colours() -> None:
     rows = [
         ("fence", shapely.LineString([(0, 0), (4, 0)]), {"kind": "fence"}),
         ("tree", shapely.Point(9, 0), {"kind": "tree"}),
@@ -672,7 +672,7 @@ def test_what_no_source_tells_can_be_said() -> None:
     assert "ground_plane" not in {m.get("name") for m in bare.iter("model")}
 
 
-def test_shapes_may_be_felt_or_seen_only_and_have_colours() -> None:
+def test_shapes_can_be_collision_or_visual_only_with_colours() -> None:
     shapes: list[dict[str, Any]] = [
         {"type": "cylinder", "radius": 0.1, "length": 2.0, "unseen": True},
         {"type": "sphere", "radius": 1.0, "visual": True, "colour": [0.2, 0.5, 0.1]},
@@ -687,7 +687,7 @@ def test_shapes_may_be_felt_or_seen_only_and_have_colours() -> None:
     assert [e.text for e in model.iter("diffuse")] == ["0.2 0.5 0.1 1.0"], "what is no colour is none"
 
 
-def test_places_on_earth_are_brought_to_the_local_frame() -> None:
+def test_geographic_objects_are_written_in_local_frame() -> None:
     datum = Datum(53.0, -0.5, heading=20.0)
     frame = Layers({}, datum).frame
     assert frame is not None
@@ -702,7 +702,7 @@ def test_places_on_earth_are_brought_to_the_local_frame() -> None:
         write(parts)
 
 
-def test_a_stored_world_stands_alone_unless_all_is_asked_for() -> None:
+def test_stored_world_is_written_alone_unless_content_is_all() -> None:
     parts: dict[PartKey, Any] = dict(read_upload(world("<model name='m'><link name='l'/></model>")).parts)
     parts[PartKey("objects", name="osm")] = features([("h", shapely.box(0, 0, 1, 1), {"kind": "building"})], "local")
     parts[PartKey("occupancy")] = OccupancyGrid(np.full((2, 2), 100, np.uint8), 0.5)
@@ -717,7 +717,7 @@ def test_a_stored_world_stands_alone_unless_all_is_asked_for() -> None:
     assert everything.find("light") is None, "the stored world's author decides on its light and ground"
 
 
-def test_walls_of_a_grid() -> None:
+def test_grid_cells_become_walls() -> None:
     cells = np.zeros((4, 6), np.uint8)
     cells[0, :] = 100
     cells[1:3, 2:4] = 100
@@ -744,7 +744,7 @@ def test_walls_of_a_grid() -> None:
     assert any("no walls" in w.problem for w in context.warnings)
 
 
-def test_rectangles_hold_each_cell_once() -> None:
+def test_rectangles_cover_each_cell_once() -> None:
     dice = np.random.default_rng(5)
     for shape, share in (((17, 23), 0.5), ((40, 8), 0.9), ((1, 9), 0.4), ((9, 1), 0.6)):
         cells = dice.random(shape) < share
@@ -757,7 +757,7 @@ def test_rectangles_hold_each_cell_once() -> None:
         assert volume == pytest.approx(cells.sum())
 
 
-def test_a_large_grid_stays_handy() -> None:
+def test_large_grid_gives_a_small_mesh() -> None:
     """4000 × 4000 cells with rooms and 20 000 single cells of noise: seconds, and a mesh of some megabytes."""
     cells = np.zeros((4000, 4000), np.uint8)
     cells[::200, :] = cells[:, ::250] = 100
@@ -770,7 +770,7 @@ def test_a_large_grid_stays_handy() -> None:
     assert volume == pytest.approx(int((cells == 100).sum()) * 0.05**2 * 2.5, rel=1e-4)
 
 
-def test_which_grid_and_what_is_needed() -> None:
+def test_choose_selects_grid_for_walls() -> None:
     keys = [PartKey("occupancy", name=n) for n in ("keepout", "lab", "map")]
     assert [k.name for k in writing.choose(keys, WriteOptions())] == ["map"]
     assert [k.name for k in writing.choose(keys, WriteOptions(grid="keepout"))] == ["keepout"]
@@ -786,7 +786,7 @@ def test_which_grid_and_what_is_needed() -> None:
 
 
 @pytest.mark.parametrize("version", ["1.4", "1.5", "1.6", "1.7", "1.8", "1.9"])
-def test_versions_that_libsdformat_takes(version: str) -> None:
+def test_written_versions_load_in_libsdformat(version: str) -> None:
     rows = [("h", shapely.box(0, 0, 1, 1), {"kind": "building"}), ("p", shapely.Point(1, 2), {"kind": "tree"})]
     files = write({PartKey("objects", name="osm"): features(rows, "local")}, Datum(1.0, 2.0, 3.0, 4.0), version=version)
     assert check(files) == []
@@ -811,7 +811,7 @@ def real_worlds(shared: Path) -> list[tuple[str, Path, dict[str, bytes]]]:
     return out
 
 
-def test_real_worlds_have_their_facts_and_come_back(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
+def test_real_worlds_match_facts_and_round_trip(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
     """Also: libsdformat says nothing against what is written that it does not say against the original."""
     worlds = real_worlds(shared)
     assert len(worlds) > 10
@@ -844,7 +844,7 @@ def test_real_worlds_have_their_facts_and_come_back(shared: Path, facts_json: di
             assert set(complaints) <= set(before), key
 
 
-def test_real_models_have_their_shapes(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_real_models_match_expected_shapes(shared: Path, facts_json: dict[str, Any]) -> None:
     """Collision geometry of lone models by kind, against the independent count; meshes only where they are there."""
     seen = 0
     for key, entry in facts_json.items():
@@ -868,7 +868,7 @@ def test_real_models_have_their_shapes(shared: Path, facts_json: dict[str, Any])
     assert seen > 20
 
 
-def test_collada_units_are_applied_and_the_up_axis_is_not(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_collada_units_are_applied_but_not_up_axis(shared: Path, facts_json: dict[str, Any]) -> None:
     """The walls of turtlebot3_world are Y_UP with a unit of 2.54 cm: only with the unit and without the turn are they
     where the map has them (all of its occupied cells within 10 cm of the model's solids)."""
     root = shared / "data/gazebo_sdf/turtlebot3_world"
@@ -886,7 +886,7 @@ def test_collada_units_are_applied_and_the_up_axis_is_not(shared: Path, facts_js
     assert near.mean() > 0.98
 
 
-def test_known_obstacles_are_points_in_rows(shared: Path) -> None:
+def test_known_obstacles_become_points(shared: Path) -> None:
     path = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/world"
     bundle = read_upload({"known_obstacles.yaml": (path / "known_obstacles.yaml").read_bytes()})
     part = objects(bundle)
@@ -902,7 +902,7 @@ def test_known_obstacles_are_points_in_rows(shared: Path) -> None:
     assert len(tree(files).findall("model")) == len(part) + 1
 
 
-def test_the_generators_lists(shared: Path) -> None:
+def test_environment_common_lists_are_read(shared: Path) -> None:
     root = shared / "data/gazebo_sdf/environment_common_test_files"
     bundle = read_upload({n: (root / n).read_bytes() for n in ("objects.yaml", "models.yaml")})
     part = objects(bundle)
@@ -919,7 +919,7 @@ def test_the_generators_lists(shared: Path) -> None:
 
 
 # --- detection and damage ----------------------------------------------------------------------------------------
-def test_what_is_a_world_and_what_is_not() -> None:
+def test_detect_accepts_worlds_only() -> None:
     world_ = b"<sdf version='1.6'><world name='w'/></sdf>"
     for good in (world_, b"\n \t" + world_, b"\xef\xbb\xbf" + world_, b"<?xml version='1.0'?><!-- a --> " + world_):
         assert gazebo.detect("any", good)
@@ -941,7 +941,7 @@ def test_what_is_a_world_and_what_is_not() -> None:
         assert not gazebo.detect("a.yaml", text)
 
 
-def test_empty_worlds_are_kept_and_come_back() -> None:
+def test_empty_worlds_round_trip() -> None:
     files = world("<gravity>0 0 -1.6</gravity>", name="moon base")
     out = offline(files, "gazebo", hints=UploadHints("gazebo")).files
     assert tree(out).get("name") == "moon base"
@@ -960,7 +960,7 @@ def test_empty_worlds_are_kept_and_come_back() -> None:
         ("<model name='m'>" * 100 + "</model>" * 100, "nested"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_used_is_refused_with_a_reason(inner: str, reason: str) -> None:
+def test_invalid_world_raises_bad_upload_with_reason(inner: str, reason: str) -> None:
     with pytest.raises(BadUpload) as caught:
         read_upload(world(inner))
     assert reason in caught.value.detail
@@ -981,13 +981,13 @@ def test_what_cannot_be_used_is_refused_with_a_reason(inner: str, reason: str) -
         "components:\n- {type: {object: custom, reference: objects.yaml}}\n",
     ],
 )
-def test_lists_that_cannot_be_used(text: str) -> None:
+def test_invalid_list_raises_unreadable_file(text: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read_upload({"objects.yaml": text.encode()}, "gazebo")
     assert caught.value.problems[0].file == "objects.yaml"
 
 
-def test_stored_text_that_was_tampered_with_is_made_anew() -> None:
+def test_model_is_rebuilt_when_stored_text_is_invalid() -> None:
     part = objects(read_upload(world(f"<model name='m'>{LINK}</model>")))
     for text in ("<model", "<plugin/>", "<!DOCTYPE a><model/>", 5):
         source_properties = {**part.properties[0]["gazebo"], "sdf": text}
@@ -999,20 +999,20 @@ def test_stored_text_that_was_tampered_with_is_made_anew() -> None:
         assert model.findtext("link/collision/geometry/box/size") == "2.0 1.0 1.0"
 
 
-def test_names_are_made_valid_and_unique() -> None:
+def test_free_name_returns_valid_unique_names() -> None:
     taken: set[str] = set()
     names = [bodies.free_name(n, taken) for n in ("a", "a", "a::b", "__x__", "world", "\x01", "a_2")]
     assert names == ["a", "a_2", "a_b", "object_x", "object_world", "object", "a_2_2"]
     assert bodies.slug("näh (1)/x") == "n_h_1_x"
 
 
-def test_a_models_file_is_chosen_by_its_config() -> None:
+def test_model_config_selects_the_file() -> None:
     library = Library(folder(SAMPLES / "yard"))
     assert library.model_file("models/crate") == "models/crate/model.sdf"
     assert library.model_file("models/none") is None
 
 
-def test_unknown_elements_are_named_but_those_of_plugins() -> None:
+def test_unknown_elements_outside_plugins_give_a_warning() -> None:
     box = "<geometry><box><size>1 1 1</size></box></geometry>"
     model = (
         f"<model name='a'><static>true</static><link name='l'><colision name='c'>{box}</colision>"

@@ -53,7 +53,7 @@ def points(data: bytes) -> Any:
     return laspy.read(io.BytesIO(data))
 
 
-def test_places_by_the_files_own_crs() -> None:
+def test_points_are_placed_by_crs_of_file() -> None:
     """UTM 30N, near Sheffield: the datum is the south-west corner, and PROJ's own transverse Mercator the truth."""
     voxels, context, layers = read(FIELD, {"resolution": "0.01"})
     earth = Transformer.from_crs("EPSG:32630", "EPSG:4326", always_xy=True)
@@ -71,7 +71,7 @@ def test_places_by_the_files_own_crs() -> None:
     assert any("no datum" in w.problem for w in context.warnings)
 
 
-def test_places_under_the_environments_datum() -> None:
+def test_points_are_placed_by_environment_datum() -> None:
     frame = local_frame(Datum(53.21, -0.005, heading=30.0))
     voxels, _, layers = read(FIELD, frame=frame)
     assert layers.datum is None, "the environment keeps its own"
@@ -83,18 +83,18 @@ def test_places_under_the_environments_datum() -> None:
     )
 
 
-def test_local_by_request_and_by_an_unknown_crs() -> None:
+def test_points_are_local_when_requested_or_crs_is_unknown() -> None:
     voxels, context, layers = read(FIELD, {"crs": "local", "origin": "700000,5900000,50"})
     assert layers.datum is None
     assert voxels.bounds() == (0.0, 0.0, 0.0, 10.05, 20.05, 2.55)
-    strange = FIELD.replace(struct.pack("<H", 32630), struct.pack("<H", 32599))
-    _, context, layers = read(strange)
+    unknown = FIELD.replace(struct.pack("<H", 32630), struct.pack("<H", 32599))
+    _, context, layers = read(unknown)
     assert layers.datum is None
     assert any("not known" in w.problem for w in context.warnings)
-    assert any("taken as the local origin" in w.problem for w in context.warnings)
+    assert any("used as the local origin" in w.problem for w in context.warnings)
 
 
-def test_wkt_that_names_files_is_left_out() -> None:
+def test_wkt_referring_to_files_is_ignored() -> None:
     header = laspy.LasHeader(version="1.4", point_format=6)
     wkt = 'GEOGCS["x",DATUM["y",SPHEROID["z",6378137,298.25]],EXTENSION["PROJ4","+proj=longlat +nadgrids=/etc/passwd"]]'
     header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
@@ -104,10 +104,10 @@ def test_wkt_that_names_files_is_left_out() -> None:
     las.write(out)
     _, context, layers = read(out.getvalue())
     assert layers.datum is None
-    assert any("names files" in w.problem for w in context.warnings)
+    assert any("refers to files" in w.problem for w in context.warnings)
 
 
-def test_wkt_of_las_1_4_and_heights_in_feet() -> None:
+def test_wkt_of_las_1_4_with_heights_in_feet_is_applied() -> None:
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.offsets, header.scales = np.array([700000.0, 5900000.0, 0.0]), np.full(3, 0.001)
     las = laspy.LasData(header)
@@ -120,7 +120,7 @@ def test_wkt_of_las_1_4_and_heights_in_feet() -> None:
     assert voxels.axis(2)[0].tolist() == [int(100 * 1200 / 3937 / 0.05)]
 
 
-def test_the_same_file_comes_back_and_the_other_kind_holds_the_same() -> None:
+def test_file_round_trips_and_both_encodings_hold_same_points() -> None:
     assert written({"a.las": FIELD}) == FIELD
     assert written({"a.laz": SPIRAL}) == SPIRAL
     for data, kind in ((FIELD, "laz"), (SPIRAL, "las")):
@@ -136,7 +136,7 @@ def test_the_same_file_comes_back_and_the_other_kind_holds_the_same() -> None:
     assert set(offline({"a.las": FIELD}, "las", options={"kind": "laz"}).files) == {"map.laz"}
 
 
-def test_dimensions_of_a_real_las_reach_the_others() -> None:
+def test_dimensions_of_real_las_reach_other_formats() -> None:
     header, rows = clouds.pcd(written({"a.las": FIELD}, "pcd", frame="source"))
     fields = header["FIELDS"].split()
     assert fields[:4] == ["x", "y", "z", "intensity"]
@@ -149,14 +149,14 @@ def test_dimensions_of_a_real_las_reach_the_others() -> None:
     assert (row["scan_angle_rank"], row["user_data"], row["point_source_id"]) == (-3, 5, 9)
 
 
-def test_local_coordinates_in_other_formats_agree_with_the_voxels() -> None:
+def test_local_coordinates_in_other_formats_match_voxels() -> None:
     voxels, _, _ = read(FIELD)
     _, rows = clouds.ply(written({"a.las": FIELD}, "ply"))
     cells = {tuple(int(np.floor(v / 0.05)) for v in row[:3]) for row in rows}
     assert cells == set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
 
 
-def test_another_cloud_as_las() -> None:
+def test_other_cloud_formats_convert_to_las() -> None:
     shelf = (SAMPLES / "pcd" / "shelf.pcd").read_bytes()
     converted = offline({"shelf.pcd": shelf}, "las")
     las = points(converted.files["map.las"])
@@ -175,7 +175,7 @@ def test_another_cloud_as_las() -> None:
     assert intensity.intensity.tolist() == [0, 10, 20, 30], "whole numbers are LAS's own intensity"
 
 
-def test_voxels_as_las_keep_their_voxels() -> None:
+def test_voxels_round_trip_via_las() -> None:
     shed = (SAMPLES / "octomap" / "shed.bt").read_bytes()
     las = points(written({"shed.bt": shed}))
     res = float(shed.partition(b"\nres ")[2].split()[0])
@@ -184,35 +184,35 @@ def test_voxels_as_las_keep_their_voxels() -> None:
     assert written({"shed.bt": shed}, kind="laz") == written({"shed.bt": shed}, kind="laz")
 
 
-def lying(data: bytes, at: int, form: str, value: int) -> bytes:
+def corrupt(data: bytes, at: int, form: str, value: int) -> bytes:
     size = struct.calcsize(form)
     return data[:at] + struct.pack(form, value) + data[at + size :]
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (FIELD[:200], "within the header"),
-        (lying(FIELD, 25, "<B", 9), "1.0 to 1.4"),
-        (lying(FIELD, 96, "<I", 2**31), "contradict"),
-        (lying(FIELD, 94, "<H", 10), "contradict"),
-        (lying(FIELD, 100, "<I", 2**32 - 1), "do not go before"),
-        (lying(FIELD, 107, "<I", 2**32 - 1), "limit"),
-        (lying(FIELD, 107, "<I", 4), "the file has"),
-        (lying(FIELD, 104, "<B", 11), "no point format"),
-        (lying(FIELD, 131, "<Q", 0x7FF0000000000000), "finite"),
-        (lying(SPIRAL, 247, "<Q", 2**63), "limit"),
-        (lying(SPIRAL, 243, "<I", 2**32 - 1), "do not go after"),
-        (lying(SPIRAL, POINTS, "<q", 5), "table of chunks"),
-        (lying(SPIRAL, struct.unpack_from("<q", SPIRAL, POINTS)[0] + 4, "<I", 2**31), "more chunks"),
-        (lying(SPIRAL, 375 + 54 + 32, "<H", 60000), "ends too early"),
-        (lying(SPIRAL, 375 + 54 + 36, "<H", 29), "LASzip record tells"),
+        (corrupt(FIELD, 25, "<B", 9), "1.0 to 1.4"),
+        (corrupt(FIELD, 96, "<I", 2**31), "contradict"),
+        (corrupt(FIELD, 94, "<H", 10), "contradict"),
+        (corrupt(FIELD, 100, "<I", 2**32 - 1), "do not fit before"),
+        (corrupt(FIELD, 107, "<I", 2**32 - 1), "limit"),
+        (corrupt(FIELD, 107, "<I", 4), "but the file has"),
+        (corrupt(FIELD, 104, "<B", 11), "unknown point format"),
+        (corrupt(FIELD, 131, "<Q", 0x7FF0000000000000), "finite"),
+        (corrupt(SPIRAL, 247, "<Q", 2**63), "limit"),
+        (corrupt(SPIRAL, 243, "<I", 2**32 - 1), "do not fit after"),
+        (corrupt(SPIRAL, POINTS, "<q", 5), "chunk table"),
+        (corrupt(SPIRAL, struct.unpack_from("<q", SPIRAL, POINTS)[0] + 4, "<I", 2**31), "more chunks"),
+        (corrupt(SPIRAL, 375 + 54 + 32, "<H", 60000), "ends too early"),
+        (corrupt(SPIRAL, 375 + 54 + 36, "<H", 29), "LASzip record declares"),
     ],
 )  # fmt: skip
-def test_lies_in_headers_are_found_before_anything_is_allocated(data: bytes, said: str) -> None:
+def test_wrong_headers_are_rejected_before_allocation(data: bytes, message: str) -> None:
     tracemalloc.start()
     try:
-        with pytest.raises((UnreadableFile, TooLarge), match=said) as caught:
+        with pytest.raises((UnreadableFile, TooLarge), match=message) as caught:
             read(data)
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
@@ -220,15 +220,15 @@ def test_lies_in_headers_are_found_before_anything_is_allocated(data: bytes, sai
     assert caught.value.problems[0].file == "map.las"
 
 
-def test_limits_are_kept() -> None:
+def test_limits_are_enforced() -> None:
     with pytest.raises(TooLarge, match="limit is 2"):
         read(FIELD, limits=Limits(voxels=2))
     with pytest.raises(TooLarge, match="more than the limit of"):
         read(SPIRAL, limits=Limits(unpacked_bytes=100))
 
 
-def test_damaged_compressed_points_are_refused_or_read(capfd: pytest.CaptureFixture[str]) -> None:
-    """Also where lazrs panics: its message goes to stderr, the exception is ours."""
+def test_damaged_compressed_points_are_rejected_or_read(capfd: pytest.CaptureFixture[str]) -> None:
+    """Includes panics of lazrs: the message goes to stderr, the exception is UnreadableFile."""
     dice = random.Random(7)
     refused = 0
     for _ in range(400):

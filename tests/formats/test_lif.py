@@ -90,7 +90,7 @@ def real(shared: Path) -> list[Path]:
     return sorted((shared / "data" / "lif").rglob("*.json"))
 
 
-def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+def test_real_files_round_trip(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
     assert len(real(shared)) == sum(f.get("kind") == "lif" for f in facts_json.values()) == 9
     for path in real(shared):
         data = path.read_bytes()
@@ -110,7 +110,7 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         assert same("lif", {path.name: data}, {"layout.lif.json": converted}) == [], path
 
 
-def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_layers_match_facts_of_real_files(shared: Path, facts_json: dict[str, Any]) -> None:
     for path in real(shared):
         fact = facts_json[str(path.relative_to(shared / "data"))]["facts"]
         layers, _ = read(path.read_bytes())
@@ -125,7 +125,7 @@ def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_js
 # --- our sample ------------------------------------------------------------------------------------------------------
 
 
-def test_facts_of_the_sample() -> None:
+def test_sample_matches_facts() -> None:
     fact = FACTS["plant.lif.json"]
     layers, context = read((SAMPLES / "plant.lif.json").read_bytes())
     for kind, word, layer in (
@@ -144,12 +144,12 @@ def test_facts_of_the_sample() -> None:
     points = [g for _, p, g in rows if p["kind"] == "node"]
     assert shapely.total_bounds(points).tolist() == [*fact["bounds"][0], *fact["bounds"][1]]
     assert sum(len(p["lif"].get("dangling", ())) for _, p, _ in rows) == fact["dangling"]
-    assert "leads to 'gone'" in warnings(context)
+    assert "leads to the unknown node 'gone'" in warnings(context)
     assert "radians" in warnings(context)
     assert {key.level for key in layers.parts} == {"0", "1"}
 
 
-def test_the_sample_in_full(same: Same) -> None:
+def test_sample_matches_expected_content(same: Same) -> None:
     data = (SAMPLES / "plant.lif.json").read_bytes()
     layers, _ = read(data)
     dock = item(layers, "N2")
@@ -175,7 +175,7 @@ def test_the_sample_in_full(same: Same) -> None:
     assert [e["edgeId"] for e in top["layouts"][0]["edges"]] == ["E1", "E0", "curve", "lift", "nowhere"]
 
 
-def test_order_does_not_depend_on_how_the_items_are_stored() -> None:
+def test_written_order_is_independent_of_stored_order() -> None:
     layers, _ = read((SAMPLES / "plant.lif.json").read_bytes())
     turned = {
         key: part.select(list(reversed(range(len(part)))))
@@ -191,7 +191,7 @@ def test_order_does_not_depend_on_how_the_items_are_stored() -> None:
     assert write(Layers(dict(reversed(turned.items())), None, layers.levels))[0] == write(layers)[0]
 
 
-def test_what_an_edit_changes_is_served() -> None:
+def test_edits_are_written() -> None:
     layers, _ = read((SAMPLES / "plant.lif.json").read_bytes())
     key = PartKey("topology", "0", "network")
     part = layers.parts[key]
@@ -216,10 +216,10 @@ def test_what_an_edit_changes_is_served() -> None:
     assert [e["maxSpeed"] for e in hall["edges"][0]["vehicleTypeEdgeProperties"]] == [0.75, 0.75]
     assert hall["nodes"][-1]["nodeId"] == "new"
     assert hall["nodes"][-1]["vehicleTypeNodeProperties"] == [{"vehicleTypeId": "any"}]
-    assert [(t.subject, t.option) for t in context.template] == [("nodes: type of vehicle", "vehicle_type")]
+    assert [(t.subject, t.option) for t in context.template] == [("nodes: vehicle type", "vehicle_type")]
 
 
-def test_what_no_source_says_can_be_said() -> None:
+def test_options_set_missing_values() -> None:
     edge = {"kind": "edge", "source": "a", "target": "b"}
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0, 0), {"kind": "node"}),
@@ -242,7 +242,7 @@ def test_what_no_source_says_can_be_said() -> None:
     assert {t.option: t.value for t in context.template if t.option} == options
 
 
-def test_drafts_speak_their_own_words(shared: Path) -> None:
+def test_drafts_keep_their_member_names(shared: Path) -> None:
     drafts = sorted((shared / "data" / "lif" / "vdma_lif_2_0_draft").glob("*.json"))
     types = []
     for path in drafts:
@@ -283,7 +283,7 @@ def street(*names: str, **more: Any) -> Features:
     return features(rows, "local")
 
 
-def test_a_network_of_another_format() -> None:
+def test_network_of_other_format_is_written() -> None:
     part = street("A", "B", speed_limit=2.5, action="row_traversal")
     up = PartKey("topology", "up", "network")
     layers = Layers({NETWORK: part, up: street("A", "C")}, None, (Level(), Level("up", 3.0)))
@@ -305,7 +305,7 @@ def test_a_network_of_another_format() -> None:
     assert write(back)[0] == served
 
 
-def test_tmap2_to_lif_and_back(shared: Path) -> None:
+def test_tmap2_round_trips_via_lif(shared: Path) -> None:
     farm = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard" / "config" / "topological"
     data = (farm / "network.tmap2.yaml").read_bytes()
     lif_data = offline({"network.tmap2.yaml": data}, "lif").files["layout.lif.json"]
@@ -324,7 +324,7 @@ def test_tmap2_to_lif_and_back(shared: Path) -> None:
     assert offline({"layout.lif.json": lif_data}, "tmap2").files
 
 
-def test_through_our_geojson_nothing_is_lost(same: Same) -> None:
+def test_file_round_trips_via_geojson(same: Same) -> None:
     data = (SAMPLES / "plant.lif.json").read_bytes()
     layers, _ = read(data)
     geojson_data = formats.write(get_format("geojson"), layers, WriteContext())["map.geojson"]
@@ -334,7 +334,7 @@ def test_through_our_geojson_nothing_is_lost(same: Same) -> None:
     assert same("lif", {"a.json": data}, {"b.json": write(again)[0]}) == []
 
 
-def test_places_on_earth_need_a_datum_and_nodes_are_needed() -> None:
+def test_write_requires_nodes_and_a_datum_for_geographic_ones() -> None:
     part = features([("a", shapely.Point(-0.5, 53.0), {"kind": "node"})], "wgs84")
     with pytest.raises(MissingDatum):
         write(part)
@@ -365,7 +365,7 @@ AT = {"x": 1, "y": 2}
         ({"layouts": 5}, "layouts", "array"),
         ({"layouts": [5]}, "layouts[0]", "object"),
         ({"layouts": [{}]}, "layouts[0].layoutId", "id"),
-        ({"layouts": [{"layoutId": "a"}, {"layoutId": "a"}]}, "layouts[1].layoutId", "twice"),
+        ({"layouts": [{"layoutId": "a"}, {"layoutId": "a"}]}, "layouts[1].layoutId", "duplicate layout"),
         ({"layouts": [], "origins": [5]}, "origins[0]", "object"),
         (layout(layoutLevelId=5), "layouts[0].layoutLevelId", "text"),
         (layout(layoutLevelId="a\nb"), "layouts[0].layoutLevelId", "control"),
@@ -383,7 +383,7 @@ AT = {"x": 1, "y": 2}
         ),
     ],
 )
-def test_bad_files_are_named(data: Any, where: str, reason: str) -> None:
+def test_invalid_file_raises_unreadable_file_with_location(data: Any, where: str, reason: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(data)
     problem = caught.value.problems[0]
@@ -392,7 +392,7 @@ def test_bad_files_are_named(data: Any, where: str, reason: str) -> None:
     assert problem.file == "layout.lif.json"
 
 
-def test_limits() -> None:
+def test_limits_are_enforced() -> None:
     with pytest.raises(UnreadableFile, match="JSON") as caught:
         read(b'{"layouts": [\n}')
     assert caught.value.problems[0].line == 2
@@ -407,29 +407,32 @@ def test_limits() -> None:
 @pytest.mark.parametrize(
     ("data", "warning"),
     [
-        (layout([{"nodeId": 7, "nodePosition": AT}]), "is no text"),
-        (layout([{"nodeId": "A", "nodePosition": AT}]), "share an id"),
-        (layout([{"nodeId": "C", "nodePosition": AT}]), "name no type of vehicle"),
-        (layout([{"nodeId": "C", "nodePosition": AT, "vehicleTypeNodeProperties": [5]}]), "name no type of vehicle"),
+        (layout([{"nodeId": 7, "nodePosition": AT}]), "is not text"),
+        (layout([{"nodeId": "A", "nodePosition": AT}]), "duplicate ids of"),
+        (layout([{"nodeId": "C", "nodePosition": AT}]), "have no vehicle type"),
+        (layout([{"nodeId": "C", "nodePosition": AT, "vehicleTypeNodeProperties": [5]}]), "have no vehicle type"),
         (layout(edges=[{"edgeId": "e", "startNodeId": "A", "endNodeId": "A"}]), "to itself"),
-        (layout(edges=[{"edgeId": "e", "startNodeId": "A", "endNodeId": "X"}]), "is no node"),
-        (layout(edges=[{"edgeId": "e", "startNodeId": None, "endNodeId": ["X"]}]), "is no node"),
-        (layout(stations=[{"stationId": "S", "interactionNodeIds": ["X"]}]), "reached at X"),
+        (layout(edges=[{"edgeId": "e", "startNodeId": "A", "endNodeId": "X"}]), "unknown node"),
+        (layout(edges=[{"edgeId": "e", "startNodeId": None, "endNodeId": ["X"]}]), "unknown node"),
+        (
+            layout(stations=[{"stationId": "S", "interactionNodeIds": ["X"]}]),
+            "unknown interaction nodes of the station: X",
+        ),
         (layout(stations=[{"stationId": "S"}]), "needs an array"),
         ({"layouts": layout()["layouts"]}, "read as version 1.0"),
         ({**layout(), "metaInformation": {"lifVersion": "3.1"}}, "is a draft"),
     ],
 )
-def test_what_is_doubtful_is_taken_with_a_warning(data: dict[str, Any], warning: str, same: Same) -> None:
+def test_doubtful_values_are_read_with_a_warning(data: dict[str, Any], warning: str, same: Same) -> None:
     layers, context = read(data)
     assert warning in warnings(context)
     served, _ = write(layers)
     assert write(read(served)[0])[0] == served
-    if "is no node" in warning or "itself" in warning:
+    if "unknown node" in warning or "itself" in warning:
         assert same("lif", {"a.json": json.dumps(data).encode()}, {"b.json": served}) == []
 
 
-def test_a_layout_without_a_level_goes_where_it_is_asked_to() -> None:
+def test_layout_without_level_gets_requested_level() -> None:
     layers, _ = read(layout(), level="cellar")
     assert {k.level for k in layers.parts} == {"cellar"}
     assert "layoutLevelId" not in json.loads(write(layers)[0])["layouts"][0]
@@ -439,7 +442,7 @@ def test_a_layout_without_a_level_goes_where_it_is_asked_to() -> None:
     assert check(lif_data)
 
 
-def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
+def test_invalid_stored_source_properties_do_not_prevent_writing() -> None:
     for value in (5, "x", [1], {"a": 1}, None, [[1]], True, {"layoutId": 3}, [{"layoutId": "x", "head": 4}]):
         source_properties = dict.fromkeys(("id", "layout", "at", "item", "dangling"), value)
         words = ("vehicleTypeNodeProperties", "vehicleTypeEdgeProperties", "nodePosition", "trajectory", "nodeName")
@@ -475,5 +478,5 @@ def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
         (b'["metaInformation", "layouts"]', False),
     ],
 )
-def test_detection(data: bytes, is_one: bool) -> None:
+def test_detect_recognises_lif(data: bytes, is_one: bool) -> None:
     assert FORMAT.detect("a.json", data) is is_one

@@ -84,7 +84,7 @@ def real_maps(shared: Path, facts_json: dict[str, Any]) -> list[tuple[str, dict[
     return out
 
 
-def test_real_maps_have_the_counted_cells_and_come_back(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
+def test_real_maps_match_facts_and_round_trip(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
     for name, files, facts in real_maps(shared, facts_json):
         main = name.rpartition("/")[2]
         layers, context = read_layers(files, main=main)
@@ -115,7 +115,7 @@ def test_real_maps_have_the_counted_cells_and_come_back(shared: Path, facts_json
             assert write_context.dropped == [], name
 
 
-def test_bounds_of_what_is_occupied(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_bounds_of_occupied_cells_match_facts(shared: Path, facts_json: dict[str, Any]) -> None:
     """Catches what counts cannot: rows upside down, columns mirrored, an origin off by a cell."""
     for name, files, facts in real_maps(shared, facts_json):
         grid, _ = read(files, main=name.rpartition("/")[2])
@@ -129,7 +129,7 @@ def test_bounds_of_what_is_occupied(shared: Path, facts_json: dict[str, Any]) ->
         assert np.allclose([*low, *high], facts["occupied_bbox_m_unrotated"], atol=1e-6), name
 
 
-def test_a_picture_of_another_machine_is_found_by_its_base_name(shared: Path) -> None:
+def test_image_with_foreign_path_is_found_by_base_name(shared: Path) -> None:
     folder = shared / "data/occupancy_grid/turtlebot3_map_office_raw"
     _, context = read({p.name: p.read_bytes() for p in folder.iterdir()})
     (warning,) = context.warnings
@@ -137,7 +137,7 @@ def test_a_picture_of_another_machine_is_found_by_its_base_name(shared: Path) ->
     assert (warning.file, warning.line, warning.where) == ("map_office_raw.yaml", 1, "image")
 
 
-def test_one_map_as_pgm_png_and_bmp(shared: Path) -> None:
+def test_pgm_png_and_bmp_give_the_same_map(shared: Path) -> None:
     folder = shared / "data/occupancy_grid/nav2_testmap"
     grids = [read({p.name: p.read_bytes()}, resolution="0.1")[0] for p in sorted(folder.glob("testmap.*"))]
     assert len(grids) == 3
@@ -145,14 +145,14 @@ def test_one_map_as_pgm_png_and_bmp(shared: Path) -> None:
     assert grids[0].counts() == {"occupied": 29, "free": 71, "unknown": 0, "other": 0}
 
 
-def test_extra_keys_of_a_real_map_come_back(shared: Path) -> None:
+def test_extra_keys_of_real_map_round_trip(shared: Path) -> None:
     folder = shared / "data/occupancy_grid/nav2_map_circular"
     grid, _ = read({p.name: p.read_bytes() for p in folder.iterdir()})
     assert grid.properties == {"occupancy_grid": {"map_type": "occupancy"}}
     assert b"\nmap_type: occupancy\n" in write(grid)[0]["map.yaml"]
 
 
-def test_memory_of_a_large_map_is_a_few_times_its_cells(shared: Path) -> None:
+def test_large_map_is_read_in_bounded_memory(shared: Path) -> None:
     folder = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/metric/map"
     files = {p.name: p.read_bytes() for p in folder.glob("map.*")}
     tracemalloc.start()
@@ -171,7 +171,7 @@ def test_memory_of_a_large_map_is_a_few_times_its_cells(shared: Path) -> None:
 
 # --- samples ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", json.loads((SAMPLES / "facts.json").read_text()))
-def test_samples_have_their_facts(name: str, facts: Any, same: Same) -> None:
+def test_samples_match_facts(name: str, facts: Any, same: Same) -> None:
     expected = json.loads((SAMPLES / "facts.json").read_text())[name]
     files = {p.name: p.read_bytes() for p in (SAMPLES / name).parent.iterdir()}
     grid, _ = read(files)
@@ -191,7 +191,7 @@ def test_samples_have_their_facts(name: str, facts: Any, same: Same) -> None:
 
 
 # --- telling and finding ------------------------------------------------------------------------------------------
-def test_detect_goes_by_content() -> None:
+def test_detect_uses_content() -> None:
     assert FORMAT.detect("a.yaml", YAML)
     assert FORMAT.detect("no name at all", b"\xef\xbb\xbf# a comment\n# another: image\n\n" + YAML)
     assert FORMAT.detect("a.yaml", YAML.replace(b"\n", b"\r\n"))
@@ -207,7 +207,7 @@ def test_detect_goes_by_content() -> None:
     assert not FORMAT.detect("map.yaml", b"")
 
 
-def test_pictures_belong_to_the_yaml_that_names_them() -> None:
+def test_images_belong_to_their_yaml() -> None:
     files = {"a/map.yaml": YAML, "a/map.pgm": PGM, "a/other.pgm": PGM, "b/map.pgm": PGM}
     groups, rest = formats.group(files)
     assert [(g.format.name, g.main, sorted(g.files)) for g in groups] == [
@@ -239,7 +239,7 @@ def test_pictures_belong_to_the_yaml_that_names_them() -> None:
         ("map.yaml", None, False),
     ],
 )
-def test_an_image_is_only_looked_up_inside_the_upload(said: str, where: str | None, warns: bool) -> None:
+def test_image_lookup_never_leaves_the_upload(said: str, where: str | None, warns: bool) -> None:
     files = {"maps/map.yaml": YAML.replace(b"map.pgm", json.dumps(said).encode())}
     files[where or "maps/unrelated.pgm"] = PGM
     if where is None:
@@ -252,22 +252,22 @@ def test_an_image_is_only_looked_up_inside_the_upload(said: str, where: str | No
     assert bool(context.warnings) == warns
 
 
-def test_of_several_pictures_of_the_name_none_is_guessed() -> None:
+def test_ambiguous_image_name_raises_unreadable_file() -> None:
     files = {"map.yaml": YAML.replace(b"map.pgm", b"/x/map.pgm"), "b/map.pgm": PGM, "a/map.pgm": PGM}
-    with pytest.raises(UnreadableFile, match="beside the YAML"):
+    with pytest.raises(UnreadableFile, match="next to the YAML file"):
         read(files)
-    assert read({**files, "map.pgm": PGM})[1].warnings[0].problem.endswith("'map.pgm' was taken for it")
+    assert read({**files, "map.pgm": PGM})[1].warnings[0].problem.endswith("'map.pgm' is used")
 
 
 # --- reading ------------------------------------------------------------------------------------------------------
-def test_rows_are_flipped_and_thresholds_bind() -> None:
+def test_rows_are_flipped_and_thresholds_applied() -> None:
     grid, context = read({"map.yaml": YAML, "map.pgm": PGM})
     assert seen(grid) == [[100, 0, 255], [0, 0, 255]]
     assert (grid.resolution, grid.origin, grid.mode) == (0.05, (-1.0, -2.0, 0.0), "trinary")
     assert context.warnings == []
 
 
-def test_context_names_grid_and_level() -> None:
+def test_context_sets_grid_and_level() -> None:
     groups, _ = formats.group({"map.yaml": YAML, "map.pgm": PGM})
     layers = formats.read(groups[0], ReadContext(grid="keepout", level="L2"))
     assert list(layers.parts) == [PartKey("occupancy", "L2", "keepout")]
@@ -303,7 +303,9 @@ def test_context_names_grid_and_level() -> None:
         (b"negate: 0", b"negate: 0\nmode: [raw]", "mode", 5),
     ],
 )
-def test_a_bad_yaml_tells_key_and_line(old: bytes, new: bytes, key: str, line: int | None) -> None:
+def test_invalid_yaml_raises_unreadable_file_with_key_and_line(
+    old: bytes, new: bytes, key: str, line: int | None
+) -> None:
     with pytest.raises(UnreadableFile) as error:
         read({"map.yaml": YAML.replace(old, new, 1), "map.pgm": PGM})
     (problem,) = error.value.problems
@@ -312,14 +314,14 @@ def test_a_bad_yaml_tells_key_and_line(old: bytes, new: bytes, key: str, line: i
 
 
 @pytest.mark.parametrize("value", [b".nan", b".inf", b"-.inf", b"1e999"])
-def test_not_finite_is_refused(value: bytes) -> None:
+def test_non_finite_number_raises_unreadable_file(value: bytes) -> None:
     for old in (b"0.05", b"-2", b"0.65"):
         with pytest.raises(UnreadableFile) as error:
             read({"map.yaml": YAML.replace(old, value, 1), "map.pgm": PGM})
         assert error.value.problems[0].line
 
 
-def test_all_that_is_wrong_is_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     with pytest.raises(UnreadableFile) as error:
         read({"map.yaml": b"image: a\nresolution: 0\nnegate: x\n", "map.pgm": PGM})
     assert {p.where for p in error.value.problems} == {
@@ -328,12 +330,12 @@ def test_all_that_is_wrong_is_told_at_once() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"text", b"a: [", b"- 1\n- 2\n", b"\xff\xfe"])
-def test_no_mapping_is_refused(data: bytes) -> None:
+def test_yaml_without_mapping_raises_unreadable_file(data: bytes) -> None:
     with pytest.raises(UnreadableFile):
         read({"map.yaml": data})
 
 
-def test_an_alias_bomb_is_refused() -> None:
+def test_alias_bomb_raises_unreadable_file() -> None:
     bomb = b"a0: &a0 [x, x]\n" + b"".join(
         b"a%d: &a%d [%s]\n" % (i, i, b", ".join([b"*a%d" % (i - 1)] * 9)) for i in range(1, 12)
     )
@@ -341,7 +343,7 @@ def test_an_alias_bomb_is_refused() -> None:
         read({"map.yaml": YAML + bomb, "map.pgm": PGM})
 
 
-def test_a_damaged_picture_is_told_by_its_name() -> None:
+def test_damaged_image_raises_an_error_with_its_name() -> None:
     with pytest.raises(UnreadableFile, match=r"map.pgm: the PGM is cut short") as error:
         read({"map.yaml": YAML, "map.pgm": PGM[:-1]})
     assert error.value.problems[0].file == "map.pgm"
@@ -350,13 +352,13 @@ def test_a_damaged_picture_is_told_by_its_name() -> None:
     assert large.value.problems[0].file == "map.pgm"
 
 
-def test_what_yaml_cpp_takes_is_taken() -> None:
+def test_values_accepted_by_yaml_cpp_are_accepted() -> None:
     text = YAML.replace(b"0.05", b'"5e-2"').replace(b"negate: 0", b"negate: no").replace(b"[-1,", b"['-1',")
     grid, _ = read({"map.yaml": text, "map.pgm": PGM})
     assert (grid.resolution, grid.negate, grid.origin[0]) == (0.05, False, -1.0)
 
 
-def test_a_yaw_is_kept_with_a_warning() -> None:
+def test_yaw_is_kept_with_a_warning() -> None:
     grid, context = read({"map.yaml": YAML.replace(b"-2, 0]", b"-2, 0.5]"), "map.pgm": PGM})
     assert grid.origin == (-1.0, -2.0, 0.5)
     assert "normalize" in context.warnings[0].problem
@@ -366,7 +368,7 @@ def test_a_yaw_is_kept_with_a_warning() -> None:
     assert "normalize" in write_context.warnings[0].problem
 
 
-def test_thresholds_the_wrong_way_round_are_read_as_nav2_does(facts: Any) -> None:
+def test_swapped_thresholds_are_read_as_in_nav2(facts: Any) -> None:
     files = {"map.yaml": YAML.replace(b"0.65", b"0.1").replace(b"0.196", b"0.9"), "map.pgm": PGM}
     grid, context = read(files)
     assert (grid.cells == independent(files, facts)).all()
@@ -374,7 +376,7 @@ def test_thresholds_the_wrong_way_round_are_read_as_nav2_does(facts: Any) -> Non
 
 
 # --- a picture alone ----------------------------------------------------------------------------------------------
-def test_a_picture_alone_needs_a_resolution() -> None:
+def test_single_image_requires_resolution() -> None:
     with pytest.raises(UnreadableFile, match="resolution") as error:
         read({"hall.pgm": PGM})
     assert error.value.problems[0].where == "resolution"
@@ -386,20 +388,20 @@ def test_a_picture_alone_needs_a_resolution() -> None:
     assert seen(grid) == [[0, 255, 255], [255, 255, 100]]
 
 
-def test_a_yaml_that_is_not_told_as_one_is_still_the_one_to_blame() -> None:
+def test_error_names_the_yaml_when_detection_fails() -> None:
     with pytest.raises(UnreadableFile) as error:
         read({"map.pgm": PGM, "map.yaml": b"image: map.pgm\n"})
     assert {p.file for p in error.value.problems} == {"map.yaml"}
 
 
-def test_options_beside_a_yaml_are_not_used_and_that_is_told() -> None:
+def test_image_options_are_ignored_with_warning_when_yaml_exists() -> None:
     grid, context = read({"map.yaml": YAML, "map.pgm": PGM}, resolution="7")
     assert grid.resolution == 0.05
-    assert "not used" in context.warnings[0].problem
+    assert "are ignored" in context.warnings[0].problem
 
 
 # --- which grid ---------------------------------------------------------------------------------------------------
-def test_the_grid_that_is_asked_for() -> None:
+def test_choose_selects_grid() -> None:
     def layers(*keys: PartKey) -> Layers:
         return Layers({key: grid_of([[0] * (i + 1)]) for i, key in enumerate(keys)})
 
@@ -433,7 +435,7 @@ def test_the_grid_that_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("name", ["a/b", "..", ".hidden", "käfig 1", "true", "100%", 'q"uote', "😀", "#x", "a: b"])
-def test_odd_grid_names_make_files_that_read_back(name: str, facts: Any) -> None:
+def test_unusual_grid_names_round_trip(name: str, facts: Any) -> None:
     grid = grid_of([[0, 100], [255, 0]])
     served, _ = write(Layers({PartKey("occupancy", name=name): grid}))
     assert not any("/" in n or n.startswith(".") for n in served)
@@ -443,7 +445,7 @@ def test_odd_grid_names_make_files_that_read_back(name: str, facts: Any) -> None
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
-def test_a_new_grid_is_written_as_map_saver_does() -> None:
+def test_new_grid_is_written_as_by_map_saver() -> None:
     served, context = write(grid_of([[0, 100], [255, 0]], 0.05, origin=(-1.0, 0.1, 0.0)))
     assert served == {
         "map.yaml": b"image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.0, 0.1, 0.0]\nnegate: 0\n"
@@ -453,7 +455,7 @@ def test_a_new_grid_is_written_as_map_saver_does() -> None:
     assert context.warnings == []
 
 
-def test_a_value_that_trinary_cannot_say_goes_out_raw(facts: Any) -> None:
+def test_value_outside_trinary_is_written_raw(facts: Any) -> None:
     grid = grid_of([[0, 100], [255, 37]])
     served, context = write(grid)
     assert b"mode: raw\n" in served["map.yaml"]
@@ -469,7 +471,7 @@ def test_a_value_that_trinary_cannot_say_goes_out_raw(facts: Any) -> None:
         write(grid, mode="scale", file_type="pgm")
 
 
-def test_unknown_in_scale_is_transparent_and_raw_where_pgm_was_asked(facts: Any) -> None:
+def test_unknown_in_scale_is_transparent_in_png_and_raw_in_pgm(facts: Any) -> None:
     grid = grid_of([[0, 100, 255], [1, 50, 99]], mode="scale", occupied_thresh=1.0, free_thresh=0.0)
     served, context = write(grid)
     assert list(served) == ["map.yaml", "map.png"]
@@ -484,7 +486,7 @@ def test_unknown_in_scale_is_transparent_and_raw_where_pgm_was_asked(facts: Any)
     assert list(write(complete_grid)[0]) == ["map.yaml", "map.pgm"]
 
 
-def test_every_cell_value_survives_the_usual_scales(facts: Any) -> None:
+def test_every_cell_value_round_trips_in_common_scales(facts: Any) -> None:
     every = OccupancyGrid(np.arange(101, dtype=np.uint8)[None, :].copy(), 1.0)
     for high, low in ((1.0, 0.0), (0.99, 0.01), (0.65, 0.196)):
         grid = OccupancyGrid(every.cells, 1.0, mode="scale", occupied_thresh=high, free_thresh=low)
@@ -506,7 +508,7 @@ THRESHOLDS = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.01, 0.196, 0.25,
     kind=st.sampled_from([{}, {"file_type": "pgm"}, {"file_type": "png"}]),
 )
 @settings(max_examples=300, deadline=None)
-def test_any_uploaded_grid_survives(
+def test_any_uploaded_grid_round_trips(
     facts: Any, pixels: list[int], mode: str, negate: bool, high: float, low: float, kind: dict[str, str]
 ) -> None:
     text = (
@@ -534,7 +536,7 @@ def test_any_uploaded_grid_survives(
     kind=st.sampled_from([{}, {"file_type": "pgm"}, {"file_type": "png"}]),
 )
 @settings(max_examples=300, deadline=None)
-def test_any_stored_grid_survives(
+def test_any_stored_grid_round_trips(
     facts: Any, cells: list[int], mode: Any, negate: bool, high: float, low: float, kind: dict[str, str]
 ) -> None:
     """Cells that the kept mode and thresholds cannot say (after an edit) go out in a mode that can."""
@@ -560,7 +562,7 @@ JSON = st.recursive(
 
 @given(extra=st.dictionaries(st.text(st.characters(codec="utf-8"), max_size=8), JSON, max_size=4))
 @settings(max_examples=300, deadline=None)
-def test_extra_keys_of_any_kind_come_back(extra: dict[str, Any]) -> None:
+def test_extra_keys_of_any_kind_round_trip(extra: dict[str, Any]) -> None:
     extra = {k: v for k, v in extra.items() if k not in KEYS}
     grid = grid_of([[0]], properties={"occupancy_grid": extra} if extra else {})
     again, _ = read(write(grid)[0])
@@ -569,12 +571,12 @@ def test_extra_keys_of_any_kind_come_back(extra: dict[str, Any]) -> None:
 
 @given(st.floats(1e-6, 1e4), st.tuples(*[st.floats(-1e7, 1e7)] * 3))
 @settings(max_examples=200, deadline=None)
-def test_numbers_come_back_exactly(resolution: float, origin: tuple[float, float, float]) -> None:
+def test_numbers_round_trip_exactly(resolution: float, origin: tuple[float, float, float]) -> None:
     again, _ = read(write(OccupancyGrid(np.zeros((1, 1), np.uint8), resolution, origin))[0])
     assert (again.resolution, again.origin) == (resolution, origin)
 
 
-def test_same_layers_same_bytes() -> None:
+def test_same_layers_give_same_bytes() -> None:
     cells = np.random.default_rng(1).choice(np.array([0, 100, 255], np.uint8), (300, 400))
     for kind in ("pgm", "png"):
         assert (
@@ -583,13 +585,13 @@ def test_same_layers_same_bytes() -> None:
         )
 
 
-def test_a_grid_too_wide_for_nav2_is_warned_of() -> None:
+def test_grid_too_wide_for_nav2_gives_a_warning() -> None:
     _, context = write(OccupancyGrid(np.zeros((1, 32768), np.uint8), 0.1))
     assert "32767" in context.warnings[0].problem
 
 
 # --- resampling ---------------------------------------------------------------------------------------------------
-def test_coarser_cells_keep_obstacles_and_the_unseen() -> None:
+def test_coarser_cells_keep_obstacles_and_unknown() -> None:
     grid = grid_of([[0, 0, 0, 255, 0], [0, 0, 0, 0, 100], [255, 255, 0, 7, 0]], 0.5)
     out = resample(grid, 1.0)
     assert seen(out) == [[0, 255, 0], [255, 7, 100]]
@@ -597,7 +599,7 @@ def test_coarser_cells_keep_obstacles_and_the_unseen() -> None:
     assert seen(resample(grid, 10.0)) == [[100]]
 
 
-def test_cells_that_share_an_old_cell_both_have_its_obstacle() -> None:
+def test_cells_sharing_a_source_cell_both_get_its_obstacle() -> None:
     grid = grid_of([[0, 100, 0]], 1.0)
     assert seen(resample(grid, 1.5)) == [[100, 100]]
 
@@ -616,7 +618,7 @@ def test_finer_cells_are_copies() -> None:
     new=st.sampled_from([0.05, 0.1, 0.02, 0.07, 0.25, 3.0, 0.013]),
 )
 @settings(max_examples=200, deadline=None)
-def test_resampling_agrees_with_areas(cells: list[list[int]], old: float, new: float) -> None:
+def test_resampling_matches_covered_areas(cells: list[list[int]], old: float, new: float) -> None:
     grid = grid_of(cells, old)
     out = resample(grid, new)
     rank = {0: 0, 255: 1, 40: 41, 100: 101}
@@ -641,7 +643,7 @@ def test_resampling_agrees_with_areas(cells: list[list[int]], old: float, new: f
                     assert out.cells[j, i] == near
 
 
-def test_resolution_is_a_parameter_and_bounded() -> None:
+def test_resolution_option_is_bounded() -> None:
     grid = grid_of([[0, 100], [255, 0]], 0.05)
     served, _ = write(grid, resolution="0.1")
     assert b"resolution: 0.1\n" in served["map.yaml"]
@@ -666,7 +668,7 @@ def place(grid: OccupancyGrid) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3, -1.2, math.pi / 2, math.pi, -math.pi / 2, 3.0, 7.0])
 @pytest.mark.parametrize("origin", [(0.0, 0.0), (-3.21, 7.77), (1234.567, -9876.543)])
-def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float]) -> None:
+def test_normalize_keeps_positions(yaw: float, origin: tuple[float, float]) -> None:
     dice = np.random.default_rng(5)
     cells = dice.choice(np.array([0, 0, 0, 255, 100], np.uint8), (23, 31))
     grid = OccupancyGrid(cells, 0.2, (*origin, yaw))
@@ -696,7 +698,7 @@ def test_baking_a_yaw_keeps_every_place(yaw: float, origin: tuple[float, float])
     assert (values == 100).sum() <= 2 * (cells == 100).sum() + 4
 
 
-def test_quarter_turns_are_exact() -> None:
+def test_normalize_is_exact_for_quarter_turns() -> None:
     cells = np.random.default_rng(2).choice(np.array([0, 100, 255], np.uint8), (5, 7))
     for turns, yaw in enumerate([0.0, math.pi / 2, math.pi, 3 * math.pi / 2]):
         out = normalize(OccupancyGrid(cells, 0.5, (2.0, -1.0, yaw)))
@@ -704,14 +706,14 @@ def test_quarter_turns_are_exact() -> None:
         assert (out.cells == expected).all()
 
 
-def test_an_aligned_grid_stays_as_it_is() -> None:
+def test_normalize_keeps_aligned_grid() -> None:
     grid = grid_of([[0, 100, 255]], 0.05, origin=(0.15, -100.0, 0.0))
     out = normalize(grid)
     assert (out.cells == grid.cells).all()
     assert out.origin == grid.origin
 
 
-def test_normalize_is_a_parameter(facts: Any) -> None:
+def test_normalize_is_an_option(facts: Any) -> None:
     grid = grid_of([[0, 100], [255, 0]], 1.0, origin=(0.3, 0.0, 0.5))
     served, context = write(grid, normalize="true")
     assert context.warnings == []
@@ -719,7 +721,7 @@ def test_normalize_is_a_parameter(facts: Any) -> None:
     assert (independent(served, facts) == normalize(grid).cells).all()
 
 
-def test_turning_is_bounded() -> None:
+def test_normalize_is_bounded() -> None:
     long = OccupancyGrid(np.zeros((1, 2**20), np.uint8), 1.0, (0.0, 0.0, math.pi / 4))
     with pytest.raises(Invalid, match="cells"):
         normalize(long)
@@ -727,7 +729,7 @@ def test_turning_is_bounded() -> None:
 
 # --- hostile ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["room", "turned", "speed"])
-def test_cuts_and_flips_are_refused_or_read(name: str) -> None:
+def test_truncated_and_mutated_files_are_rejected_or_read(name: str) -> None:
     files = {p.name: p.read_bytes() for p in (SAMPLES / name).iterdir()}
     dice = random.Random(name)
     for victim, original in files.items():
@@ -746,7 +748,7 @@ def test_cuts_and_flips_are_refused_or_read(name: str) -> None:
 
 @given(st.binary(max_size=200), st.booleans())
 @settings(max_examples=200, deadline=None)
-def test_any_bytes_are_refused_or_read(data: bytes, after: bool) -> None:
+def test_any_bytes_are_rejected_or_read(data: bytes, after: bool) -> None:
     files = {"map.yaml": YAML + data if after else data, "map.pgm": PGM}
     FORMAT.detect("map.yaml", files["map.yaml"])
     list(FORMAT.claims.companions("map.yaml", files["map.yaml"], sorted(files)))
@@ -758,7 +760,7 @@ def test_any_bytes_are_refused_or_read(data: bytes, after: bool) -> None:
         return
 
 
-def test_detect_is_quick_on_anything() -> None:
+def test_detect_is_fast_on_any_input() -> None:
     for piece in (b" ", b"{", b"#\n", b"image:", b"\n", b"---", b'"', b"image: resolution: ", b"%a\n"):
         assert FORMAT.detect("x", piece * (2**22 // len(piece))) in (True, False)
 
@@ -772,7 +774,7 @@ def info_of(files: dict[str, bytes], name: str) -> dict[str, Any]:
     return parameters
 
 
-def test_a_masks_parameters_come_back_with_it() -> None:
+def test_mask_parameters_round_trip() -> None:
     grid, context = read(MASK)
     assert context.warnings == []
     served, write_context = write(Layers({PartKey("occupancy", name="slow_mask"): grid}))
@@ -787,7 +789,7 @@ def test_a_masks_parameters_come_back_with_it() -> None:
     assert write(Layers({PartKey("occupancy", name="slow_mask"): again}))[0] == served
 
 
-def test_a_mask_that_does_not_say_what_it_means_gets_nav2s_usual_values() -> None:
+def test_mask_without_parameters_gets_nav2_defaults() -> None:
     grid = grid_of([[0, 100]])
     served, context = write(Layers({PartKey("occupancy", name="keepout"): grid}))
     assert info_of(served, "keepout_filter_info.yaml") == {
@@ -804,7 +806,7 @@ def test_a_mask_that_does_not_say_what_it_means_gets_nav2s_usual_values() -> Non
     assert list(write(grid)[0]) == ["map.yaml", "map.pgm"]
 
 
-def test_parameter_files_of_namespaces_and_of_others() -> None:
+def test_parameter_files_with_namespaces_and_other_nodes_are_read() -> None:
     parameters = yaml.safe_load(MASK["slow_params.yaml"])
     within = {**MASK, "slow_params.yaml": yaml.safe_dump({"robot_1": {"nav": parameters}, "amcl": {"x": 1}}).encode()}
     grid, _ = read(within)
@@ -828,7 +830,7 @@ def test_parameter_files_of_namespaces_and_of_others() -> None:
         (b'"/slow_filter_mask"\n    base', b"3\n    base", "mask_topic"),
     ],
 )
-def test_wrong_parameters_are_named(old: bytes, new: bytes, where: str) -> None:
+def test_invalid_mask_parameters_raise_an_error_with_location(old: bytes, new: bytes, where: str) -> None:
     files = {**MASK, "slow_params.yaml": MASK["slow_params.yaml"].replace(old, new)}
     assert files != MASK
     with pytest.raises(UnreadableFile) as caught:
@@ -836,6 +838,6 @@ def test_wrong_parameters_are_named(old: bytes, new: bytes, where: str) -> None:
     assert [(p.file, p.where) for p in caught.value.problems] == [("slow_params.yaml", where)]
 
 
-def test_a_masks_files_are_asked_for_by_name() -> None:
+def test_mask_files_are_selected_by_name() -> None:
     assert occupancy_grid.options_from_filename("keepout_filter_info.yaml") == {"grid": "keepout"}
     assert occupancy_grid.options_from_filename("keepout.yaml") == {"grid": "keepout"}

@@ -99,7 +99,7 @@ def smallest(voxels: VoxelMap) -> dict[tuple[int, int, int], float]:
 
 
 # --- worked out by hand -------------------------------------------------------------------------------------------
-def test_two_bits_a_child() -> None:
+def test_children_have_two_bits() -> None:
     # The root's octant 7 (x, y, z ≥ 0) is inner; within it octant 0 is free, 1 (x) occupied, the rest unknown.
     data = header("bt", 4) + bytes([0x00, 0b11_00_00_00, 0b00_00_10_01, 0x00])
     voxels, context = read(data)
@@ -113,7 +113,7 @@ def test_two_bits_a_child() -> None:
     assert write(voxels) == data
 
 
-def test_the_smallest_voxel_lies_where_the_library_says() -> None:
+def test_smallest_voxel_position_equals_library() -> None:
     # key = floor(coordinate / resolution) + 32768: (1.05, -0.05, 0.25) at 0.1 m is voxel (10, -1, 2).
     code = morton(np.array([10]), np.array([-1]), np.array([2]))
     voxels = leaves((16, int(code[0]), 1.5))
@@ -122,7 +122,7 @@ def test_the_smallest_voxel_lies_where_the_library_says() -> None:
     assert rows(again) == rows(voxels)
 
 
-def test_log_odds_are_read_and_inner_nodes_are_made() -> None:
+def test_log_odds_are_read_and_inner_nodes_computed() -> None:
     def node(odds: float, mask: int) -> bytes:
         return struct.pack("<fB", odds, mask)
 
@@ -136,7 +136,7 @@ def test_log_odds_are_read_and_inner_nodes_are_made() -> None:
     assert write(read(stale, "a.ot")[0]) == data, "inner nodes are made from the leaves"
 
 
-def test_colours_of_inner_nodes_are_means_of_the_set_ones() -> None:
+def test_inner_node_colours_are_means_of_set_colours() -> None:
     def node(odds: float, colour: tuple[int, int, int], mask: int) -> bytes:
         return struct.pack("<f3BB", odds, *colour, mask)
 
@@ -152,7 +152,7 @@ def test_colours_of_inner_nodes_are_means_of_the_set_ones() -> None:
     assert b"id ColorOcTree" in write(voxels, kind="bt")
 
 
-def test_the_form_of_2010() -> None:
+def test_2010_format_is_read() -> None:
     body = bytes([0x00, 0b11_00_00_00, 0b00_00_10_01, 0x00])
     voxels, context = read(struct.pack("<IdI", 3, 0.1, 4) + body)
     assert "2010" in context.warnings[0].problem
@@ -162,7 +162,7 @@ def test_the_form_of_2010() -> None:
     assert wall.bounds() == (-0.8, 0.0, 0.0, 0.8, 0.1, 0.6)
 
 
-def test_our_samples_hold_what_was_built() -> None:
+def test_samples_contain_expected_voxels() -> None:
     shed, _ = read((SAMPLES / "shed.bt").read_bytes())
     walls = 22 * 16 * 9 - 20 * 14 * 8 - 4 * 5  # the block less its inside less the door
     assert shed.voxel_counts() == {"occupied": walls, "free": 22 * 16 * 9 - walls}
@@ -176,7 +176,7 @@ def test_our_samples_hold_what_was_built() -> None:
 
 
 @pytest.mark.parametrize("odds", [-0.5, 0.0, 2.0])
-def test_a_tree_that_is_one_leaf_is_its_eight_octants(odds: float) -> None:
+def test_single_leaf_tree_becomes_eight_octants(odds: float) -> None:
     voxels, _ = read(header("ot", 1) + struct.pack("<fB", odds, 0), "a.ot")
     assert rows(voxels) == [(1, k, odds) for k in range(8)]
     assert rows(prune(voxels)) == rows(voxels), "the root never becomes a leaf"
@@ -184,7 +184,7 @@ def test_a_tree_that_is_one_leaf_is_its_eight_octants(odds: float) -> None:
     assert again.occupied.tolist() == [odds >= 0] * 8
 
 
-def test_empty_trees() -> None:
+def test_empty_trees_round_trip() -> None:
     for kind, name in (("bt", "OcTree"), ("ot", "OcTree"), ("ot", "ColorOcTree")):
         data = header(kind, 0, name=name)
         voxels, context = read(data, f"a.{kind}")
@@ -197,13 +197,13 @@ def test_empty_trees() -> None:
     assert "no voxels" in context.warnings[0].problem
 
 
-def test_resolution_as_the_library_prints_it_unless_it_says_more() -> None:
+def test_resolution_is_formatted_as_in_library_unless_more_precise() -> None:
     for text in ("0.05", "1e-05", "2", "1000", "0.123456"):
         assert f"\nres {text}\n".encode() in write(leaves((16, 1, 1.0), resolution=float(text)))
     assert b"\nres 0.1234567\n" in write(leaves((16, 1, 1.0), resolution=0.1234567))
 
 
-def test_words_of_the_header() -> None:
+def test_header_keywords_are_read() -> None:
     body = bytes([0x00, 0b11_00_00_00, 0b00_00_10_01, 0x00])
     first = b"# Octomap OcTree binary file\n"
     loose = first + b"# by hand\r\nres 1e-1   size 4\n  id 1 # the old name\ncolour blue\n\ndata \n" + body
@@ -227,7 +227,7 @@ def real(shared: Path) -> list[Path]:
     return sorted(p for p in (shared / "data" / "octomap").rglob("*") if p.suffix in (".bt", ".ot"))
 
 
-def test_real_maps_hold_what_the_library_counts(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_real_maps_match_library_counts(shared: Path, facts_json: dict[str, Any]) -> None:
     seen = real(shared)
     assert len(seen) >= 5
     for path in seen:
@@ -245,7 +245,7 @@ def test_real_maps_hold_what_the_library_counts(shared: Path, facts_json: dict[s
             assert float(voxels.log_odds.max()) == pytest.approx(facts["logodds_max"], abs=1e-9)
 
 
-def test_real_maps_come_back_byte_for_byte(shared: Path, same: Same) -> None:
+def test_real_maps_round_trip_byte_for_byte(shared: Path, same: Same) -> None:
     """The library wrote all of them but the one of 2010, which gets today's header."""
     for path in real(shared):
         data = path.read_bytes()
@@ -258,7 +258,7 @@ def test_real_maps_come_back_byte_for_byte(shared: Path, same: Same) -> None:
             assert out.endswith(data[16:])
 
 
-def test_real_maps_in_the_other_kind_hold_the_same_voxels(shared: Path, facts: ModuleType) -> None:
+def test_real_maps_keep_voxels_in_other_kind(shared: Path, facts: ModuleType) -> None:
     for path in real(shared):
         data = path.read_bytes()
         voxels, _ = read(data, path.name)
@@ -267,7 +267,7 @@ def test_real_maps_in_the_other_kind_hold_the_same_voxels(shared: Path, facts: M
         assert (before == after).all()
 
 
-def test_a_large_map_is_read_within_its_time(shared: Path) -> None:
+def test_large_map_is_read_in_bounded_time(shared: Path) -> None:
     """geb079: 35 ms in C++. A loop over half a million nodes would take ten times as long as this allows."""
     data = (shared / "data" / "octomap" / "geb079" / "geb079.bt").read_bytes()
     times = []
@@ -282,7 +282,7 @@ def test_a_large_map_is_read_within_its_time(shared: Path) -> None:
 # --- the library's own tools --------------------------------------------------------------------------------------
 @pytest.mark.skipif(shutil.which("convert_octree") is None, reason="octomap-tools is not installed")
 @pytest.mark.parametrize("seed", range(6))
-def test_the_library_writes_the_same_bytes(seed: int, tmp_path: Path) -> None:
+def test_written_bytes_equal_library(seed: int, tmp_path: Path) -> None:
     voxels = random_tree(seed, colour=seed % 2 == 1)
     full = write(voxels)
     (tmp_path / "a.ot").write_bytes(full)
@@ -299,7 +299,7 @@ def test_the_library_writes_the_same_bytes(seed: int, tmp_path: Path) -> None:
 # --- laws ---------------------------------------------------------------------------------------------------------
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.booleans())
-def test_any_tree_comes_back(seed: int, colour: bool) -> None:
+def test_any_tree_round_trips(seed: int, colour: bool) -> None:
     voxels = random_tree(seed, colour=colour)
     again, _ = read(write(voxels), "a.ot")
     assert rows(again) == rows(voxels)
@@ -325,7 +325,7 @@ def test_pruning_merges_eight_equal_leaves_level_by_level() -> None:
     assert rows(prune(leaves(*split))) == rows(leaves(*split))
 
 
-def test_pruning_ends_where_nothing_merges_as_in_the_library() -> None:
+def test_pruning_stops_as_in_library() -> None:
     eight = [(15, k, 1.0) for k in range(8)]
     assert len(prune(leaves(*eight))) == 8, "no leaf of depth 16 merges, so the library does not look at depth 15"
     assert rows(prune(leaves(*eight), deepest=15)) == [(14, 0, 1.0)]
@@ -333,7 +333,7 @@ def test_pruning_ends_where_nothing_merges_as_in_the_library() -> None:
     assert rows(prune(leaves(*more))) == [(14, 0, 1.0), (15, 0o100, 1.0)]
 
 
-def test_pruning_averages_colours_and_says_so() -> None:
+def test_pruning_averages_colours_and_reports_it() -> None:
     eight = leaves(*((16, k, 1.0) for k in range(8)))
     shades = np.full((8, 3), 255, np.uint8)
     shades[0], shades[1] = (10, 20, 30), (20, 20, 31)
@@ -349,7 +349,7 @@ def test_pruning_averages_colours_and_says_so() -> None:
 
 
 @pytest.mark.parametrize("depth", [1, 9, 13, 15])
-def test_a_coarser_map_is_as_occupied_as_the_most_occupied_below(depth: int) -> None:
+def test_coarser_map_has_maximum_occupancy_of_merged_voxels(depth: int) -> None:
     voxels = random_tree(depth)
     coarse = coarser(voxels, depth)
     assert int(coarse.depth.max()) <= depth
@@ -362,7 +362,7 @@ def test_a_coarser_map_is_as_occupied_as_the_most_occupied_below(depth: int) -> 
     assert coarser(voxels, DEPTH) is voxels
 
 
-def test_level_of_detail_is_declared_and_pruned() -> None:
+def test_level_of_detail_is_reported_and_pruned() -> None:
     voxels = leaves(*((16, k, 1.0 if k % 9 else -1.0) for k in range(64)))
     context = WriteContext(options=WriteOptions(kind="bt", depth=15))
     data = octomap.write(Layers({PartKey("voxels"): voxels}), context)["map.bt"]
@@ -370,7 +370,7 @@ def test_level_of_detail_is_declared_and_pruned() -> None:
     assert ("voxels", 56) in [(d.subject, d.count) for d in context.dropped]
 
 
-def test_a_cut_keeps_exactly_the_voxels_that_meet_the_box() -> None:
+def test_bbox_keeps_exactly_intersecting_voxels() -> None:
     size = 13
     middle = int(morton(np.array([0]), np.array([0]), np.array([0]))[0])
     base = middle >> 3 * (DEPTH - size)
@@ -389,7 +389,7 @@ def test_a_cut_keeps_exactly_the_voxels_that_meet_the_box() -> None:
     assert smallest(read(data, "a.ot")[0]) == expected
 
 
-def test_cuts_on_faces_points_and_everything() -> None:
+def test_bbox_on_faces_points_and_everything() -> None:
     voxels = leaves((13, int(morton(*(np.array([0]) for _ in "xyz"))[0]) >> 9, 1.0))
     assert cut(voxels, (0.3, 0.0, 0.0, 0.5, 0.1, 0.1)).bounds() == (0.3, 0.0, 0.0, 0.5, 0.1, 0.1)
     assert cut(voxels, (0.25, 0.25, 0.25) * 2).bounds() == (0.2, 0.2, 0.2, 0.3, 0.3, 0.3)
@@ -402,7 +402,7 @@ def test_cuts_on_faces_points_and_everything() -> None:
             cut(voxels, bad)
 
 
-def test_a_cut_does_not_grow_without_bound() -> None:
+def test_bbox_result_size_is_bounded() -> None:
     voxels = leaves(*((1, k, -1.0) for k in range(8)))
     side = HALF * 0.1 - 0.15
     tracemalloc.start()
@@ -413,7 +413,7 @@ def test_a_cut_does_not_grow_without_bound() -> None:
 
 
 # --- options ------------------------------------------------------------------------------------------------------
-def test_a_kind_that_cannot_say_everything_declares_it() -> None:
+def test_bt_reports_dropped_log_odds_and_colours() -> None:
     voxels, _ = read((SAMPLES / "shelf.ot").read_bytes(), "shelf.ot")
     context = WriteContext(options=WriteOptions(kind="bt"))
     (name,) = octomap.write(Layers({PartKey("voxels"): voxels}), context)
@@ -425,16 +425,16 @@ def test_a_kind_that_cannot_say_everything_declares_it() -> None:
     assert quiet.dropped == []
 
 
-def test_which_voxel_map() -> None:
+def test_choose_selects_voxel_map() -> None:
     def choose(*keys: PartKey, **options: str) -> PartKey:
         (key,) = octomap.choose(keys, WriteOptions(**options))
         return key
 
-    lab, shed, usual = (PartKey("voxels", "ground", n) for n in ("lab", "shed", "map"))
+    lab, shed, default = (PartKey("voxels", "ground", n) for n in ("lab", "shed", "map"))
     upper = PartKey("voxels", "upper", "lab")
     assert choose(lab) == lab
-    assert choose(lab, usual) == usual
-    assert choose(lab, usual, name="lab") == lab
+    assert choose(lab, default) == default
+    assert choose(lab, default, name="lab") == lab
     assert choose(lab, upper) == lab
     assert choose(lab, upper, level="upper") == upper
     with pytest.raises(Ambiguous, match="lab, shed"):
@@ -449,7 +449,7 @@ def test_which_voxel_map() -> None:
         choose()
 
 
-def test_a_wanted_file_says_kind_and_name() -> None:
+def test_file_name_selects_kind_and_name() -> None:
     assert octomap.options_from_filename("map.ot") == {"kind": "ot"}
     assert octomap.options_from_filename("map.bt") == {"kind": "bt"}
     assert octomap.options_from_filename("lab.bt") == {"kind": "bt", "name": "lab"}
@@ -479,9 +479,9 @@ def long_chain(levels: int) -> bytes:
         (b"", 1, None, "first line"),
         (b"\x03\0\0\0", 1, None, "first line"),
         (b"# Octomap OcTreeish\nid OcTree\nsize 4\nres 1\ndata\n" + GOOD, 1, None, "first line"),
-        (FIRST + b"id OcTree\nsize 4\nres 0.1\n", 4, "data", "does not end"),
-        (FIRST + b"# " + b"x" * 70_000 + b"\ndata\n", 1, "data", "does not end"),
-        (FIRST.rstrip(), 1, "data", "does not end"),
+        (FIRST + b"id OcTree\nsize 4\nres 0.1\n", 4, "data", "incomplete header"),
+        (FIRST + b"# " + b"x" * 70_000 + b"\ndata\n", 1, "data", "incomplete header"),
+        (FIRST.rstrip(), 1, "data", "incomplete header"),
         (FIRST + b"size 4\nres 0.1\ndata\n" + GOOD, None, "id", "id"),
         (FIRST + b"id OcTree\nres 0.1\ndata\n" + GOOD, None, "size", "size"),
         (FIRST + b"id OcTree\nsize 4\ndata\n" + GOOD, None, "res", "res"),
@@ -497,25 +497,27 @@ def long_chain(levels: int) -> bytes:
         (header("bt", 5) + GOOD, None, "size", "the data has 4"),
         (header("bt", 2) + GOOD[:2], None, "size", "the data has 1"),
         (header("bt", 1) + GOOD[:2], None, "data", "ends before"),
-        (header("bt", 5) + GOOD + b"\0\0", None, "data", "goes on"),
+        (header("bt", 5) + GOOD + b"\0\0", None, "data", "more data follows"),
         (header("bt", 4), None, "size", "the data has 0"),
         (header("bt", 0) + GOOD, None, "size", "the data has 2 inner"),
         (header("bt", 2) + b"\x03\0\0\0", None, "data", "no children"),
         (header("bt", 18) + chain(16), None, "data", "deeper"),
         (header("bt", 100_002) + chain(100_000), None, "data", "deeper"),
         (header("bt", 202) + b"\xff\xff" * 200 + b"\x02\0", None, "data", "ends before"),
-        (header("ot", 2) + b"\0" * 9, None, "data", "no"),
+        (header("ot", 2) + b"\0" * 9, None, "data", "multiple of 5"),
         (header("ot", 1) + struct.pack("<fB", math.nan, 0), None, "data", "finite"),
         (header("ot", 2) + struct.pack("<fBfB", 1.0, 1, math.inf, 0), None, "data", "node 1"),
         (header("ot", 18) + long_chain(17), None, "data", "deeper"),
-        (header("ot", 2) + struct.pack("<fBfB", 1.0, 0, 1.0, 0), None, "data", "goes on"),
+        (header("ot", 2) + struct.pack("<fBfB", 1.0, 0, 1.0, 0), None, "data", "more data follows"),
         (header("ot", 2) + struct.pack("<fBfB", 1.0, 3, 1.0, 0), None, "data", "ends before"),
         (struct.pack("<IdI", 3, math.nan, 4) + GOOD, None, "res", "resolution"),
         (struct.pack("<IdI", 3, -0.1, 4) + GOOD, None, "res", "resolution"),
         (struct.pack("<IdI", 3, 0.1, 5) + GOOD, None, "size", "the data has 4"),
     ],
 )
-def test_what_is_wrong_is_named(data: bytes, line: int | None, where: str | None, reason: str) -> None:
+def test_invalid_file_raises_unreadable_file_with_location(
+    data: bytes, line: int | None, where: str | None, reason: str
+) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(data)
     (problem,) = caught.value.problems
@@ -523,14 +525,14 @@ def test_what_is_wrong_is_named(data: bytes, line: int | None, where: str | None
     assert reason in problem.problem
 
 
-def test_a_tree_of_all_sixteen_levels_is_read() -> None:
+def test_tree_of_all_sixteen_levels_is_read() -> None:
     voxels, _ = read(header("bt", 17) + chain(15))
     assert rows(voxels) == [(16, 0, pytest.approx(OCCUPIED))]
     full, _ = read(header("ot", 17) + long_chain(16), "a.ot")
     assert rows(full) == [(16, 0, 0.0)]
 
 
-def test_a_tree_beyond_the_limit_is_not_unfolded() -> None:
+def test_tree_beyond_limit_raises_too_large() -> None:
     words = header("bt", 2_000_000_000) + b"\xaa\xaa" * 1000
     tracemalloc.start()
     with pytest.raises(TooLarge, match="limit"):
@@ -543,7 +545,7 @@ def test_a_tree_beyond_the_limit_is_not_unfolded() -> None:
         read(header("bt", 4) + GOOD, limits=Limits(voxels=3))
 
 
-def test_nobody_else_is_taken_for_one() -> None:
+def test_detect_rejects_other_files() -> None:
     assert formats.detect("map.bt", header("bt", 4) + GOOD) is get_format("octomap")
     assert formats.detect("simple", struct.pack("<IdI", 3, 0.1, 4) + GOOD) is get_format("octomap")
     for data in (
@@ -557,7 +559,7 @@ def test_nobody_else_is_taken_for_one() -> None:
         assert not octomap.detect("map.bt", data)
 
 
-def test_voxels_that_nobody_wants_are_not_read() -> None:
+def test_unwanted_voxels_are_not_read() -> None:
     context = ReadContext(requested_layers=frozenset({"topology"}))
     data = header("bt", 4) + GOOD
     assert octomap.read({"a.bt": data}, context).parts == {}

@@ -53,7 +53,7 @@ def header(fields: str = "x y z", size: str = "4 4 4", kind: str = "F F F", n: i
 
 
 @pytest.mark.parametrize("name", REAL)
-def test_facts_of_real_clouds(shared: Path, facts_json: dict[str, Any], name: str) -> None:
+def test_real_clouds_match_facts(shared: Path, facts_json: dict[str, Any], name: str) -> None:
     data = (shared / "data/pointcloud/pcl_data" / name).read_bytes()
     facts = facts_json[f"pointcloud/pcl_data/{name}"]["facts"]
     cloud = parse(data, ReadContext())
@@ -69,12 +69,12 @@ def test_facts_of_real_clouds(shared: Path, facts_json: dict[str, Any], name: st
     assert len(truth ^ voxel_cells) <= 0.01 * len(truth)
     assert all(any((i + a, j + b, k + c) in voxel_cells for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)) for i, j, k in truth)  # fmt: skip  # noqa: E501
     assert voxels.resolution == 0.05
-    assert ("samp41" in name) == any("taken as the local origin" in w.problem for w in context.warnings)
+    assert ("samp41" in name) == any("used as the local origin" in w.problem for w in context.warnings)
 
 
 @pytest.mark.parametrize("kind", [None, *KINDS])
 @pytest.mark.parametrize("name", REAL)
-def test_real_clouds_come_back_point_by_point(shared: Path, name: str, kind: str | None) -> None:
+def test_real_clouds_round_trip_point_by_point(shared: Path, name: str, kind: str | None) -> None:
     data = (shared / "data/pointcloud/pcl_data" / name).read_bytes()
     back = again(data) if kind is None else again(data, data=kind)
     _, before = clouds.pcd(data)
@@ -86,7 +86,7 @@ def test_real_clouds_come_back_point_by_point(shared: Path, name: str, kind: str
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["shelf", "intensity", "line"])
-def test_every_field_comes_back_in_order(name: str, kind: str) -> None:
+def test_fields_round_trip_in_order(name: str, kind: str) -> None:
     data = (SAMPLES / f"{name}.pcd").read_bytes()
     a, before = clouds.pcd(data)
     b, after = clouds.pcd(again(data, data=kind))
@@ -97,11 +97,11 @@ def test_every_field_comes_back_in_order(name: str, kind: str) -> None:
     assert list(map(float, b["VIEWPOINT"].split())) == list(map(float, a["VIEWPOINT"].split()))
 
 
-def test_comments_come_back_in_another_encoding() -> None:
+def test_comments_are_kept_when_encoding_changes() -> None:
     assert b"# a shelf, scanned from its front\n" in again((SAMPLES / "shelf.pcd").read_bytes(), data="binary")
 
 
-def test_voxels_of_a_cloud_worked_out_by_hand() -> None:
+def test_voxels_match_values_computed_by_hand() -> None:
     """Points of the sample by voxels of 5 cm: (0.01, …) and (0.03, …) share one, NaN has none."""
     voxels, context, _ = read((SAMPLES / "shelf.pcd").read_bytes())
     assert cells(voxels) == {(0, 0, 0), (-3, 25, 6), (20, 20, 20)}
@@ -110,10 +110,10 @@ def test_voxels_of_a_cloud_worked_out_by_hand() -> None:
     assert shade == {(0, 0, 0): [127, 127, 0], (-3, 25, 6): [0, 0, 255], (20, 20, 20): [128, 128, 129]}
     assert voxels.occupied.all()
     assert not voxels.binary, "colours need an .ot"
-    assert any("1 of 6 points have no coordinates" in w.problem for w in context.warnings)
+    assert any("1 of 6 points have no valid coordinates" in w.problem for w in context.warnings)
 
 
-def test_a_turned_viewpoint_is_told() -> None:
+def test_rotated_viewpoint_gives_a_warning() -> None:
     data = header().replace(b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 0 0 0 0.7071 0.7071 0 0") + struct.pack(
         "<3f", 1, 2, 3
     )
@@ -121,13 +121,13 @@ def test_a_turned_viewpoint_is_told() -> None:
     assert any("VIEWPOINT" in w.problem for w in context.warnings)
 
 
-def test_old_headers_and_missing_words() -> None:
+def test_old_headers_with_missing_keywords_are_read() -> None:
     data = b"# .PCD v.5\nVERSION .5\nCOLUMNS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nDATA ascii\n0 0 0\n1 1 1\n"
     assert len(read(data)[0]) == 2
     assert formats.detect("map.pcd", data) is FORMAT
 
 
-def test_compressed_data_with_padding_as_others_write_it() -> None:
+def test_compressed_data_with_padding_is_read() -> None:
     head = header("x _ y z", "4 1 4 4", "F U F F", 2, "binary_compressed")
     x, others = struct.pack("<2f", 1, 2), struct.pack("<4f", 3, 4, 5, 6)
     for flat in (x + b"\7\7" + others, x + others):  # with padding, and as PCL does it
@@ -136,7 +136,7 @@ def test_compressed_data_with_padding_as_others_write_it() -> None:
         assert clouds.pcd(again(data, data="binary"))[1] == [[1, 3, 5], [2, 4, 6]]
 
 
-def test_colours_as_floats_survive_as_text() -> None:
+def test_float_colours_round_trip_as_text() -> None:
     """An alpha of 255 makes a packed colour a NaN, whose text would forget it."""
     colour = struct.unpack("<f", struct.pack("<I", 0xFF102030))[0]
     data = header("x y z rgb", "4 4 4 4", "F F F F") + struct.pack("<4f", 0, 0, 0, colour)
@@ -149,7 +149,7 @@ def test_colours_as_floats_survive_as_text() -> None:
 
 @pytest.mark.parametrize("size", [0, 1, 5, 1000, 40_000, lzf.MAX_INTERPRETED_BYTES // 16 + 7])
 @pytest.mark.parametrize("kind", ["zeros", "noise", "text", "repeats"])
-def test_compression_unfolds_to_the_same(size: int, kind: str) -> None:
+def test_compression_round_trips(size: int, kind: str) -> None:
     dice = random.Random(size)
     data = {
         "zeros": bytes(size),
@@ -164,7 +164,7 @@ def test_compression_unfolds_to_the_same(size: int, kind: str) -> None:
         assert len(packed) < 0.7 * size
 
 
-def test_native_and_plain_loops_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_native_and_python_loops_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     data = bytes(random.Random(3).choices(range(7), k=30_000))
     plain = lzf.squeeze(data)
     monkeypatch.setattr(lzf, "MAX_INTERPRETED_BYTES", 0)
@@ -176,19 +176,19 @@ def test_native_and_plain_loops_agree(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "said", "line"),
+    ("data", "message", "line"),
     [
         (header(n=10**11), "limit", None),
-        (header(n=2) + bytes(12), "take 24 bytes", None),
+        (header(n=2) + bytes(12), "need 24 bytes", None),
         (header(data="ascii", n=3) + b"1 2 3\n1 2 3\n", "3 rows|3 points", 11),
-        (header(data="ascii", n=2) + b"1 2 3\n1 x 3\n", "cannot be read", 12),
-        (header(data="ascii", n=2) + b"1 2 3\n1 2\n", "cannot be read", 12),
+        (header(data="ascii", n=2) + b"1 2 3\n1 x 3\n", "invalid row of numbers", 12),
+        (header(data="ascii", n=2) + b"1 2 3\n1 2\n", "invalid row of numbers", 12),
         (header(data="zip"), "DATA must be", 10),
         (header("x y", "4 4", "F F") + bytes(8), "missing: z", None),
         (header(size="4 4"), "SIZE has 2 values", 3),
-        (header(kind="F F Q"), "no type Q", 4),
-        (header("x y x"), "two fields", 2),
-        (header().replace(b"POINTS 1", b"POINTS 2"), "WIDTH times HEIGHT", 9),
+        (header(kind="F F Q"), "unknown type Q", 4),
+        (header("x y x"), "duplicate field", 2),
+        (header().replace(b"POINTS 1", b"POINTS 2"), "WIDTH × HEIGHT", 9),
         (header().replace(b"COUNT 1 1 1", b"COUNT 1 1 0"), "COUNT", 5),
         (header().replace(b"WIDTH 1", b"WIDTH -1"), "WIDTH", 6),
         (header().replace(b"VIEWPOINT 0", b"VIEWPOINT nan"), "VIEWPOINT", 8),
@@ -196,18 +196,18 @@ def test_native_and_plain_loops_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         (header(data="binary_compressed") + b"123", "sizes", None),
         (header(data="binary_compressed") + struct.pack("<II", 4, 12) + b"1234", "compressed", None),
         (header(data="binary_compressed") + struct.pack("<II", 99, 12) + b"1234", "99", None),
-        (header(data="binary_compressed") + struct.pack("<II", 4, 2**32 - 1) + b"1234", "do not take", None),
-        (header()[:-14], "does not end", 9),
+        (header(data="binary_compressed") + struct.pack("<II", 4, 2**32 - 1) + b"1234", "do not match", None),
+        (header()[:-14], "incomplete header", 9),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(data: bytes, said: str, line: int | None) -> None:
-    with pytest.raises((UnreadableFile, TooLarge), match=said) as caught:
+def test_invalid_file_raises_an_error_with_line(data: bytes, message: str, line: int | None) -> None:
+    with pytest.raises((UnreadableFile, TooLarge), match=message) as caught:
         read(data)
     assert caught.value.problems[0].file == "map.pcd"
     assert caught.value.problems[0].line == line
 
 
-def test_limits_are_kept() -> None:
+def test_limits_are_enforced() -> None:
     with pytest.raises(TooLarge, match="limit is 5"):
         read(header(n=6) + bytes(72), limits=Limits(voxels=5))
     with pytest.raises(TooLarge, match="text"):
@@ -223,7 +223,7 @@ def test_limits_are_kept() -> None:
         read(bomb, limits=Limits(unpacked_bytes=13_000))
 
 
-def test_options_place_the_cloud() -> None:
+def test_options_set_origin_and_crs() -> None:
     data = header(n=2) + struct.pack("<6f", 10, 20, 30, 10.3, 20.3, 30.3)
     assert cells(read(data, {"resolution": "0.5"})[0]) == {(20, 40, 60)}
     assert cells(read(data, {"resolution": "0.25", "origin": "10,20,30"})[0]) == {(0, 0, 0), (1, 1, 1)}
@@ -233,7 +233,7 @@ def test_options_place_the_cloud() -> None:
         read(data, {"crs": "/etc/passwd"})
 
 
-def test_clouds_too_large_for_5_cm_get_larger_voxels() -> None:
+def test_large_clouds_get_larger_voxels() -> None:
     data = header(n=2) + struct.pack("<6f", -2000, 0, 0, 2000, 100, 0)
     voxels, context, _ = read(data)
     assert voxels.resolution == 0.1
@@ -241,13 +241,13 @@ def test_clouds_too_large_for_5_cm_get_larger_voxels() -> None:
     assert any("0.1 m" in w.problem for w in context.warnings)
 
 
-def test_points_on_the_edge_of_the_tree() -> None:
+def test_points_on_octree_boundary_are_kept() -> None:
     edge = HALF * 0.05
     voxels, _, _ = read(header(size="8 8 8", n=2) + struct.pack("<6d", -edge, 0, 0, math.nextafter(edge, 0), 0, 0))
     assert cells(voxels) == {(-HALF, 0, 0), (HALF - 1, 0, 0)}
 
 
-def test_a_cloud_without_points_comes_back() -> None:
+def test_cloud_without_points_round_trips() -> None:
     data = header(n=0)
     voxels, context, _ = read(data)
     assert len(voxels) == 0

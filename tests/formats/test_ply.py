@@ -55,7 +55,7 @@ def header(kind: str = "binary_little_endian", n: int = 1, more: str = "") -> by
     return f"ply\nformat {kind} 1.0\nelement vertex {n}\n{axes}{more}end_header\n".encode()
 
 
-def test_facts_of_the_real_cloud(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_real_cloud_matches_facts(shared: Path, facts_json: dict[str, Any]) -> None:
     data = (shared / "data" / REAL).read_bytes()
     facts = facts_json[REAL]["facts"]
     cloud = parse(data, ReadContext())
@@ -70,7 +70,7 @@ def test_facts_of_the_real_cloud(shared: Path, facts_json: dict[str, Any]) -> No
 
 
 @pytest.mark.parametrize("kind", [None, *KINDS])
-def test_the_real_cloud_comes_back_vertex_by_vertex(shared: Path, kind: str | None) -> None:
+def test_real_cloud_round_trips_vertex_by_vertex(shared: Path, kind: str | None) -> None:
     data = (shared / "data" / REAL).read_bytes()
     back = again(data) if kind is None else again(data, data=kind)
     assert clouds.ply(back) == clouds.ply(data)
@@ -80,7 +80,7 @@ def test_the_real_cloud_comes_back_vertex_by_vertex(shared: Path, kind: str | No
     assert b"comment Created by Open3D\n" in back
 
 
-def test_faces_are_kept_with_the_file_and_declared_where_they_are_lost() -> None:
+def test_faces_stay_in_the_file_and_are_reported_when_dropped() -> None:
     voxels, context = read(PYRAMID)
     assert voxels.leaf_counts() == {"occupied": 5, "free": 0}
     assert any("5 × face" in w.problem for w in context.warnings)
@@ -92,7 +92,7 @@ def test_faces_are_kept_with_the_file_and_declared_where_they_are_lost() -> None
         assert ("face", 5) in [(d["what"], d["count"]) for d in dropped]
 
 
-def test_vertices_behind_lists_in_the_other_byte_order() -> None:
+def test_vertices_after_lists_are_read_in_both_byte_orders() -> None:
     cloud = parse(NORMALS, ReadContext())
     assert cloud.places(0, 3).tolist() == [[0.1, 0.2, 0.3], [-1.01, 2.02, 3.03], [5.5, -5.5, 0.5]]
     assert cloud.columns["intensity"].tolist() == [7, 8, 65535]
@@ -102,7 +102,7 @@ def test_vertices_behind_lists_in_the_other_byte_order() -> None:
     assert rows[1] == [-1.01, 2.02, 3.03, 1.0, 0.0, 0.0, 8]
 
 
-def test_normals_and_colours_become_pcls() -> None:
+def test_normals_and_colours_convert_to_pcl_columns() -> None:
     header, points = clouds.pcd(again(NORMALS, "pcd"))
     assert header["FIELDS"] == "x y z normal_x normal_y normal_z intensity"
     assert (header["TYPE"], header["SIZE"]) == ("F F F F F F U", "8 8 8 4 4 4 2")
@@ -117,7 +117,7 @@ def test_normals_and_colours_become_pcls() -> None:
     assert rows == clouds.ply(PYRAMID)[1], "there and back"
 
 
-def test_lists_of_different_lengths_are_walked() -> None:
+def test_lists_of_different_lengths_are_skipped() -> None:
     more = "element face 3\nproperty list uchar int vertex_indices\nproperty list ushort float w\n"
     faces = b"".join(struct.pack(f"<B{n}iH{m}f", n, *range(n), m, *[0.5] * m) for n, m in ((3, 0), (4, 2), (0, 1)))
     data = header(more=more) + struct.pack("<3f", 1, 2, 3) + faces
@@ -129,40 +129,40 @@ def test_lists_of_different_lengths_are_walked() -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "said", "line"),
+    ("data", "message", "line"),
     [
         (b"ply\nformat ascii 2.0\nend_header\n", "version 1.0", 2),
         (header(n=10**11), "limit", None),
-        (header(n=2) + bytes(23), "take 24 bytes", 3),
+        (header(n=2) + bytes(23), "need 24 bytes", 3),
         (header("ascii", 2) + b"1 2 3\n", "1 lines", 8),
-        (header("ascii", 2) + b"1 2 3\n4 five 6\n", "cannot be read", 9),
+        (header("ascii", 2) + b"1 2 3\n4 five 6\n", "invalid row of numbers", 9),
         (b"ply\nformat ascii 1.0\nelement face 1\nend_header\n", "one element vertex", None),
-        (header(more="property list uchar int a\n") + bytes(20), "with lists", 3),
-        (header(more="property quad a\n"), "known type", 7),
-        (header(more="property float x\n"), "two properties", 7),
+        (header(more="property list uchar int a\n") + bytes(20), "with list properties", 3),
+        (header(more="property quad a\n"), "supported type", 7),
+        (header(more="property float x\n"), "duplicate property", 7),
         (header(more="element vertex x\n"), "a name and a number", 7),
-        (header(more="element f 1\nproperty list float int a\n"), "must be whole", 8),
+        (header(more="element f 1\nproperty list float int a\n"), "must have an integer type", 8),
         (header().replace(b"property float z\n", b"") + bytes(8), "missing: z", None),
-        (header(more="strange 1\n"), "unknown word", 7),
-        (b"ply\nproperty float x\nend_header\n", "before the first element", 2),
-        (header()[:-5], "does not end", 7),
+        (header(more="strange 1\n"), "unknown keyword", 7),
+        (b"ply\nproperty float x\nend_header\n", "precedes the first element", 2),
+        (header()[:-5], "incomplete header", 7),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(data: bytes, said: str, line: int | None) -> None:
-    with pytest.raises((UnreadableFile, TooLarge), match=said) as caught:
+def test_invalid_file_raises_an_error_with_line(data: bytes, message: str, line: int | None) -> None:
+    with pytest.raises((UnreadableFile, TooLarge), match=message) as caught:
         read(data)
     assert caught.value.problems[0].file == "map.ply"
     assert caught.value.problems[0].line == line
 
 
-def test_limits_are_kept() -> None:
+def test_limits_are_enforced() -> None:
     with pytest.raises(TooLarge, match="limit is 5"):
         read(header(n=6) + bytes(72), limits=Limits(voxels=5))
     with pytest.raises(TooLarge, match="text"):
         read(header("ascii") + b"1 2 3" + b" " * 200, limits=Limits(text_bytes=100))
 
 
-def test_centres_of_voxels_as_a_cloud() -> None:
+def test_voxel_centres_become_a_cloud() -> None:
     """The colour tree's occupied voxels, at full depth, by trimesh."""
     shelf = (SAMPLES / "octomap" / "shelf.ot").read_bytes()
     converted = offline({"shelf.ot": shelf}, "ply")

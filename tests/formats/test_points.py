@@ -47,7 +47,7 @@ def cells(voxels: VoxelMap) -> set[tuple[int, ...]]:
     return set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
 
 
-def test_real_clouds_through_http(api: Api, shared: Path) -> None:  # noqa: F811
+def test_real_clouds_round_trip_over_http(api: Api, shared: Path) -> None:  # noqa: F811
     for k, path in enumerate(sorted((shared / "data" / "pointcloud").rglob("*.p[cl]?"))):
         env, data = f"cloud-{k}", path.read_bytes()
         api.post("environments", {"name": env})
@@ -63,7 +63,7 @@ def test_real_clouds_through_http(api: Api, shared: Path) -> None:  # noqa: F811
         assert all(line["information"] == "raw" for line in report["layers"])
 
 
-def test_a_cloud_is_not_served_for_other_voxels(api: Api) -> None:  # noqa: F811
+def test_cloud_is_not_exported_for_other_voxels(api: Api) -> None:  # noqa: F811
     """Another octree of the same name takes the cloud's place; the version before still has it."""
     api.post("environments", {"name": "stale"})
     api.upload("stale", {"map.pcd": SHELF})
@@ -82,7 +82,7 @@ def test_a_cloud_is_not_served_for_other_voxels(api: Api) -> None:  # noqa: F811
     assert not [d for d in report["dropped"] if d["what"] == "resources"], "the cloud has gone with its voxels"
 
 
-def test_two_clouds_in_one_environment_by_name(api: Api) -> None:  # noqa: F811
+def test_two_clouds_are_selected_by_name(api: Api) -> None:  # noqa: F811
     api.post("environments", {"name": "pair"})
     api.upload("pair", {"shelf.pcd": SHELF, "line.pcd": LINE})
     assert api.get("/maps/pair/pcd/shelf.pcd").content == SHELF
@@ -97,7 +97,7 @@ def test_two_clouds_in_one_environment_by_name(api: Api) -> None:  # noqa: F811
     assert api.get("environments/pair/versions/2/layers/voxels?name=line").json()["resolution"] == 0.2
 
 
-def test_changed_leaves_forget_the_cloud() -> None:
+def test_changed_leaves_detach_the_cloud() -> None:
     layers = layers_of("map.pcd", SHELF)
     key = PartKey("voxels")
     voxels = layers.parts[key]
@@ -121,7 +121,7 @@ def test_changed_leaves_forget_the_cloud() -> None:
         written(Layers({key: coarser(voxels, 15)}), "pcd", frame="source")
 
 
-def test_centres_fall_into_the_voxels_they_came_from(shared: Path) -> None:
+def test_centres_are_inside_their_voxels(shared: Path) -> None:
     """octomap → pcd → voxels of the same resolution: the same occupied ones."""
     path = shared / "data/octomap/geb079/geb079.bt"
     pcd_data = offline({"geb.bt": path.read_bytes()}, "pcd").files["map.pcd"]
@@ -134,7 +134,7 @@ def test_centres_fall_into_the_voxels_they_came_from(shared: Path) -> None:
     assert len(after) == 185673, "as liboctomap counts"
 
 
-def test_moved_clouds_in_both_frames(shared: Path) -> None:
+def test_far_clouds_are_written_in_both_frames(shared: Path) -> None:
     data = (shared / "data/pointcloud/pcl_data/samp41-utm.pcd").read_bytes()
     layers = layers_of("map.pcd", data)
     voxels = layers.parts[PartKey("voxels")]
@@ -147,7 +147,7 @@ def test_moved_clouds_in_both_frames(shared: Path) -> None:
     assert cells(voxels) == {tuple(p) for p in np.floor(b * (1 / 0.05)).astype(int).tolist()}
     source, context = written(layers, "ply", frame="source")
     assert np.array_equal(np.array(clouds.ply(source)[1]), a)
-    assert any("coordinates they came in" in w.problem for w in context.warnings)
+    assert any("coordinates of the upload" in w.problem for w in context.warnings)
     assert np.array_equal(np.array(clouds.ply(written(layers, "ply")[0])[1]), b), "others are local by default"
     placed = layers_of("map.pcd", data, crs="EPSG:32633", resolution="0.1")
     assert placed.datum is not None
@@ -163,7 +163,7 @@ def test_moved_clouds_in_both_frames(shared: Path) -> None:
     assert nz == 0
 
 
-def test_there_must_be_a_cloud_and_only_one() -> None:
+def test_write_requires_exactly_one_cloud() -> None:
     for to in ("pcd", "ply", "las"):
         with pytest.raises(MissingLayer, match="upload"):
             written(Layers(), to)
@@ -175,13 +175,13 @@ def test_there_must_be_a_cloud_and_only_one() -> None:
         assert written(two, to, name="b")[0]
 
 
-def test_too_many_centres_are_refused() -> None:
+def test_too_many_centres_raise_invalid() -> None:
     huge = VoxelMap(0.05, np.array([1], np.uint8), np.array([0], np.uint64), np.array([1], np.float32))
     with pytest.raises(Invalid, match="depth"):
         written(Layers({PartKey("voxels"): huge}), "pcd")
 
 
-def test_expanded_by_brute_force() -> None:
+def test_expanded_codes_match_brute_force() -> None:
     depth = np.array([14, 16, 15], np.uint8)
     code = np.array([5, 6 << 6, (6 << 3) + 1], np.uint64)
     voxels = VoxelMap(0.1, depth, code, np.array([1, -1, 1], np.float32))
@@ -200,7 +200,7 @@ def big_text(megabytes: int) -> bytes:
     return head.encode() + rows.encode() + b"\n"
 
 
-def test_memory_of_a_large_text() -> None:
+def test_large_text_is_read_in_bounded_memory() -> None:
     data = big_text(2)
     assert len(data) > 1_700_000
     lzf.squeeze(bytes(lzf.MAX_INTERPRETED_BYTES))  # compiled before anything is traced: that would take long
@@ -219,7 +219,7 @@ def test_memory_of_a_large_text() -> None:
         assert peak < 10 * len(data), f"{to} {options}: {peak / len(data):.1f} times the text"
 
 
-def test_a_million_points_cost_no_more_than_sorting_them() -> None:
+def test_million_points_are_read_in_sorting_time() -> None:
     n = 1_000_000
     dice = np.random.default_rng(5)
     body = dice.uniform(-50, 50, (n, 3)).astype("<f4").tobytes()
@@ -239,7 +239,7 @@ def test_a_million_points_cost_no_more_than_sorting_them() -> None:
     assert ours < 1.5 * floor, f"{ours:.2f} s, and the sort alone {floor:.2f} s"
 
 
-def test_colours_are_means() -> None:
+def test_voxel_colours_are_means_of_point_colours() -> None:
     head = b"VERSION 0.7\nFIELDS x y z rgba\nSIZE 4 4 4 4\nTYPE F F F U\nWIDTH 3\nHEIGHT 1\nDATA binary\n"
     body = b"".join(struct.pack("<3fI", 0.01 * k, 0, 0, v) for k, v in enumerate((0xFF0A0000, 0xFF140005, 0xFF1E0007)))
     voxels = layers_of("map.pcd", head + body).parts[PartKey("voxels")]

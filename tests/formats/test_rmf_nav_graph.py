@@ -1,4 +1,4 @@
-"""rmf_nav_graph: graphs come back the same, and those made of a building equal what the official generator makes."""
+"""rmf_nav_graph: graphs round-trip, and graphs of a building equal those of the official generator."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def generated(shared: Path) -> list[Path]:
     return folders
 
 
-def test_every_real_graph_comes_back_the_same(shared: Path, same: Same) -> None:
+def test_real_graphs_round_trip(shared: Path, same: Same) -> None:
     for folder in [*generated(shared), shared / "data" / "openrmf_building" / "robast_sim"]:
         files = {p.name: p.read_bytes() for p in folder.rglob("[0-9].yaml")}
         back = offline(files, "rmf_nav_graph").files
@@ -65,7 +65,7 @@ def test_every_real_graph_comes_back_the_same(shared: Path, same: Same) -> None:
         assert offline(back, "rmf_nav_graph").files == back
 
 
-def test_graphs_made_of_a_building_equal_those_of_the_official_generator(shared: Path, same: Same) -> None:
+def test_graphs_of_building_equal_official_generator(shared: Path, same: Same) -> None:
     for folder in generated(shared):
         building = shared / "data" / "openrmf_building" / folder.name.removeprefix("generated_")
         source = next(building.glob("*.building.yaml"))
@@ -75,7 +75,7 @@ def test_graphs_made_of_a_building_equal_those_of_the_official_generator(shared:
         assert same("rmf_nav_graph", official, files) == same("rmf_nav_graph", files, official) == [], folder
 
 
-def test_vertices_are_numbered_as_the_official_generator_does(shared: Path) -> None:
+def test_vertex_order_equals_official_generator(shared: Path) -> None:
     for folder in generated(shared):
         building = shared / "data" / "openrmf_building" / folder.name.removeprefix("generated_")
         source = next(building.glob("*.building.yaml"))
@@ -88,7 +88,7 @@ def test_vertices_are_numbered_as_the_official_generator_does(shared: Path) -> N
                 assert [v[2] for v in ours["levels"][level]["vertices"]] == names
 
 
-def test_facts_of_every_real_graph_hold_in_the_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_layers_match_facts_of_real_graphs(shared: Path, facts_json: dict[str, Any]) -> None:
     for folder in generated(shared):
         for path in sorted(folder.rglob("*.yaml")):
             facts = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
@@ -106,7 +106,7 @@ def test_facts_of_every_real_graph_hold_in_the_layers(shared: Path, facts_json: 
             assert doors == facts["doors"]
 
 
-def test_the_graphs_of_a_folder_are_one_network() -> None:
+def test_graphs_of_directory_form_one_network() -> None:
     groups, rest = formats.group(sample("rmf_nav_graph", "clinic"))
     assert [(g.format.name, sorted(g.files)) for g in groups] == [("rmf_nav_graph", ["0.yaml", "1.yaml"])]
     assert rest == []
@@ -124,7 +124,7 @@ def test_the_graphs_of_a_folder_are_one_network() -> None:
     assert (lift["size"][:2], lift["pose"][5]) == ([2.0, 2.5], 0.25)
 
 
-def test_our_sample_comes_back_row_by_row() -> None:
+def test_sample_round_trips_row_by_row() -> None:
     files = sample("rmf_nav_graph", "clinic")
     graphs, context = write(read(files)[0])
     for name, data in files.items():
@@ -133,7 +133,7 @@ def test_our_sample_comes_back_row_by_row() -> None:
     assert not context.template
 
 
-def test_a_building_gives_doors_lifts_mutexes_limits_and_orientations() -> None:
+def test_building_exports_doors_lifts_mutexes_limits_and_orientations() -> None:
     converted = offline(sample("openrmf", "clinic"), "rmf_nav_graph")
     zero, one = (yaml.safe_load(converted.files[name]) for name in ("0.yaml", "1.yaml"))
     assert list(converted.files) == ["0.yaml", "1.yaml"]
@@ -166,7 +166,7 @@ def test_a_building_gives_doors_lifts_mutexes_limits_and_orientations() -> None:
         assert graph["lifts"]["Lift A"]["dims"] == [2.0, 2.5]
 
 
-def test_metres_tell_offset_and_crs_and_docks_tell_lanes() -> None:
+def test_metric_building_exports_offset_crs_and_dock_lanes() -> None:
     files = offline(sample("openrmf", "yard"), "rmf_nav_graph").files
     graph = yaml.safe_load(files["3.yaml"])
     assert (graph["offset"], graph["crs_name"]) == ([22700.5, 15900], "EPSG:3414")
@@ -179,14 +179,14 @@ def test_metres_tell_offset_and_crs_and_docks_tell_lanes() -> None:
     assert docked["levels"]["L"]["lanes"] == [[0, 1, {"dock_name": "pump"}], [1, 0, {"undock_name": "pump"}]]
 
 
-def test_graphs_become_a_building_and_are_the_same_again(same: Same, shared: Path) -> None:
+def test_graphs_round_trip_via_building(same: Same, shared: Path) -> None:
     for folder in generated(shared):
         files = {p.name: p.read_bytes() for p in folder.rglob("*.yaml")}
         building = offline(files, "openrmf").files
         assert same("rmf_nav_graph", files, offline(building, "rmf_nav_graph").files) == []
 
 
-def test_a_network_of_another_format_is_graph_0_with_its_ids_as_names() -> None:
+def test_network_of_other_format_becomes_graph_0_with_ids_as_names() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0, 0), {"kind": "node", "tmap2": {}}),
         ("b", shapely.Point(2, 0), {"kind": "node", "name": "Bee"}),
@@ -212,7 +212,7 @@ def test_a_network_of_another_format_is_graph_0_with_its_ids_as_names() -> None:
     ]
 
 
-def test_robots_and_lanes_that_no_source_tells_of() -> None:
+def test_options_fill_in_robots_and_lanes() -> None:
     rows: list[Any] = [(i, shapely.Point(k, 0), {"kind": "node"}) for k, i in enumerate(("a", "b10", "b9"))]
     line = shapely.LineString([(0, 0), (1, 0)])
     rows += [(f"{a}_{b}", line, {"kind": "edge", "source": a, "target": b}) for a, b in (("a", "b9"), ("a", "b10"))]
@@ -254,33 +254,33 @@ levels:
 """
 
 
-def test_a_level_without_vertices_stays_a_level() -> None:
+def test_level_without_vertices_is_written() -> None:
     text = "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: []}, M: {vertices: [], lanes: []}}\n"
     graph = yaml.safe_load(offline({"0.yaml": text.encode()}, "rmf_nav_graph").files["0.yaml"])
     assert graph["levels"]["M"] == {"lanes": [], "vertices": []}
     assert offline({"0.yaml": text.encode()}, "tmap2").files, "an empty level is no part of other maps"
 
 
-def test_names_that_stand_twice_are_warned_of() -> None:
+def test_duplicate_names_give_a_warning() -> None:
     graphs, context = write(
         read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {name: a}]]}}\n")[0]
     )
     assert len(graphs["0.yaml"]["levels"]["L"]["vertices"]) == 2
-    assert "which fleet adapters refuse: a" in context.warnings[0].problem
+    assert "duplicate vertex names: a; fleet adapters reject them" in context.warnings[0].problem
 
 
-def test_without_a_lane_there_is_no_graph() -> None:
+def test_network_without_lanes_raises_missing_layer() -> None:
     node = features([("a", shapely.Point(0, 0), {"kind": "node"})], "local")
     with pytest.raises(MissingLayer, match="supply"):
         write(Layers({PartKey("topology", "ground", "network"): node}))
 
 
-def test_lanes_to_vertices_that_do_not_exist_are_kept() -> None:
+def test_lanes_to_missing_vertices_round_trip() -> None:
     layers, context = read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: [[0, 4, {}]]}}\n")
     assert "joins the vertices 0 and 4" in context.warnings[0].problem
     graphs, warned = write(layers)
     assert graphs["0.yaml"]["levels"]["L"]["lanes"] == [[0, 4, {}]]
-    assert "will refuse" in warned.warnings[0].problem
+    assert "will reject" in warned.warnings[0].problem
 
 
 HEAD = "building_name: x\nlevels:\n  L:\n"
@@ -298,14 +298,14 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("text", BROKEN)
-def test_what_is_wrong_is_named(text: str) -> None:
+def test_invalid_graph_raises_unreadable_file(text: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(text)
     assert caught.value.problems[0].where == BROKEN[text]
     assert caught.value.problems[0].file == "0.yaml"
 
 
-def test_a_building_wins_over_its_graphs_on_the_same_level() -> None:
+def test_building_takes_precedence_over_its_graphs() -> None:
     files = {**sample("openrmf", "clinic"), **sample("rmf_nav_graph", "clinic")}
     building = yaml.safe_load(offline(files, "openrmf", hints=UploadHints()).files["building.yaml"])
     alone = yaml.safe_load(offline(sample("openrmf", "clinic"), "openrmf").files["building.yaml"])
@@ -313,7 +313,7 @@ def test_a_building_wins_over_its_graphs_on_the_same_level() -> None:
     assert offline(files, "rmf_nav_graph").files == offline(sample("openrmf", "clinic"), "rmf_nav_graph").files
 
 
-def test_what_few_lanes_say_is_kept_once_and_nothing_of_the_parsed_text() -> None:
+def test_equal_lane_parameters_are_shared_in_memory() -> None:
     """Memory of a large graph is that of its features: equal parameters are one object, keys are shared."""
     rows = "".join(f"      - [{k}, {k + 1}, {{speed_limit: 0.5}}]\n" for k in range(50))
     places = "".join(f"      - [{k}.5, 0.0, {{name: ''}}]\n" for k in range(51))

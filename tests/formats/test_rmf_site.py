@@ -96,7 +96,7 @@ def problems(context: ReadContext | WriteContext) -> str:
     return "\n".join(f"{p.where}: {p.problem}" for p in context.warnings)
 
 
-def test_a_site_comes_back_the_same_in_json_and_ron() -> None:
+def test_site_round_trips_in_json_and_ron() -> None:
     layers, _ = read(WARD)
     original = json.loads(WARD["ward.site.json"])
     site, files, context = write(layers)
@@ -124,7 +124,7 @@ def test_a_site_comes_back_the_same_in_json_and_ron() -> None:
     assert FORMAT.selection.from_filename("map.zip") == {}
 
 
-def test_what_stands_where_by_hand() -> None:
+def test_item_positions_match_values_computed_by_hand() -> None:
     layers, context = read(WARD)
     assert layers.levels == (Level("Ground floor", 0.0), Level("Upstairs", 3.5))
     assert layers.datum == Datum(53.2686, -0.5245)
@@ -194,10 +194,10 @@ def test_what_stands_where_by_hand() -> None:
     assert item(objects(layers), "Ground floor/fiducial/44")[0]["name"] == "north east"
     robot, _ = item(objects(layers, "Upstairs"), "Upstairs/model/174")
     assert robot["pose"] == pytest.approx([5.0, 5.0, 3.5, 0.0, 0.0, 2 * math.atan2(0.6, 0.8)])
-    assert "2 lanes are of several graphs" in problems(context)
+    assert "2 lanes belong to several graphs" in problems(context)
 
 
-def test_an_older_site_in_ron_reads_as_the_same_elements() -> None:
+def test_older_ron_site_reads_as_same_elements() -> None:
     layers, _ = read(HUT)
     desk, _ = item(objects(layers, "L1"), "L1/model/50")
     assert desk["pose"] == pytest.approx([1.5, 2.0, 0.0, 0.0, 0.0, math.pi / 4])
@@ -212,10 +212,10 @@ def test_an_older_site_in_ron_reads_as_the_same_elements() -> None:
     (scenario,) = site["scenarios"].values()
     assert site["model_descriptions"][str(model["description"])]["source"] == {"Search": "OpenRobotics/Desk"}
     assert scenario["instances"]["50"] == {"pose": model["pose"], "inclusion": "Included", "on_level": 0}
-    assert "the image 'scan.png' was not in the upload" in problems(context)
+    assert "the image 'scan.png' was not uploaded" in problems(context)
 
 
-def test_unknown_members_are_told_by_name_and_come_back() -> None:
+def test_unknown_members_give_a_warning_and_round_trip() -> None:
     files = ward(
         new_in_0_2={"a": 1},
         levels__1__mood="blue",
@@ -237,22 +237,22 @@ def test_unknown_members_are_told_by_name_and_come_back() -> None:
         ({"levels": {}}, "levels: a site needs at least one level"),
         ({"levels__1__anchors__10": {"Translate2D": [1.0]}}, "levels.1.anchors.10: must be a list of 2 numbers"),
         ({"levels__1__anchors__10": {"Spline": []}}, "levels.1.anchors.10: must be Translate2D"),
-        ({"levels__1__anchors__10": {"Translate2D": [1e9, 0]}}, "levels.1.anchors.10: is beyond"),
-        ({"levels__1__anchors__ten": {"Translate2D": [1.0, 1.0]}}, "'ten' is no id"),
-        ({"levels__1__walls__60__anchors": [10, 999]}, "levels.1.walls.60: stands on anchors"),
+        ({"levels__1__anchors__10": {"Translate2D": [1e9, 0]}}, "levels.1.anchors.10: must be within"),
+        ({"levels__1__anchors__ten": {"Translate2D": [1.0, 1.0]}}, "invalid id 'ten'"),
+        ({"levels__1__walls__60__anchors": [10, 999]}, "levels.1.walls.60: uses anchors"),
         ({"levels__1__walls__60__anchors": [10]}, "levels.1.walls.60.anchors: must be a list of 2 ids"),
-        ({"levels__1__walls__60__anchors": [10, True]}, "must be the id of an element"),
+        ({"levels__1__walls__60__anchors": [10, True]}, "must be an element id"),
         ({"levels__1__doors__31__kind": {"SingleSwing": {"swing": {"Forward": {"grad": 1}}}}}, "must be deg or rad"),
         ({"levels__1__drawings__40__properties__pixels_per_meter": 0}, "must be between"),
         ({"navigation__guided__lanes__130__reverse": "Maybe"}, "must be Same, Disable or Different"),
         ({"navigation__guided__lanes__130__graphs": "None"}, "must be All, Only or AllExcept"),
-        ({"lifts__110__properties__reference_anchors": [10, 11]}, "there is no anchor 10 of the site"),
+        ({"lifts__110__properties__reference_anchors": [10, 11]}, "unknown anchor 10 of the site"),
         ({"lifts__110__properties__cabin__Rect__depth": -1}, "must have a depth and a width above 0"),
-        ({"model_instances__172__pose__rot": {"quat": [0, 0, 0, 0]}}, "is no rotation"),
+        ({"model_instances__172__pose__rot": {"quat": [0, 0, 0, 0]}}, "invalid rotation"),
         ({"properties__geographic_offset__anchor": [95.0, 0.0]}, "latitude must be between"),
     ],
 )
-def test_what_is_wrong_is_refused_with_its_place(changes: dict[str, Any], reason: str) -> None:
+def test_invalid_site_raises_unreadable_file_with_location(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(ward(**changes))
     assert reason in caught.value.detail
@@ -260,22 +260,22 @@ def test_what_is_wrong_is_refused_with_its_place(changes: dict[str, Any], reason
 
 
 @pytest.mark.parametrize(("latitude", "good"), [(-80.1, False), (-80.0, True), (84.0, True), (84.1, False)])
-def test_places_beyond_the_zones_of_utm_are_refused_by_the_editor(latitude: float, good: bool) -> None:
+def test_check_rejects_latitudes_outside_utm_zones(latitude: float, good: bool) -> None:
     files = ward(properties__geographic_offset__anchor=[latitude, 0.0])
     findings = [p for p in formats.check(FORMAT, files) if p.where == "properties.geographic_offset.anchor"]
     assert [p.level for p in findings] == ([] if good else ["error"])
 
 
-def test_lanes_without_an_anchor_are_kept_for_the_way_back() -> None:
+def test_lanes_without_anchor_round_trip() -> None:
     lane = {"anchors": [14, 999], "graphs": "All"}
     layers, context = read(ward(navigation__guided__lanes__136=lane))
-    assert "1 stand on no anchor" in problems(context)
-    site, _, told_back = write(layers)
+    assert "1 items use no anchor" in problems(context)
+    site, _, write_context = write(layers)
     assert site["navigation"]["guided"]["lanes"]["136"] == lane
-    assert "136 stand on anchors that are not there" in problems(told_back)
+    assert "136 use anchors that do not exist" in problems(write_context)
 
 
-def test_geometry_decides_after_an_edit() -> None:
+def test_edited_geometry_takes_precedence() -> None:
     layers, _ = read(WARD)
     key = PartKey("topology", "Ground floor", "network")
     moved = changed(network(layers), "Ground floor/15", shapely.Point(7.0, 2.5), name="middle")
@@ -302,14 +302,14 @@ def test_geometry_decides_after_an_edit() -> None:
     assert site["scenarios"]["160"]["instances"].keys() == {"173", "199"}
 
 
-def test_a_site_of_another_place_keeps_the_datum_of_the_environment() -> None:
+def test_environment_datum_is_kept_when_site_has_another() -> None:
     frame = local_frame(Datum(1.0, 2.0, heading=10.0))
     layers, context = read(WARD, frame=frame)
     assert layers.datum is None
-    assert "is not the environment's datum" in problems(context)
-    site, _, told_back = write(Layers(layers.parts, Datum(1.0, 2.0, 5.0, 10.0), layers.levels))
+    assert "differs from the environment's datum" in problems(context)
+    site, _, write_context = write(Layers(layers.parts, Datum(1.0, 2.0, 5.0, 10.0), layers.levels))
     assert site["properties"]["geographic_offset"] == {"anchor": [1.0, 2.0], "zoom": 17, "visible": True}
-    assert {d.subject for d in told_back.dropped} == {"the datum's heading", "the datum's altitude"}
+    assert {d.subject for d in write_context.dropped} == {"the datum's heading", "the datum's altitude"}
 
 
 def summary(building: dict[str, Any]) -> dict[str, Any]:
@@ -343,7 +343,7 @@ def summary(building: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def test_real_buildings_go_through_a_site_with_all_that_both_can_say(shared: Path) -> None:
+def test_real_buildings_round_trip_via_site(shared: Path) -> None:
     for path in sorted((shared / "data" / "openrmf_building").glob("*/*.building.yaml")):
         files = {path.name: path.read_bytes(), **{p.name: p.read_bytes() for p in path.parent.glob("*.png")}}
         site = offline(files, "rmf_site").files
@@ -361,7 +361,7 @@ def test_real_buildings_go_through_a_site_with_all_that_both_can_say(shared: Pat
             assert again[name]["level_doors"].keys() == lift["level_doors"].keys()
 
 
-def test_a_site_becomes_a_building_and_navigation_graphs() -> None:
+def test_site_exports_to_building_and_navigation_graphs() -> None:
     built = offline(WARD, "openrmf")
     building = yaml.safe_load(built.files["building.yaml"])
     ground = building["levels"]["Ground floor"]
@@ -375,7 +375,7 @@ def test_a_site_becomes_a_building_and_navigation_graphs() -> None:
     assert any(v[2].get("lift") == "Lift A" for v in cleaners["Ground floor"]["vertices"])
 
 
-def test_any_network_is_written_with_chargers_and_robots_as_asked() -> None:
+def test_options_add_chargers_and_robots_to_any_network() -> None:
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0, 0), {"kind": "node"}),
         ("b", shapely.Point(3, 0), {"kind": "node"}),
@@ -414,7 +414,7 @@ def test_any_network_is_written_with_chargers_and_robots_as_asked() -> None:
         write(Layers({}))
 
 
-def test_the_rules_of_the_editor_find_what_it_refuses() -> None:
+def test_check_finds_errors_of_the_editor() -> None:
     check = FORMAT.check
     assert check is not None
     assert list(check(WARD)) == []
@@ -442,7 +442,7 @@ def test_the_rules_of_the_editor_find_what_it_refuses() -> None:
     }
 
 
-def test_members_of_other_types_are_refused_or_written_back() -> None:
+def test_members_of_wrong_type_are_rejected_or_round_trip() -> None:
     """A reader that takes what the writer cannot use would leave a stored map that nobody gets."""
     top = json.loads(WARD["ward.site.json"])
     places: list[tuple[Any, Any]] = []

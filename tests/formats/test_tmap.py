@@ -1,4 +1,4 @@
-"""tmap: the older list comes back the same, says all that its reader asks for, and turns into tmap2 and back whole."""
+"""tmap: the older list round-trips, has all keys that its reader uses, and converts to tmap2 and back without loss."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def drawn() -> Layers:
     return Layers({NETWORK: features(rows, "local")})
 
 
-def test_the_real_list_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+def test_real_list_round_trips(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
     name = "tmap2/legacy_tmap_bacchus_vines/tmap.tmap"
     data = (shared / "data" / name).read_bytes()
     assert formats.detect("tmap.tmap", data) is FORMAT
@@ -116,7 +116,7 @@ def test_the_real_list_comes_back_the_same(shared: Path, same: Same, facts_json:
     assert sum(len(node[4]) for node in load_v1(served)) == facts["edges_directed"]
 
 
-def test_our_sample_and_its_facts() -> None:
+def test_sample_matches_facts() -> None:
     fact = json.loads((SAMPLES / "tmap" / "facts.json").read_text())["old.tmap"]
     layers, context = read(OLD)
     part = layers.parts[NETWORK]
@@ -127,7 +127,7 @@ def test_our_sample_and_its_facts() -> None:
     assert plain(write(layers)[0]) == plain(OLD)
 
 
-def test_it_is_told_by_its_content_and_may_still_be_called_tmap2() -> None:
+def test_detect_uses_content_and_accepts_tmap2_name() -> None:
     mapping = (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     for name in ("map.tmap", "map.yaml", "x.tmap2"):
         assert formats.detect(name, OLD) is FORMAT
@@ -140,14 +140,14 @@ def test_it_is_told_by_its_content_and_may_still_be_called_tmap2() -> None:
         assert bundle.files["old.tmap"].format == (format_name or "tmap")
 
 
-def test_beside_a_tmap2_the_tmap2_is_believed() -> None:
+def test_tmap2_takes_precedence_over_tmap() -> None:
     files = {"old.tmap": OLD, "a_rather_long_name.tmap2.yaml": (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()}
     bundle = read_bundle(files, UploadHints(), EnvironmentContext(), Limits())
     assert bundle.parts[NETWORK].document["tmap2"]["name"] == "orchard_full"  # type: ignore[union-attr]
     assert not bundle.files["old.tmap"].used
 
 
-def test_to_tmap2_and_back_nothing_is_lost() -> None:
+def test_list_round_trips_via_tmap2() -> None:
     tmap2_files = offline({"old.tmap": OLD}, "tmap2").files
     back = offline(dict(tmap2_files), "tmap").files["map.tmap"]
     first, last = plain(OLD), plain(back)
@@ -159,7 +159,7 @@ def test_to_tmap2_and_back_nothing_is_lost() -> None:
     assert load_v1(OLD) == load_v1(back)
 
 
-def test_a_tmap2_as_a_list_keeps_what_items_say_and_declares_what_the_top_said() -> None:
+def test_tmap2_as_list_keeps_items_and_reports_dropped_top_level() -> None:
     data = (SAMPLES / "tmap2" / "orchard.tmap2.yaml").read_bytes()
     layers = formats.read(FileGroup(get_format("tmap2"), "n.tmap2.yaml", {"n.tmap2.yaml": data}), ReadContext())
     served, context = write(layers)
@@ -176,7 +176,7 @@ def test_a_tmap2_as_a_list_keeps_what_items_say_and_declares_what_the_top_said()
                 assert want.items() <= have.items() if isinstance(want, dict) else want == have
 
 
-def test_a_network_from_elsewhere_is_completed_and_said_so() -> None:
+def test_network_of_other_format_is_filled_in_and_reported() -> None:
     served, context = write(drawn(), pointset="yard", top_vel=0.4, action="go")
     entries = yaml.safe_load(served)
     assert [e["node"]["name"] for e in entries] == ["a", "b"]
@@ -208,7 +208,7 @@ def test_a_network_from_elsewhere_is_completed_and_said_so() -> None:
         (b"- node:\n    name: a\n    pose: {position: {x: .nan, y: 2}}\n", ""),
     ],
 )
-def test_bad_lists_are_refused_with_their_place(data: bytes, reason: str) -> None:
+def test_invalid_list_raises_unreadable_file_with_location(data: bytes, reason: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(data)
     assert reason in caught.value.detail

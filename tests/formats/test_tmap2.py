@@ -84,7 +84,7 @@ def real(shared: Path) -> list[Path]:
 # --- real files ------------------------------------------------------------------------------------------------------
 
 
-def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+def test_real_files_round_trip(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
     paths = real(shared)
     assert len(paths) == sum(f.get("kind") == "tmap2" for f in facts_json.values()) == 9
     for path in paths:
@@ -99,7 +99,7 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         assert once_more == served, path
 
 
-def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+def test_layers_match_facts_of_real_files(shared: Path, facts_json: dict[str, Any]) -> None:
     for path in real(shared):
         fact = facts_json[str(path.relative_to(shared / "data"))]["facts"]
         layers, context = read(path.read_bytes(), path.name)
@@ -121,7 +121,7 @@ def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_js
         assert actions == fact["actions"]
 
 
-def test_served_files_are_valid_for_the_schema_and_other_readers(shared: Path) -> None:
+def test_written_files_are_valid_for_schema_and_other_readers(shared: Path) -> None:
     for path in real(shared):
         if path.stat().st_size > 400_000:
             continue
@@ -155,7 +155,7 @@ def check_schema(top: dict[str, Any]) -> None:
 # --- our samples -----------------------------------------------------------------------------------------------------
 
 
-def test_facts_of_samples() -> None:
+def test_samples_match_facts() -> None:
     fact = FACTS["orchard.tmap2.yaml"]
     layers, context = read((SAMPLES / "orchard.tmap2.yaml").read_bytes())
     part = network(layers)
@@ -166,13 +166,13 @@ def test_facts_of_samples() -> None:
     assert bounds(part) == fact["bounds"]
     assert part.document["tmap2"]["name"] == fact["name"]
     text = warnings(context)
-    assert ("is no node" in text) == bool(fact["dangling"])
+    assert ("leads to the unknown node" in text) == bool(fact["dangling"])
     assert ("have no edges" in text) == bool(fact["lonely"])
-    assert ("stand twice" in text) == bool(fact["repeated_names"])
-    assert ("stand for several" in text) == bool(fact["repeated_edge_ids"])
+    assert ("duplicate node names" in text) == bool(fact["repeated_names"])
+    assert ("duplicate edge ids" in text) == bool(fact["repeated_edge_ids"])
 
 
-def test_points_of_interest_are_objects() -> None:
+def test_nodes_without_edges_become_points_of_interest() -> None:
     layers, context = read((SAMPLES / "stops.tmap2.yaml").read_bytes())
     part = layers.parts[POINTS]
     assert isinstance(part, Features)
@@ -185,14 +185,14 @@ def test_points_of_interest_are_objects() -> None:
     assert served["nodes"][0]["node"]["properties"] == {"semantics": "charger"}
 
 
-def test_a_document_of_points_of_interest_names_the_network_made_from_them() -> None:
+def test_points_of_interest_document_names_derived_network() -> None:
     layers, _ = read((SAMPLES / "stops.tmap2.yaml").read_bytes())
     derived_network = network(layers).with_document({})
     served, _ = write(Layers({NETWORK: derived_network, **layers.parts}), title="farm")
     assert yaml.safe_load(served)["name"] == "stops"
 
 
-def test_the_orchard_in_full(same: Same) -> None:
+def test_orchard_matches_expected_file(same: Same) -> None:
     data = (SAMPLES / "orchard.tmap2.yaml").read_bytes()
     layers, _ = read(data)
     part = network(layers)
@@ -225,7 +225,7 @@ def test_the_orchard_in_full(same: Same) -> None:
     ]
 
 
-def test_the_older_list_is_served_completed() -> None:
+def test_older_list_is_written_with_missing_members() -> None:
     layers, _ = read(OLD.read_bytes(), "old.tmap")
     assert network(layers).document["tmap"] == {"layout": "list"}
     served, context = again(layers)
@@ -269,7 +269,7 @@ def two(first: Any, second: Any = "B") -> str:
         "_1",
     ],
 )  # fmt: skip
-def test_any_name_comes_back_as_it_was(name: str) -> None:
+def test_any_name_round_trips(name: str) -> None:
     layers, context = read(two(name))
     part = network(layers)
     assert part.properties[0]["name"] == name
@@ -282,21 +282,21 @@ def test_any_name_comes_back_as_it_was(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "x" * 257, "a\nb", "a\x07", "a\u2028b", None, ["a"], {"a": 1}])
-def test_names_that_cannot_be_used(name: Any) -> None:
+def test_invalid_name_raises_unreadable_file(name: Any) -> None:
     with pytest.raises(UnreadableFile, match="name") as caught:
         read(two(name))
     assert caught.value.problems[0].where == "nodes[0].node.name"
     assert caught.value.problems[0].file == "network.tmap2.yaml"
 
 
-def test_names_that_are_no_texts_become_texts_with_their_edges() -> None:
+def test_scalar_names_become_text_with_their_edges() -> None:
     layers, context = read(two(5, 7))
     assert network(layers).ids == ("5", "7", "e1")
     assert network(layers).properties[2]["target"] == "7"
-    assert "is no text" in warnings(context)
+    assert "is not text" in warnings(context)
 
 
-def test_long_edge_ids_and_edges_without_one() -> None:
+def test_long_and_missing_edge_ids_round_trip() -> None:
     document = yaml.safe_load(two("A" * 256, "B" * 256))
     document["nodes"][0]["node"]["edges"] = [
         {"edge_id": "A" * 600, "node": "B" * 256},
@@ -333,7 +333,7 @@ DATUM = Datum(53.2686, -0.5245)
 
 
 @pytest.mark.parametrize("name", ["tmap2", "tmap"])
-def test_what_nodes_get_can_be_chosen(name: str) -> None:
+def test_options_set_members_of_new_nodes(name: str) -> None:
     fmt = formats.get_format(name)
     options = {"verts_radius": "1.5", "xy_goal_tolerance": "0.2", "yaw_goal_tolerance": "0.5"}
     context = WriteContext(options=formats.write_options(fmt, options), title="farm")
@@ -358,7 +358,7 @@ def test_what_nodes_get_can_be_chosen(name: str) -> None:
     assert same == served
 
 
-def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> None:
+def test_network_of_other_format_gets_defaults_and_keeps_attributes() -> None:
     served, context = write(Layers({NETWORK: from_elsewhere()}, DATUM), title="farm")
     top = yaml.safe_load(served)
     check_schema(top)
@@ -396,7 +396,7 @@ def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> No
     assert again(read(served)[0])[0] == served
 
 
-def test_options_say_what_edges_do_and_whether_osm_is_written() -> None:
+def test_options_set_edge_action_and_osm_tags() -> None:
     options = formats.write_options(
         FORMAT, {"action": "NavigateToPose", "action_type": "nav2_msgs/NavigateToPose", "osm": "true", "pointset": "no"}
     )
@@ -411,12 +411,12 @@ def test_options_say_what_edges_do_and_whether_osm_is_written() -> None:
     assert back.properties[back.index()["n10"]]["osm"] == {"tags": {"a": "b"}}
 
 
-def test_places_on_earth_need_a_datum() -> None:
+def test_geographic_network_requires_datum() -> None:
     with pytest.raises(MissingDatum):
         write(Layers({NETWORK: from_elsewhere()}))
 
 
-def test_levels_are_joined_at_their_elevation_and_said_so() -> None:
+def test_levels_are_merged_at_their_elevation_and_reported() -> None:
     def level(x: float, z: float | None = None) -> Features:
         place = shapely.Point(x, 0) if z is None else shapely.Point(x, 0, z)
         edge = {"kind": "edge", "source": "A", "target": "B"}
@@ -442,18 +442,18 @@ def test_levels_are_joined_at_their_elevation_and_said_so() -> None:
     assert context.dropped == []
 
 
-def test_a_last_updated_that_is_no_time_is_replaced_and_said_so() -> None:
+def test_invalid_last_updated_is_replaced_with_warning() -> None:
     document = yaml.safe_load(two("A"))
     for value in (0, "yesterday", None, 20220623):
         document["meta"]["last_updated"] = value
         served, context = again(read(yaml.safe_dump(document))[0])
         assert yaml.safe_load(served)["meta"]["last_updated"] == EPOCH
-        assert ("no time" in warnings(context)) == (value is not None)
+        assert ("not a time" in warnings(context)) == (value is not None)
     document["meta"]["last_updated"] = "2022-06-23_13-10-11"
     assert yaml.safe_load(again(read(yaml.safe_dump(document))[0])[0])["meta"]["last_updated"] == "2022-06-23_13-10-11"
 
 
-def test_what_nobody_knows_is_kept_where_it_stood() -> None:
+def test_unknown_members_round_trip_in_place() -> None:
     document = yaml.safe_load(two("A"))
     document["definitions"] = {"default_bt": "<root>\n  <a b='c'/>\n</root>\n", "zz": [[1, [2]], {}, []]}
     document["actions"] = {"navigate_to_pose": {"composable": False}}
@@ -471,7 +471,7 @@ def test_what_nobody_knows_is_kept_where_it_stood() -> None:
     assert served == document
 
 
-def test_nodes_in_the_child_frame_stand_where_the_transformation_puts_them() -> None:
+def test_transformation_moves_nodes_in_child_frame() -> None:
     document = yaml.safe_load(two("A"))
     half = math.sqrt(0.5)
     document["transformation"] = {
@@ -499,7 +499,7 @@ def test_nodes_in_the_child_frame_stand_where_the_transformation_puts_them() -> 
 # --- determinism and round trips -------------------------------------------------------------------------------------
 
 
-def test_the_order_of_items_does_not_matter() -> None:
+def test_written_bytes_are_independent_of_item_order() -> None:
     for path in (SAMPLES / "orchard.tmap2.yaml", OLD):
         part = network(read(path.read_bytes(), path.name)[0])
         served, _ = write(Layers({NETWORK: part}))
@@ -508,7 +508,7 @@ def test_the_order_of_items_does_not_matter() -> None:
         assert write(Layers({NETWORK: part.select(order)}))[0] == served
 
 
-def test_equal_edge_ids_stay_in_one_order() -> None:
+def test_duplicate_edge_ids_keep_their_order() -> None:
     document = yaml.safe_load(two("B", "A"))
     document["nodes"][0]["node"]["edges"] = [
         {"edge_id": "gg", "node": "A", "action": "x"},
@@ -520,7 +520,7 @@ def test_equal_edge_ids_stay_in_one_order() -> None:
     assert again(read(served)[0])[0] == served
 
 
-def test_small_and_large_numbers_are_numbers_for_pyyaml() -> None:
+def test_pyyaml_reads_small_and_large_numbers() -> None:
     rows = [("A", shapely.Point(1e-9, 9999999.123456789), {"kind": "node", "orientation": [1e-20, 0.0, 1.5e-7, 1.0]})]
     served, _ = write(Layers({NETWORK: features(rows, "local")}))
     pose = yaml.safe_load(served)["nodes"][0]["node"]["pose"]
@@ -577,7 +577,7 @@ def plain(top: dict[str, Any]) -> dict[str, Any]:
 
 @settings(max_examples=150, deadline=None)
 @given(networks())
-def test_any_network_comes_back_the_same(top: dict[str, Any]) -> None:
+def test_any_network_round_trips(top: dict[str, Any]) -> None:
     text = yaml.safe_dump(top, allow_unicode=True)
     layers, _ = read(text)
     served, context = again(layers)
@@ -620,7 +620,7 @@ def broken(change: Callable[[dict[str, Any]], Any]) -> str:
         (lambda t: t.update(transformation={"child": "c", "translation": {"x": "a"}}), "transformation.translation.x"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named(change: Callable[[dict[str, Any]], Any], where: str) -> None:
+def test_invalid_file_raises_unreadable_file_with_location(change: Callable[[dict[str, Any]], Any], where: str) -> None:
     with pytest.raises(UnreadableFile) as caught:
         read(broken(change))
     assert caught.value.problems[0].where == where
@@ -628,7 +628,7 @@ def test_what_is_wrong_is_named(change: Callable[[dict[str, Any]], Any], where: 
 
 
 @pytest.mark.parametrize("value", [".nan", ".inf", "1.0e+999"])
-def test_positions_that_are_not_finite_are_refused_with_their_line(value: str) -> None:
+def test_non_finite_positions_raise_unreadable_file_with_line(value: str) -> None:
     text = two("A").replace("x: 5.0", f"x: {value}")
     with pytest.raises(UnreadableFile) as caught:
         read(text)
@@ -638,7 +638,7 @@ def test_positions_that_are_not_finite_are_refused_with_their_line(value: str) -
 @pytest.mark.parametrize(
     "data", [b"", b"nodes", b"[]", b"- 1", b"nodes: [", b"\x00\x01", b"a: *b", b"nodes: [{node: *x}]"]
 )
-def test_other_bytes_are_refused_or_empty(data: bytes) -> None:
+def test_other_bytes_are_rejected_or_empty(data: bytes) -> None:
     if data == b"[]":
         assert len(network(read(data)[0])) == 0
         return
@@ -646,7 +646,7 @@ def test_other_bytes_are_refused_or_empty(data: bytes) -> None:
         read(data)
 
 
-def test_truncated_and_mutated_files_are_read_or_refused() -> None:
+def test_truncated_and_mutated_files_are_read_or_rejected() -> None:
     data = (SAMPLES / "orchard.tmap2.yaml").read_bytes()
     dice = random.Random(11)
     for k in range(300):
@@ -662,7 +662,7 @@ def test_truncated_and_mutated_files_are_read_or_refused() -> None:
             yaml.safe_load(again(layers)[0])
 
 
-def test_limits_hold() -> None:
+def test_limits_are_enforced() -> None:
     data = (SAMPLES / "orchard.tmap2.yaml").read_bytes()
     with pytest.raises(BadUpload):
         read(data, limits=Limits(features=3))
@@ -670,7 +670,7 @@ def test_limits_hold() -> None:
         read(data, limits=Limits(yaml_nodes=20))
 
 
-def test_layers_nobody_wants_are_not_read() -> None:
+def test_unwanted_layers_are_not_read() -> None:
     assert read(b"not yaml: [", requested_layers=frozenset({"location"}))[0].parts == {}
 
 
@@ -687,5 +687,5 @@ def test_layers_nobody_wants_are_not_read() -> None:
         ("x.kml", b"metric_map: a\nnodes: []\n", False),
     ],
 )
-def test_what_is_taken_for_a_network(name: str, data: bytes, is_one: bool) -> None:
+def test_detect_recognises_networks(name: str, data: bytes, is_one: bool) -> None:
     assert FORMAT.detect(name, data) is is_one

@@ -111,8 +111,8 @@ ROWS = [
     Row("kml/orchard.kml", "<Point>", INCLUDE, warned="XInclude"),
     Row("osm/quarter.osm", "<osm ", "<?xml-stylesheet href='x.xsl'?><osm ", warned="'<?xml-stylesheet'"),
     Row("gazebo/cart/cart/model.sdf", r"<radius>[\d.]+", "<radius>0", warned="the shape has no extent"),
-    Row("gazebo/yard/worlds/yard.world", r"<static>\w+", "<static>maybe", warned="taken for false"),
-    Row("gazebo/cart/cart/model.sdf", r"<pose>(\S+ \S+ \S+) \S+", r"<pose>\1 90", warned="are its angles in radians?"),
+    Row("gazebo/yard/worlds/yard.world", r"<static>\w+", "<static>maybe", warned="it is read as false"),
+    Row("gazebo/cart/cart/model.sdf", r"<pose>(\S+ \S+ \S+) \S+", r"<pose>\1 90", warned="angles must be in radians"),
     Row(
         "lanelet2/local/lanelet2_map.osm",
         r'k="speed_limit" v="[^"]*',
@@ -178,7 +178,7 @@ def bad_binaries() -> list[tuple[str, Callable[[bytes], bytes], str]]:
         return data[:at] + struct.pack("<H", 65281) + data[at + 2 :]
 
     return [
-        ("octomap/shelf.ot", infinite, "no finite number"),
+        ("octomap/shelf.ot", infinite, "must be a finite number"),
         ("satellite/heights.tif", many_bands, "the limit is 1024"),
         ("satellite/orchard.tif", unknown_code, "EPSG:9999"),
     ]

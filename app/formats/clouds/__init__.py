@@ -1,4 +1,4 @@
-"""Point clouds, each format of which can be made from the file of any other: LAS and LAZ, PCD, PLY."""
+"""Point cloud formats, convertible into each other: LAS and LAZ, PCD, PLY."""
 
 from app.formats.clouds import las, pcd, ply
 

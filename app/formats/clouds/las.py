@@ -1,8 +1,8 @@
 """LAS and LAZ point clouds ↔ voxels.
 
-Read: the voxels that the points lie in, and the file beside them (see ``clouds.points``); the file's CRS places them.
-Written: the very file that the voxels were made of; the points of another cloud format's; else the centres of the
-occupied voxels. What is written anew is LAS 1.4 in steps of a millimetre.
+Reading gives the voxels of the points, and the file as a resource (see ``clouds.points``), placed by the file's CRS.
+Writing gives the file that the voxels came from; the points of another cloud format; else the centres of the occupied
+voxels. New files are LAS 1.4 in steps of a millimetre.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ ENDINGS = ("las", "laz")
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """Which cloud, and how it is written."""
+    """Selection of the cloud, and its encoding."""
 
     name: str | None = parameter(None, points.NAME_DOC)
     level: str | None = parameter(None, points.LEVEL_DOC)
-    kind: Literal["las", "laz"] | None = parameter(None, "laz is compressed; default: as uploaded, else las")
+    kind: Literal["las", "laz"] | None = parameter(None, "las, or laz (compressed); default: as uploaded, else las")
     frame: Literal["source", "local"] | None = parameter(None, points.FRAME_DOC)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """One voxel map and its cloud. Raises UnreadableFile or TooLarge."""
+    """Read one voxel map and its cloud. Raises UnreadableFile or TooLarge."""
     main = context.main or next(iter(files))
     compressed = len(files[main]) > 104 and bool(files[main][104] & 0xC0)
     return points.read(files, context, "laz" if compressed else "las", las_codec.parse)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.las`` or ``map.laz`` (``<name>.las`` where a name is asked for).
+    """Write ``map.las`` or ``map.laz`` (``<name>.las`` if a name is requested).
 
     Raises MissingLayer, NotFound, Ambiguous or Invalid.
     """
@@ -52,9 +52,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     cloud = source.cloud()
     if source.form not in ENDINGS:
         if cloud.height > 1:
-            context.drop("rows and columns of the cloud", 1, "LAS points are one list: ask for pcd")
+            context.drop("rows and columns of the cloud", 1, "LAS points are one list: request pcd instead")
         context.drop(
-            "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "LAS has no place for it: ask for pcd"
+            "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "LAS cannot store it: request pcd instead"
         )
         for noun, count in cloud.further.items():
             context.drop(noun, count, "LAS has points only")
@@ -62,12 +62,12 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
+    """Choose the named voxel map, else ``map``, else the only one, and its cloud."""
     return points.choose(keys, options.name, options.level)
 
 
 def options_from_filename(name: str) -> dict[str, str]:
-    """``map.laz`` asks for compression; ``lab.las`` for the voxel map ``lab``, too."""
+    """Select compression for ``map.laz``, and the voxel map ``lab`` for ``lab.las``."""
     stem, _, end = name.rpartition(".")
     if not stem or end not in ENDINGS:
         return {}

@@ -1,8 +1,7 @@
-"""LAS and LAZ files as clouds of points, through laspy and lazrs.
+"""LAS and LAZ files as point clouds, read and written with laspy and lazrs.
 
-What the header says is held against the file's size before anything is allocated. Coordinates are whole numbers times a
-scale plus an offset, so they come out as float64; a dimension of zeros only says nothing and is left out. Source: ASPRS
-LAS 1.4 R15.
+The header is checked against the file's size before anything is allocated. Coordinates are integers times a scale plus
+an offset and become float64; dimensions with only zeros are skipped. Source: ASPRS LAS 1.4 R15.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from app.formats.clouds.points import AXES, RGB, Cloud, check_count, unreadable_
 
 MAGIC = b"LASF"
 SCALE = 0.001
-"""Metres: the usual step of coordinates, and ours."""
+"""Default step of coordinates, in metres."""
 
 HEADER = struct.Struct("<4s20xBB64x4xHIIBHI")
 """Signature, version, header size, offset to the points, VLRs, point format, bytes a point, points (until 1.3)."""
@@ -32,66 +31,70 @@ HEADER = struct.Struct("<4s20xBB64x4xHIIBHI")
 VLR_BYTES, EVLR_BYTES = 54, 60
 LASZIP = b"laszip encoded"
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers of the items of points since 1.4: coordinates and the like, colours, near infrared, waveforms."""
+"""Number of layers by item type of points since 1.4: base item, colours, near infrared, waveforms."""
 
 EXTRA_BYTES = 14
-"""An item of as many layers as it has bytes."""
+"""Item type with one layer per byte."""
 
 FILES = re.compile(r"EXTENSION|PARAMETERFILE|GRIDS", re.IGNORECASE)
-"""In WKT: words by which PROJ would open a file."""
+"""WKT keywords that make PROJ open files."""
 
 SOFTWARE = "Fleet Map Server"
 NO_DATE = slice(90, 94)
-"""Day and year of the header: 0 is unknown. A date of today would make other bytes tomorrow."""
+"""Creation day and year in the header, set to 0 (unknown): the current date would change the bytes each day."""
 
 INTEGER_DIMENSIONS = {"intensity": 65535, "classification": 255, "user_data": 255, "point_source_id": 65535}
-"""Dimensions of every point that other formats' columns of the same name go to, with their largest value."""
+"""Standard dimensions that take other formats' columns of the same name, with their maximum value."""
 
 
 def detect(name: str, data: bytes) -> bool:
-    """The signature, and a version that exists."""
+    """Detect the signature and an existing version."""
     del name
     return data.startswith(MAGIC) and len(data) > 26 and data[24] == 1 and data[25] <= 4
 
 
 def parse(data: bytes, context: ReadContext) -> Cloud:
-    """All points. Raises UnreadableFile or TooLarge."""
+    """Parse all points. Raises UnreadableFile or TooLarge."""
     import laspy
 
     count = _check(data, context)
     with _convert_errors():
         las = laspy.read(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs)
     if len(las.points) != count:
-        raise unreadable_error(f"the header says {count} points, the file has {len(las.points)}", where="header")
+        raise unreadable_error(
+            f"the header declares {count} points, but the file has {len(las.points)}", where="header"
+        )
     return _cloud(las, count, context)
 
 
 def _check(data: bytes, context: ReadContext) -> int:
-    """The number of points, after the header is held against limits and the file's size."""
+    """Check the header against the limits and the file's size; return the number of points."""
     if len(data) < 227:
         raise unreadable_error("the file ends within the header", where="header")
     magic, major, minor, size, start, vlrs, form, record, count = HEADER.unpack_from(data)
     if magic != MAGIC or major != 1 or minor > 4:
-        raise unreadable_error(f"only LAS 1.0 to 1.4 can be read, this is {magic!r} {major}.{minor}", where="header")
+        raise unreadable_error(f"unsupported version {magic!r} {major}.{minor}: must be LAS 1.0 to 1.4", where="header")
     need = {3: 235, 4: 375}.get(minor, 227)
     if size < need or start < size or start > len(data):
         raise unreadable_error("the sizes in the header contradict each other", where="header")
     if vlrs * VLR_BYTES > start - size:
-        raise unreadable_error(f"{vlrs} records do not go before the points", where="header")
+        raise unreadable_error(f"{vlrs} variable length records do not fit before the points", where="header")
     evlrs = 0
     if minor == 4:
         first, evlrs, count = struct.unpack_from("<QIQ", data, 235)
         if evlrs and (first > len(data) or evlrs * EVLR_BYTES > len(data) - first):
-            raise unreadable_error(f"{evlrs} records do not go after the points", where="header")
+            raise unreadable_error(f"{evlrs} extended records do not fit after the points", where="header")
     if any(not math.isfinite(v) for v in struct.unpack_from("<6d", data, 131)):
         raise unreadable_error("scales and offsets must be finite numbers", where="header")
     if form & 0x3F > 10:
-        raise unreadable_error(f"there is no point format {form & 0x3F}", where="header")
+        raise unreadable_error(f"unknown point format {form & 0x3F}", where="header")
     check_count(count, context)
     if form & 0xC0 == 0:
         if start + count * record > len(data):
             have = len(data) - start
-            raise unreadable_error(f"{count} points of {record} bytes take {count * record} bytes, the file has {have}")
+            raise unreadable_error(
+                f"{count} points of {record} bytes need {count * record} bytes, but the file has {have}"
+            )
     elif count:
         context.limits.check_unpacked(count * record, len(data) - start)
         _check_chunks(data, start, size, vlrs, count, record)
@@ -99,7 +102,7 @@ def _check(data: bytes, context: ReadContext) -> int:
 
 
 def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, record: int) -> None:
-    """Of compressed points: the record that tells their items, and the table of chunks, allocated as it says."""
+    """Check the LASzip record and the chunk table of compressed points, whose sizes are allocated as declared."""
     position = size
     for _ in range(vlrs):
         user, number, length = struct.unpack_from("<2x16sHH", data, position)
@@ -108,7 +111,7 @@ def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, rec
             break
         position += length
     else:
-        raise unreadable_error("the file is compressed and has no LASzip record", where="header")
+        raise unreadable_error("the file is compressed but has no LASzip record", where="header")
     if length < 34 or position + length > start:
         raise unreadable_error("the LASzip record ends too early", where="laszip")
     items = struct.unpack_from("<H", data, position + 32)[0]
@@ -118,15 +121,15 @@ def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, rec
     total = sum(bytes_ for _, bytes_ in kinds)
     if total != record:
         raise unreadable_error(
-            f"the LASzip record tells points of {total} bytes, the header of {record}", where="laszip"
+            f"the LASzip record declares points of {total} bytes, the header of {record}", where="laszip"
         )
     if len(data) - start < 8:
         raise unreadable_error("the compressed points are missing", where="laszip")
     (table,) = struct.unpack_from("<q", data, start)
-    if table == -1:  # a writer that could not go back has put the offset at the very end
+    if table == -1:  # a streaming writer has put the offset at the end
         (table,) = struct.unpack_from("<q", data, len(data) - 8)
     if not start + 8 <= table <= len(data) - 8:
-        raise unreadable_error("the table of chunks lies outside of the file", where="laszip")
+        raise unreadable_error("the chunk table is outside the file", where="laszip")
     if struct.unpack_from("<I", data, table + 4)[0] > count:
         raise unreadable_error("there are more chunks than points", where="laszip")
     if any(kind in LAYERS or kind == EXTRA_BYTES for kind, _ in kinds):
@@ -134,7 +137,7 @@ def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, rec
 
 
 def _check_layers(data: bytes, start: int, table: int, laszip: bytes, kinds: list[tuple[int, int]]) -> None:
-    """Of the point formats of 1.4: each chunk tells the sizes of its layers, which are allocated as it says."""
+    """Check the layer sizes in each chunk of 1.4 point formats, which are allocated as declared."""
     import lazrs
 
     stream = io.BytesIO(data)
@@ -146,7 +149,7 @@ def _check_layers(data: bytes, start: int, table: int, laszip: bytes, kinds: lis
     position = start + 8
     for _, size in chunks:
         if size < first + 4 * layers or position + size > table:
-            raise unreadable_error("a chunk ends beyond the points, or before it begins", where="laszip")
+            raise unreadable_error("a chunk ends beyond the points or before its start", where="laszip")
         if first + 4 * layers + sum(struct.unpack_from(f"<{layers}I", data, position + first)) > size:
             raise unreadable_error("the layers of a chunk are larger than the chunk", where="laszip")
         position += size
@@ -154,7 +157,7 @@ def _check_layers(data: bytes, start: int, table: int, laszip: bytes, kinds: lis
 
 @contextmanager
 def _convert_errors() -> Iterator[None]:
-    """Errors of laspy and lazrs as UnreadableFile. lazrs panics on some damage: an exception of Rust, and no other."""
+    """Convert errors of laspy and lazrs to UnreadableFile, including Rust panics of lazrs on damaged files."""
     import laspy
     import lazrs
 
@@ -182,18 +185,18 @@ def _cloud(las: Any, count: int, context: ReadContext) -> Cloud:
             columns[name if name not in columns else f"{name}_"] = column
     crs = _crs(las.header)
     if crs is not None and (len(crs) > 2**16 or FILES.search(crs)):
-        context.warn("the coordinate reference system is too long or names files of its own: left out, say crs=EPSG:…")
+        context.warn("the coordinate reference system is too long or refers to files; it is ignored, set crs=EPSG:…")
         crs = None
     return Cloud(columns, count, crs=crs)
 
 
 def _crs(header: Any) -> str | None:
-    """The coordinate reference system: WKT, else the code that GeoTIFF keys name; None where there is none."""
+    """Return the coordinate reference system: WKT, else the code of the GeoTIFF keys, else None."""
     records = [*header.vlrs, *(header.evlrs or ())]
     for record in records:
         if record.user_id == "LASF_Projection" and record.record_id == 2112:
             text = str(getattr(record, "string", "")).strip("\0 ")
-            if re.match(r"[A-Z_0-9]{4,40}\[", text):  # and nothing else that PROJ takes for a CRS
+            if re.match(r"[A-Z_0-9]{4,40}\[", text):  # WKT only, none of PROJ's other CRS notations
                 return text
     for record in records:
         if record.user_id == "LASF_Projection" and record.record_id == 34735:
@@ -206,7 +209,7 @@ def _crs(header: Any) -> str | None:
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def recompress(data: bytes, compress: bool) -> bytes:
-    """An uploaded file, compressed or not, with all that it holds."""
+    """Compress or decompress an uploaded file without loss."""
     import laspy
 
     with _convert_errors():
@@ -219,8 +222,11 @@ def recompress(data: bytes, compress: bool) -> bytes:
 
 
 def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: bool) -> bytes:
-    """LAS 1.4, point format 7 with colours and 6 without, in steps of a millimetre; what LAS has no dimension for
-    becomes extra bytes. columns: as ``plain`` gives them. Points without finite coordinates are left out."""
+    """Encode LAS 1.4, point format 7 with colours and 6 without, in steps of a millimetre.
+
+    columns: as returned by ``plain``; columns without a LAS dimension become extra bytes. Points without finite
+    coordinates are dropped.
+    """
     import laspy
 
     places = np.stack([columns[axis].astype(np.float64) for axis in AXES], axis=1)
@@ -240,7 +246,7 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
         scale *= 10
     header.scales = np.full(3, scale)
     if scale > SCALE:
-        context.warn(f"the cloud is so large that its points are written in steps of {scale:g} m")
+        context.warn(f"the cloud exceeds the range of millimetre steps; its points are written in steps of {scale:g} m")
     extra: dict[str, NDArray[Any]] = {}
     standard: dict[str, NDArray[Any]] = {}
     for name, column in columns.items():
@@ -275,7 +281,7 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
 
 
 def _is_within(column: NDArray[Any], maximum: int) -> bool:
-    """Whether all values are whole numbers from 0 to this."""
+    """Check that all values are integers from 0 to ``maximum``."""
     if not len(column):
         return True
     if column.dtype.kind == "f" and not bool((np.isfinite(column) & (column == np.floor(column))).all()):
@@ -284,7 +290,7 @@ def _is_within(column: NDArray[Any], maximum: int) -> bool:
 
 
 def _free_name(name: str, taken: set[str]) -> str:
-    """A name for extra bytes: at most 32 bytes of ASCII, and not a dimension's that is there."""
+    """Return a name for extra bytes: at most 32 bytes of ASCII, and not an existing dimension."""
     stem = re.sub(r"[^ -~]", "_", name)[:28] or "value"
     out, k = stem, 2
     while out.lower() in taken:

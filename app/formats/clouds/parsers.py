@@ -1,4 +1,4 @@
-"""How each kind of cloud file is read, by its ending: any of them may be what a wanted cloud is made from."""
+"""Parsers of cloud files by extension: any of them can be the source of a requested cloud."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """PCD point clouds (Point Cloud Library) ↔ voxels.
 
-Read: the voxels that the points lie in, and the file beside them (see ``clouds.points``). Written: the very file that
-the voxels were made of; the points of another cloud format's; else the centres of the occupied voxels, as float32.
+Reading gives the voxels of the points, and the file as a resource (see ``clouds.points``). Writing gives the file that
+the voxels came from; the points of another cloud format; else the centres of the occupied voxels, as float32.
 """
 
 from __future__ import annotations
@@ -21,23 +21,26 @@ NAME = "pcd"
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """Which cloud, and how it is written."""
+    """Selection of the cloud, and its encoding."""
 
     name: str | None = parameter(None, points.NAME_DOC)
     level: str | None = parameter(None, points.LEVEL_DOC)
     data: Literal["ascii", "binary", "binary_compressed"] | None = parameter(
-        None, "how points are encoded; default: as uploaded, else binary"
+        None, "encoding of the points; default: as uploaded, else binary"
     )
     frame: Literal["source", "local"] | None = parameter(None, points.FRAME_DOC)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """One voxel map and its cloud. Raises UnreadableFile (with line and word, or the reason) or TooLarge."""
+    """Read one voxel map and its cloud. Raises UnreadableFile (with line and keyword, or the reason) or TooLarge."""
     return points.read(files, context, NAME, pcd_codec.parse)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.pcd`` (``<name>.pcd`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
+    """Write ``map.pcd`` (``<name>.pcd`` if a name is requested).
+
+    Raises MissingLayer, NotFound, Ambiguous or Invalid.
+    """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
     source = points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
     name = points.file_name(options.name, NAME)
@@ -52,7 +55,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
+    """Choose the named voxel map, else ``map``, else the only one, and its cloud."""
     return points.choose(keys, options.name, options.level)
 
 

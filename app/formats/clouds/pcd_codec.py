@@ -1,9 +1,9 @@
-"""PCD files as clouds of points: the text header, and ``ascii``, ``binary`` or ``binary_compressed`` data.
+"""PCD files as point clouds: text header, and ``ascii``, ``binary`` or ``binary_compressed`` data.
 
 Header lines ``VERSION``, ``FIELDS`` (``COLUMNS`` before 0.6), ``SIZE``, ``TYPE`` (I, U, F), ``COUNT``, ``WIDTH``,
 ``HEIGHT``, ``VIEWPOINT``, ``POINTS``, ``DATA``. Numbers are little endian. A field ``_`` is padding. Compressed data:
-uint32 compressed and unfolded size, then LZF of all values of the first field, then of the second …; PCL leaves padding
-out there, others do not. Source: PCL's pcd_io.cpp and the format's documentation.
+uint32 compressed and uncompressed size, then LZF of all values of the first field, then of the second …; PCL omits
+padding there, others do not. Source: PCL's pcd_io.cpp and the format's documentation.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _TYPES |= {"F4": "<f4", "F8": "<f8"}
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A header that starts with a version or fields, after comments, and tells what data follows."""
+    """Detect a header that starts with a version or fields, after comments, and declares its data."""
     del name
     head = data[:HEADER_BYTES]
     return START.match(head) is not None and re.search(rb"^[ \t]*DATA[ \t]", head, re.MULTILINE) is not None
@@ -52,7 +52,7 @@ def detect(name: str, data: bytes) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A field of the header. position: of its column among those of text rows."""
+    """Field of the header. position: index of its first column in text rows."""
 
     name: str
     dtype: np.dtype[Any]
@@ -72,13 +72,13 @@ class _Header:
 
 
 def parse(data: bytes, context: ReadContext) -> Cloud:
-    """All points. Raises UnreadableFile (line and word of the header, or the reason) or TooLarge."""
+    """Parse all points. Raises UnreadableFile (line and keyword of the header, or the reason) or TooLarge."""
     header = _header(data, context)
     count = header.width * header.height
     check_count(count, context)
     record = sum(f.dtype.itemsize * f.count for f in header.fields)
     if record > RECORD_BYTES:
-        raise unreadable_error(f"a point takes {record} bytes; at most {RECORD_BYTES} can be read", where="SIZE")
+        raise unreadable_error(f"a point has {record} bytes: the maximum is {RECORD_BYTES}", where="SIZE")
     if header.data == "ascii":
         columns = _from_text(data, header, count, context)
     elif header.data == "binary":
@@ -96,7 +96,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
     while "DATA" not in entries:
         end = data.find(b"\n", position, HEADER_BYTES)
         if end < 0:
-            raise unreadable_error("the header does not end: the line DATA is missing", number + 1, "DATA")
+            raise unreadable_error("incomplete header: the line DATA is missing", number + 1, "DATA")
         number += 1
         line, position = data[position:end].decode("utf-8", "replace").strip(), end + 1
         if line.startswith("#"):
@@ -106,20 +106,20 @@ def _header(data: bytes, context: ReadContext) -> _Header:
         if key in WORDS:
             entries[key] = (values, number)
         elif key:
-            context.warn(f"unknown word {key[:40]!r} in the header: left out", line=number, where=key[:40])
+            context.warn(f"unknown keyword {key[:40]!r} in the header; it is ignored", line=number, where=key[:40])
     for key in ("SIZE", "TYPE", "WIDTH"):
         if key not in entries:
-            raise unreadable_error(f"the header does not tell {key}", where=key)
+            raise unreadable_error(f"the header has no {key}", where=key)
     fields = _fields(entries)
     width = _integer(entries, "WIDTH")
     height = _integer(entries, "HEIGHT") if "HEIGHT" in entries else 1
     if "POINTS" in entries and _integer(entries, "POINTS") != width * height:
-        reason = f"POINTS is {_integer(entries, 'POINTS')}, but WIDTH times HEIGHT is {width * height}"
+        reason = f"POINTS is {_integer(entries, 'POINTS')}, but WIDTH × HEIGHT is {width * height}"
         raise unreadable_error(reason, entries["POINTS"][1], "POINTS")
     (kind, *_), line_number = entries["DATA"][0] or [""], entries["DATA"][1]
     data_kind = next((k for k in KINDS if k == kind), None)
     if data_kind is None:
-        raise unreadable_error(f"DATA must be one of {', '.join(KINDS)}, got {kind[:40]!r}", line_number, "DATA")
+        raise unreadable_error(f"DATA must be one of {', '.join(KINDS)}, not {kind[:40]!r}", line_number, "DATA")
     user_comments = [c for c in comments if not c.startswith("# .PCD")]
     return _Header(fields, width, height, _viewpoint(entries), tuple(user_comments), data_kind, position, number)
 
@@ -127,7 +127,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
 def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
     key = "FIELDS" if "FIELDS" in entries else "COLUMNS"
     if key not in entries:
-        raise unreadable_error("the header does not tell FIELDS", where="FIELDS")
+        raise unreadable_error("the header has no FIELDS", where="FIELDS")
     names, line = entries[key]
     counts, count_line = entries.get("COUNT", (["1"] * len(names), line))
     (sizes, size_line), (types, type_line) = entries["SIZE"], entries["TYPE"]
@@ -139,15 +139,13 @@ def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         dtype = _TYPES.get(f"{kind}{size}")
         if dtype is None:
-            raise unreadable_error(
-                f"field {name[:40]}: there is no type {kind[:8]} of {size[:8]} bytes", type_line, "TYPE"
-            )
+            raise unreadable_error(f"field {name[:40]}: unknown type {kind[:8]} of {size[:8]} bytes", type_line, "TYPE")
         if not re.fullmatch(r"[1-9][0-9]{0,4}", count):
             raise unreadable_error(
-                f"field {name[:40]}: COUNT must be a number from 1 to 99999, got {count[:8]!r}", count_line, "COUNT"
+                f"field {name[:40]}: COUNT must be a number from 1 to 99999, not {count[:8]!r}", count_line, "COUNT"
             )
         if name != PADDING and name in seen:
-            raise unreadable_error(f"two fields are called {name[:40]!r}", line, key)
+            raise unreadable_error(f"duplicate field {name[:40]!r}", line, key)
         seen.add(name)
         out.append(_Field(name, np.dtype(dtype), int(count)))
     return tuple(out)
@@ -156,7 +154,7 @@ def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
 def _integer(entries: Mapping[str, tuple[list[str], int]], key: str) -> int:
     values, line = entries[key]
     if len(values) != 1 or not re.fullmatch(r"[0-9]{1,12}", values[0]):
-        raise unreadable_error(f"{key} must be a whole number, got {' '.join(values)[:40]!r}", line, key)
+        raise unreadable_error(f"{key} must be an integer, not {' '.join(values)[:40]!r}", line, key)
     return int(values[0])
 
 
@@ -166,7 +164,7 @@ def _viewpoint(entries: Mapping[str, tuple[list[str], int]]) -> tuple[float, ...
     values, line = entries["VIEWPOINT"]
     pattern = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
     if len(values) != 7 or not all(re.fullmatch(pattern, v, re.ASCII) for v in values):
-        raise unreadable_error(f"VIEWPOINT must be seven numbers, got {' '.join(values)[:80]!r}", line, "VIEWPOINT")
+        raise unreadable_error(f"VIEWPOINT must be seven numbers, not {' '.join(values)[:80]!r}", line, "VIEWPOINT")
     numbers = tuple(float(v) + 0.0 for v in values)
     if not all(map(math.isfinite, numbers)):
         raise unreadable_error("VIEWPOINT must be seven finite numbers", line, "VIEWPOINT")
@@ -184,12 +182,12 @@ def _columns(rows: NDArray[Any], fields: tuple[_Field, ...]) -> dict[str, NDArra
 def _from_text(data: bytes, header: _Header, count: int, context: ReadContext) -> dict[str, NDArray[Any]]:
     if len(data) - header.body > context.limits.text_bytes:
         raise TooLarge(
-            f"the points take {len(data) - header.body} bytes of text; the limit is {context.limits.text_bytes}"
+            f"the points have {len(data) - header.body} bytes of text; the limit is {context.limits.text_bytes}"
         )
     flat = np.dtype([(f"{k}.{j}", f.dtype) for k, f in enumerate(header.fields) for j in range(f.count)])
     rows = table(data[header.body :], flat, count, header.lines + 1)
     if len(rows) > count:
-        context.warn(f"the header says {count} points and more rows follow: left out", where="POINTS")
+        context.warn(f"more rows follow the {count} points of the header; they are ignored", where="POINTS")
     return _columns(np.ascontiguousarray(rows[:count]).view(_dtype(header.fields)), header.fields)
 
 
@@ -199,10 +197,10 @@ def _from_binary(
     body_size = len(data) - header.body
     if body_size < count * record:
         raise unreadable_error(
-            f"{count} points of {record} bytes take {count * record} bytes, the file has {body_size}", where="DATA"
+            f"{count} points of {record} bytes need {count * record} bytes, but the file has {body_size}", where="DATA"
         )
     if body_size > count * record:
-        context.warn(f"{body_size - count * record} bytes follow after the last point", where="DATA")
+        context.warn(f"{body_size - count * record} bytes follow the last point; they are ignored", where="DATA")
     return _columns(np.frombuffer(data, _dtype(header.fields), count, header.body), header.fields)
 
 
@@ -218,13 +216,11 @@ def _from_compressed(data: bytes, header: _Header, count: int, context: ReadCont
         None,
     )
     if fields is None:
-        raise unreadable_error(
-            f"{count} points do not take the {size} bytes that the compressed data says", where="DATA"
-        )
+        raise unreadable_error(f"{count} points do not match the uncompressed size of {size} bytes", where="DATA")
     start = header.body + 8
     if len(data) - start < packed:
         raise unreadable_error(
-            f"the compressed data has {len(data) - start} bytes, the file says {packed}", where="DATA"
+            f"the compressed data has {len(data) - start} bytes, but the file declares {packed}", where="DATA"
         )
     context.limits.check_unpacked(size, packed)
     try:
@@ -243,9 +239,9 @@ def _from_compressed(data: bytes, header: _Header, count: int, context: ReadCont
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def pack(cloud: Cloud, kind: Data) -> bytes:
-    """A PCD of version 0.7."""
+    """Encode a PCD of version 0.7."""
     columns = {name: np.ascontiguousarray(c, c.dtype.newbyteorder("<")) for name, c in cloud.columns.items()}
-    if kind == "ascii":  # packed colours with an alpha of 255 are no number as floats; PCL writes them so, too
+    if kind == "ascii":  # packed colours with alpha 255 are NaN as floats; PCL writes integers, too
         columns |= {
             name: c.view("<u4") for name, c in columns.items() if name in ("rgb", "rgba") and c.dtype == np.float32
         }
@@ -283,7 +279,7 @@ def _body(columns: Mapping[str, NDArray[Any]], n: int, kind: Data) -> bytes:
 
 
 def text_rows(columns: list[NDArray[Any]], n: int) -> bytes:
-    """Rows of the shortest texts that read back as the same values, a few thousand at a time."""
+    """Format rows as the shortest texts that read back as the same values, a few thousand at a time."""
     out = []
     for start in range(0, n, 2**14):
         texts = [
@@ -295,7 +291,7 @@ def text_rows(columns: list[NDArray[Any]], n: int) -> bytes:
 
 
 def add_padding(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Columns under common names as PCL calls them: normals ``normal_x`` …, colours packed into one ``rgb``."""
+    """Rename columns as in PCL: normals to ``normal_x`` …, colours packed into one ``rgb``."""
     out: dict[str, NDArray[Any]] = {}
     names = {"nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
     coloured = all(name in columns for name in RGB)

@@ -1,7 +1,7 @@
-"""PLY point clouds (and meshes, of which the vertices count) ↔ voxels.
+"""PLY point clouds (and the vertices of meshes) ↔ voxels.
 
-Read: the voxels that the vertices lie in, and the file beside them (see ``clouds.points``). Written: the very file that
-the voxels were made of; the points of another cloud format's; else the centres of the occupied voxels, as float32.
+Reading gives the voxels of the vertices, and the file as a resource (see ``clouds.points``). Writing gives the file
+that the voxels came from; the points of another cloud format; else the centres of the occupied voxels, as float32.
 """
 
 from __future__ import annotations
@@ -21,23 +21,26 @@ NAME = "ply"
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """Which cloud, and how it is written."""
+    """Selection of the cloud, and its encoding."""
 
     name: str | None = parameter(None, points.NAME_DOC)
     level: str | None = parameter(None, points.LEVEL_DOC)
     data: Literal["ascii", "binary_little_endian", "binary_big_endian"] | None = parameter(
-        None, "how points are encoded; default: as uploaded, else binary_little_endian"
+        None, "encoding of the points; default: as uploaded, else binary_little_endian"
     )
     frame: Literal["source", "local"] | None = parameter(None, points.FRAME_DOC)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """One voxel map and its cloud. Raises UnreadableFile (with line and word, or the reason) or TooLarge."""
+    """Read one voxel map and its cloud. Raises UnreadableFile (with line and keyword, or the reason) or TooLarge."""
     return points.read(files, context, NAME, ply_codec.parse)
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.ply`` (``<name>.ply`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
+    """Write ``map.ply`` (``<name>.ply`` if a name is requested).
+
+    Raises MissingLayer, NotFound, Ambiguous or Invalid.
+    """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
     source = points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
     name = points.file_name(options.name, NAME)
@@ -46,18 +49,18 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     cloud = source.cloud()
     if source.form != NAME:
         if cloud.height > 1:
-            context.drop("rows and columns of the cloud", 1, "a PLY's vertices are one list: ask for pcd")
+            context.drop("rows and columns of the cloud", 1, "PLY vertices are one list: request pcd instead")
         context.drop(
-            "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "PLY has no place for it: ask for pcd"
+            "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "PLY cannot store it: request pcd instead"
         )
         cloud = replace(cloud, columns=points.plain(cloud), comments=())
     for noun, count in cloud.further.items():
-        context.drop(noun, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
+        context.drop(noun, count, "a rewritten PLY has vertices only: omit data= and frame= to get the uploaded file")
     return {name: ply_codec.pack(cloud, options.data or "binary_little_endian")}
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
+    """Choose the named voxel map, else ``map``, else the only one, and its cloud."""
     return points.choose(keys, options.name, options.level)
 
 

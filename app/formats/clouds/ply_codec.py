@@ -1,8 +1,8 @@
-"""PLY files as clouds of points: the text header, and ``ascii`` or binary data of either byte order.
+"""PLY files as point clouds: text header, and ``ascii`` or binary data of either byte order.
 
 ``element <name> <count>`` is followed by its properties: ``property <type> <name>``, or ``property list <type of the
-count> <type> <name>``. The element ``vertex`` is the cloud; others (faces …) are counted and checked to be there.
-Source: Greg Turk's "The PLY Polygon File Format".
+count> <type> <name>``. The element ``vertex`` is the cloud; other elements (faces …) are counted and
+checked for completeness. Source: Greg Turk's "The PLY Polygon File Format".
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _NAMES = {code: name for name, code in list(_TYPES.items())[:8]}
 
 
 def detect(name: str, data: bytes) -> bool:
-    """The magic word in a line of its own, and a format line after it."""
+    """Detect a line with the magic word followed by a format line."""
     del name
     return re.match(rb"ply[ \t]*\r?\n", data[:64]) is not None
 
 
 @dataclass(frozen=True, slots=True)
 class _Property:
-    """count: the type of a list's count, None for a single value."""
+    """Property of an element. count: type of a list's length, None for a single value."""
 
     name: str
     type: str
@@ -62,7 +62,7 @@ class _Element:
         return any(p.count is not None for p in self.properties)
 
     def dtype(self, order: str, sizes: tuple[int, ...] = ()) -> np.dtype[Any]:
-        """A record, its lists with these lengths."""
+        """Return the dtype of a record with lists of these lengths."""
         left = list(sizes)
         columns: list[Any] = []
         for k, p in enumerate(self.properties):
@@ -83,15 +83,15 @@ class _Header:
 
 
 def parse(data: bytes, context: ReadContext) -> Cloud:
-    """All vertices. Raises UnreadableFile (line and word of the header, or the reason) or TooLarge."""
+    """Parse all vertices. Raises UnreadableFile (line and keyword of the header, or the reason) or TooLarge."""
     header = _header(data)
     vertices = [e for e in header.elements if e.name == VERTEX]
     if len(vertices) != 1:
-        raise unreadable_error(f"a PLY needs one element {VERTEX}, this one has {len(vertices)}", where=VERTEX)
+        raise unreadable_error(f"a PLY needs one element {VERTEX}, not {len(vertices)}", where=VERTEX)
     for element in header.elements:
         check_count(element.count, context)
     if vertices[0].lists:
-        reason = "vertices with lists cannot be read: save them with a single value in each property"
+        reason = "vertices with list properties are unsupported: save them with one value per property"
         raise unreadable_error(reason, vertices[0].line, VERTEX)
     columns = (_from_text if header.data == "ascii" else _from_binary)(data, header, context)
     check_columns(columns)
@@ -107,7 +107,7 @@ def _header(data: bytes) -> _Header:
     while True:
         end = data.find(b"\n", position, HEADER_BYTES)
         if end < 0:
-            raise unreadable_error("the header does not end: the line end_header is missing", number + 1, "end_header")
+            raise unreadable_error("incomplete header: the line end_header is missing", number + 1, "end_header")
         number += 1
         line, position = data[position:end].decode("utf-8", "replace").strip(), end + 1
         key, *values = line.split() or [""]
@@ -120,22 +120,24 @@ def _header(data: bytes) -> _Header:
             kind = next((k for k in KINDS if values == [k, "1.0"]), None)
             if kind is None:
                 raise unreadable_error(
-                    f"the format must be one of {', '.join(KINDS)} in version 1.0, got {line[:80]!r}", number
+                    f"the format must be one of {', '.join(KINDS)} in version 1.0, not {line[:80]!r}", number
                 )
         elif key == "element":
             if len(values) != 2 or not re.fullmatch(r"[0-9]{1,12}", values[1]):
-                raise unreadable_error(f"an element has a name and a number, got {line[:80]!r}", number, "element")
+                raise unreadable_error(
+                    f"an element must have a name and a number, not {line[:80]!r}", number, "element"
+                )
             elements.append(_Element(values[0], int(values[1]), [], number))
         elif key == "property":
             if not elements:
-                raise unreadable_error("a property stands before the first element", number, "property")
+                raise unreadable_error("a property precedes the first element", number, "property")
             _add_property(elements[-1], values, line, number)
         elif key == "end_header":
             break
         elif key:
-            raise unreadable_error(f"unknown word {key[:40]!r} in the header", number, key[:40])
+            raise unreadable_error(f"unknown keyword {key[:40]!r} in the header", number, key[:40])
     if kind is None:
-        raise unreadable_error("the header does not tell the format", where="format")
+        raise unreadable_error("the header has no format", where="format")
     return _Header(kind, tuple(elements), tuple(comments), position, number)
 
 
@@ -144,11 +146,13 @@ def _add_property(element: _Element, values: list[str], line: str, number: int) 
     listed = types[:1] == ["list"]
     types = types[1:] if listed else types
     if len(types) != (2 if listed else 1) or any(t not in _TYPES for t in types):
-        raise unreadable_error(f"a property has a known type and a name, got {line[:80]!r}", number, "property")
+        raise unreadable_error(
+            f"a property must have a supported type and a name, not {line[:80]!r}", number, "property"
+        )
     if listed and _TYPES[types[0]][0] == "f":
-        raise unreadable_error(f"the number of a list's values must be whole, got {types[0]}", number, name[:40])
+        raise unreadable_error(f"the length of a list must have an integer type, not {types[0]}", number, name[:40])
     if any(p.name == name for p in element.properties):
-        raise unreadable_error(f"two properties of {element.name[:40]} are called {name[:40]!r}", number, name[:40])
+        raise unreadable_error(f"duplicate property {name[:40]!r} of {element.name[:40]}", number, name[:40])
     if len(element.properties) >= 1000:
         raise unreadable_error("an element has more than 1000 properties", number, element.name[:40])
     element.properties.append(_Property(name, _TYPES[types[-1]], _TYPES[types[0]] if listed else None))
@@ -157,12 +161,12 @@ def _add_property(element: _Element, values: list[str], line: str, number: int) 
 def _from_text(data: bytes, header: _Header, context: ReadContext) -> dict[str, NDArray[Any]]:
     text = data[header.body :]
     if len(text) > context.limits.text_bytes:
-        raise TooLarge(f"the points take {len(text)} bytes of text; the limit is {context.limits.text_bytes}")
+        raise TooLarge(f"the points have {len(text)} bytes of text; the limit is {context.limits.text_bytes}")
     total = sum(e.count for e in header.elements)
     lines = text.count(b"\n") + (not text.endswith(b"\n"))
     if lines < total:
         raise unreadable_error(
-            f"the header says {total} elements, the file has {lines} lines of them", header.lines + 1
+            f"the header declares {total} elements, but the file has {lines} lines of them", header.lines + 1
         )
     before = 0
     for element in header.elements:
@@ -172,7 +176,7 @@ def _from_text(data: bytes, header: _Header, context: ReadContext) -> dict[str, 
     last = header.elements[-1].name == VERTEX
     rows = table(text, element.dtype("<"), element.count, header.lines + 1, before, alone=last)
     if len(rows) > element.count and last:
-        context.warn(f"the header says {element.count} vertices and more rows follow: left out", where=VERTEX)
+        context.warn(f"more rows follow the {element.count} vertices of the header; they are ignored", where=VERTEX)
     return {p.name: rows[f"{k}"][: element.count] for k, p in enumerate(element.properties)}
 
 
@@ -187,24 +191,24 @@ def _from_binary(data: bytes, header: _Header, context: ReadContext) -> dict[str
         dtype = element.dtype(order)
         need = dtype.itemsize * element.count
         if len(data) - position < need:
-            reason = f"{element.count} × {element.name[:40]} take {need} bytes, the file has {len(data) - position}"
+            reason = f"{element.count} × {element.name[:40]} need {need} bytes, but the file has {len(data) - position}"
             raise unreadable_error(reason, element.line, element.name[:40])
         if element.name == VERTEX:
             rows = np.frombuffer(data, dtype, element.count, position)
             columns = {p.name: rows[f"{k}"] for k, p in enumerate(element.properties)}
         position += need
     if position < len(data):
-        context.warn(f"{len(data) - position} bytes follow after the last element")
+        context.warn(f"{len(data) - position} bytes follow the last element; they are ignored")
     return columns
 
 
 def _end_of_lists(data: bytes, start: int, element: _Element, order: str) -> int:
-    """Where an element with lists ends. Equal lengths (triangles) are checked at once, else row by row."""
+    """Find the end of an element with lists. Equal lengths (triangles) are checked at once, else row by row."""
     if not element.count:
         return start
     short = unreadable_error(f"the file ends within {element.name[:40]}", element.line, element.name[:40])
 
-    # For each property: what reads a list's length, the bytes of that length (or of the value), of a list's value.
+    # For each property: reader of a list's length, bytes of that length (or of the value), bytes of a list's value.
     parts = [
         (struct.Struct(order + _CODES[p.count]) if p.count else None, int((p.count or p.type)[1]), int(p.type[1]))
         for p in element.properties
@@ -240,7 +244,7 @@ def _end_of_lists(data: bytes, start: int, element: _Element, order: str) -> int
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def pack(cloud: Cloud, kind: Data) -> bytes:
-    """A PLY with vertices only. 64-bit integers become doubles: PLY has none."""
+    """Encode a PLY with vertices only. 64-bit integers, which PLY lacks, become doubles."""
     order = ">" if kind == "binary_big_endian" else "<"
     columns: dict[str, NDArray[Any]] = {}
     for name, column in _single(cloud.columns).items():
@@ -258,7 +262,7 @@ def pack(cloud: Cloud, kind: Data) -> bytes:
 
 
 def _single(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Names without blanks, each once."""
+    """Make the columns' names unique and free of spaces."""
     out: dict[str, NDArray[Any]] = {}
     for name, column in columns.items():
         ascii_name = re.sub(r"[^!-~]", "_", name)

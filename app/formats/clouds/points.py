@@ -1,14 +1,13 @@
-"""Point clouds and voxels: what ``pcd``, ``ply`` and ``las`` share.
+"""Point clouds and voxels: shared by ``pcd``, ``ply`` and ``las``.
 
-A cloud becomes the voxels that its points lie in, all of them occupied; a voxel's colour is the mean of its points'.
-The file itself is kept beside the voxels, byte for byte, as a resource, and the voxel map says which one it is and of
-which leaves it tells (``properties.points``). So the same format gives the same points back, the other cloud formats
-give them too, and the file is never served for voxels that it did not make: neither after another upload of that name
-nor after a change of the leaves.
+A cloud becomes the occupied voxels that contain its points; a voxel's colour is the mean of its points. The file is
+stored beside the voxels, byte for byte, as a resource; the voxel map refers to it and holds a fingerprint of the leaves
+made from it (``properties.points``). So all cloud formats return the same points, and the file is never exported for
+other voxels: neither after another upload with that name nor after a change of the leaves.
 
-Frame of the voxels: local. Points of a known CRS (a LAS file names its own) come there by the environment's datum;
-others are taken as local metres. A cloud that lies far beyond the octree (UTM coordinates without a CRS) is moved to
-the origin by whole metres, with a warning.
+Frame of the voxels: local. Points with a CRS (a LAS file names its own) are converted with the environment's datum;
+others are read as local metres. A cloud far beyond the octree (UTM coordinates without a CRS) is moved to the origin by
+whole metres, with a warning.
 """
 
 from __future__ import annotations
@@ -35,22 +34,22 @@ from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, expand_leaves, mor
 from app.parameters import parameter
 
 PROPERTY = "points"
-"""Where a voxel map says which file its leaves were made of."""
+"""Property of a voxel map that refers to the source file of its leaves."""
 
 RESOLUTIONS = tuple(digit * 10.0**power for power in range(-2, 4) for digit in (1, 2, 5))[2:]
-"""Metres: 0.05 is the default, the next ones are for clouds that it does not reach around."""
+"""Voxel sizes in metres: 0.05 is the default, the others are for clouds that do not fit into the octree with it."""
 
 FAR_RATIO = 10.0
-"""A cloud lies far away where it is so many times farther from the origin than it is long."""
+"""Distance from the origin, in lengths of the cloud, above which a cloud is far away."""
 
 MAX_METRES = 1e9
-"""Metres: numbers beyond are marks for "no return", not places."""
+"""Maximum coordinate in metres; larger values mark "no return"."""
 
 CHUNK = 2**20
-"""Points that are looked at at once: bounded memory beside the file's own."""
+"""Number of points processed at once, to bound the memory in addition to the file."""
 
 IDENTITY_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-"""The viewpoint of a cloud that says nothing of it: at the origin, not turned."""
+"""Default viewpoint of a cloud: at the origin, not rotated."""
 
 AXES = ("x", "y", "z")
 Array = NDArray[np.float64]
@@ -59,32 +58,32 @@ Offset = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """How points become voxels."""
+    """Conversion of points to voxels."""
 
     resolution: float | None = parameter(
         None,
-        "edge of a voxel; default: 0.05, or the next of 0.1, 0.2, 0.5 … with which the cloud fits into the tree",
+        "edge length of a voxel; default: 0.05, or the first of 0.1, 0.2, 0.5 … that fits the cloud into the octree",
         minimum=1e-3,
         maximum=1e4,
         unit="m",
     )
     origin: tuple[float, float, float] | None = parameter(
-        None, "x,y,z of the file that are the local origin: they are subtracted from every point", unit="m"
+        None, "x,y,z in the file's coordinates that become the local origin; subtracted from every point", unit="m"
     )
     crs: str | None = parameter(
         None,
-        "coordinate reference system of the points, as EPSG:32632; 'local' for local metres whatever the file says; "
-        "default: what the file says, else local metres",
+        "coordinate reference system of the points, for example EPSG:32632; 'local': local metres, ignoring the file; "
+        "default: that of the file, else local metres",
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """n points: named columns in the file's order, float or integer [n] or [n, count]; x, y and z are among them.
+    """Point cloud: named columns in file order, float or integer [n] or [n, count], including x, y and z.
 
     width, height: of an organised cloud, width · height = n; else n and 1. viewpoint: x, y, z and the quaternion w, x,
-    y, z of the sensor. comments: lines of text. further: what else the file holds, by name and count. crs: as the file
-    tells it (a code or WKT).
+    y, z of the sensor. comments: lines of text. further: counts of the file's other elements by name. crs: as in the
+    file (a code or WKT).
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -99,7 +98,7 @@ class Cloud:
         return len(self.columns["x"])
 
     def places(self, start: int, stop: int) -> Array:
-        """Coordinates of some points, metres or as the CRS has them: float64 [m, 3]."""
+        """Return coordinates of a range of points, in metres or in units of the CRS: float64 [m, 3]."""
         return np.stack([self.columns[axis][start:stop].astype(np.float64) for axis in AXES], axis=1)
 
 
@@ -107,18 +106,18 @@ Parse = Callable[[bytes, ReadContext], Cloud]
 
 
 def unreadable_error(reason: str, line: int | None = None, where: str | None = None) -> UnreadableFile:
-    """A file that cannot be read, and where."""
+    """Create the error for an unreadable file, with its location."""
     return UnreadableFile(reason, [Problem(reason, line=line, where=where)])
 
 
 def check_count(count: int, context: ReadContext) -> None:
-    """TooLarge for more points than an upload may have: as many as voxels, of which each point makes one at most."""
+    """Raise TooLarge if there are more points than voxels allowed in an upload: each point gives at most one voxel."""
     if count > context.limits.voxels:
         raise TooLarge(f"the cloud has {count} points; the limit is {context.limits.voxels}")
 
 
 def check_columns(columns: Mapping[str, NDArray[Any]]) -> None:
-    """UnreadableFile where a coordinate is missing."""
+    """Raise UnreadableFile if a coordinate is missing."""
     missing = [axis for axis in AXES if axis not in columns or columns[axis].ndim != 1]
     if missing:
         raise unreadable_error(
@@ -129,35 +128,35 @@ def check_columns(columns: Mapping[str, NDArray[Any]]) -> None:
 def table(
     text: bytes, dtype: np.dtype[Any], rows: int, first_line: int, skip: int = 0, *, alone: bool = True
 ) -> NDArray[Any]:
-    """Rows of numbers separated by blanks: structured [rows].
+    """Parse rows of space-separated numbers to a structured array [rows].
 
-    dtype: packed fields without shapes, a column each. first_line: the text's line in its file, from 1. skip: lines
-    before the rows. alone: nothing else follows, so that one row more is given where there is one. Raises
-    UnreadableFile with the line.
+    dtype: packed fields without shapes, one per column. first_line: the text's line in its file, from 1. skip: lines
+    before the rows. alone: nothing else follows; one additional row is returned if there is one. Raises UnreadableFile
+    with the line.
     """
 
     if not rows:
         return np.empty(0, dtype)
-    if text.count(b"\n", 0, len(text)) + 1 < rows:  # cheaper than to find out row by row
-        raise unreadable_error(f"the header says {rows} points, the file has fewer lines", first_line)
+    if text.count(b"\n", 0, len(text)) + 1 < rows:  # cheaper than parsing row by row
+        raise unreadable_error(f"the header declares {rows} points, but the file has fewer lines", first_line)
     try:
         out = np.loadtxt(io.BytesIO(text), dtype, comments=None, skiprows=skip, max_rows=rows + alone, ndmin=1)
     except (ValueError, OverflowError) as error:
         match = re.search(r"at row (\d+)", str(error))
-        # NumPy counts rows from 0 where a value is wrong, from 1 where there are too many or too few.
+        # NumPy counts rows from 0 for an invalid value, from 1 for too many or too few values.
         line = first_line + skip + int(match[1]) - (" columns " in str(error)) if match else None
         reason = str(error).partition(";")[0][:200]
-        raise unreadable_error(f"a row of numbers cannot be read: {reason}", line) from error
+        raise unreadable_error(f"invalid row of numbers: {reason}", line) from error
     if len(out) < rows:
-        raise unreadable_error(f"the header says {rows} points, the file has {len(out)} rows", first_line)
+        raise unreadable_error(f"the header declares {rows} points, but the file has {len(out)} rows", first_line)
     return np.asarray(out)
 
 
 # --- points -> voxels ---------------------------------------------------------------------------------------------
 def read(files: Files, context: ReadContext, form: str, parse: Parse) -> Layers:
-    """A voxel map, and the file as the resource that belongs to it.
+    """Read a voxel map, and the file as its resource.
 
-    Raises UnreadableFile, TooLarge, or Invalid for a CRS that does not exist.
+    Raises UnreadableFile, TooLarge, or Invalid for an unknown CRS.
     """
     main = context.main or next(iter(files))
     data = files[main]
@@ -167,9 +166,9 @@ def read(files: Files, context: ReadContext, form: str, parse: Parse) -> Layers:
     cloud = parse(data, context)
     name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
     if cloud.viewpoint[3:] != (1.0, 0.0, 0.0, 0.0):
-        context.warn("the VIEWPOINT turns the cloud: it is kept, and the points are taken as they stand")
+        context.warn("the VIEWPOINT is rotated; it is stored but not applied to the points")
     for noun, count in cloud.further.items():
-        context.warn(f"{count} × {noun}: kept with the file, only the points become voxels", where=noun)
+        context.warn(f"{count} × {noun} are stored with the file only; only points become voxels", where=noun)
     voxels, placed, datum = _voxelise(cloud, options, context)
     path = f"{name}.{form}"
     source_properties = {
@@ -197,7 +196,7 @@ def read(files: Files, context: ReadContext, form: str, parse: Parse) -> Layers:
 def _voxelise(
     cloud: Cloud, options: ReadOptions, context: ReadContext
 ) -> tuple[VoxelMap, dict[str, Any], Datum | None]:
-    """The voxels, how the points came to their places, and the datum where the cloud brought one."""
+    """Return the voxels, how the points were placed, and the datum if the cloud sets one."""
     frame, corner = context.frame, None
     local: Array | None = None
     placed: dict[str, Any] = {}
@@ -207,8 +206,8 @@ def _voxelise(
             corner = _corner(earth)
             frame = local_frame(corner)
             context.warn(
-                f"the environment has no datum: the cloud's south-west corner, latitude {corner.latitude!r}, longitude "
-                f"{corner.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
+                f"the environment has no datum; the cloud's south-west corner, latitude {corner.latitude!r}, longitude "
+                f"{corner.longitude!r}, is used: upload a datum.yaml or PATCH the environment to set another"
             )
         local = frame.to_local(earth)
         placed |= {"crs": crs, "datum": frame.datum.as_dict()}
@@ -226,9 +225,11 @@ def _voxelise(
         if len(finite_places):
             low, high = np.minimum(low, finite_places.min(axis=0)), np.maximum(high, finite_places.max(axis=0))
     if finite < n:
-        context.warn(f"{n - finite} of {n} points have no coordinates of a place: kept with the file, no voxels")
+        context.warn(
+            f"{n - finite} of {n} points have no valid coordinates; they are stored with the file and give no voxels"
+        )
     if not finite:
-        context.warn("the cloud has no points with coordinates")
+        context.warn("the cloud has no points with valid coordinates; the voxel map is empty")
         resolution = options.resolution or RESOLUTIONS[0]
         none = np.empty(0, np.uint64)
         return VoxelMap(resolution, np.empty(0, np.uint8), none, np.empty(0, np.float32)), placed, corner
@@ -240,7 +241,7 @@ def _voxelise(
     for places in chunks():
         usable = _usable(places)
         index = np.floor((places[usable] - np.array(shift)) * factor).astype(np.int64)
-        # What lies on the tree's far side by the rounding of a product belongs to its last voxel.
+        # Points on the octree's upper boundary due to rounding belong to its last voxel.
         np.clip(index, -HALF, HALF - 1, out=index)
         codes.append(morton(index[:, 0], index[:, 1], index[:, 2]))
         rows.append(start + np.flatnonzero(usable))
@@ -254,10 +255,10 @@ def _voxelise(
 def _merge_codes(
     code: NDArray[np.uint64], rows: Sequence[NDArray[np.intp]], shade: NDArray[np.uint8] | None
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint8] | None]:
-    """Each code once, ascending, with the mean colour of its points."""
+    """Return unique codes, ascending, with the mean colour of their points."""
     if shade is None:
         code = np.sort(code)
-        return code[np.concatenate([[True], code[1:] != code[:-1]])], None  # np.unique takes a hundred times as long
+        return code[np.concatenate([[True], code[1:] != code[:-1]])], None  # np.unique is 100 times slower
     order = np.argsort(code, kind="stable")
     code = code[order]
     first = np.flatnonzero(np.concatenate([[True], code[1:] != code[:-1]]))
@@ -270,40 +271,40 @@ def _merge_codes(
 
 
 def _to_wgs84(cloud: Cloud, options: ReadOptions, context: ReadContext) -> tuple[str, Array | None]:
-    """The CRS and the points' (longitude, latitude, height), where there is a CRS that is known."""
+    """Return the CRS and the points' (longitude, latitude, height), or None without a supported CRS."""
     crs = options.crs or cloud.crs
     if crs is None or crs == "local" or not len(cloud):
         return "", None
     if options.crs is not None and not re.fullmatch(r"[A-Za-z]{2,10}:[0-9]{1,10}", options.crs):
-        raise Invalid(f"crs must be a code like EPSG:32632, or 'local'; got {options.crs[:80]!r}")
+        raise Invalid(f"crs must be a code like EPSG:32632, or 'local', not {options.crs[:80]!r}")
     try:
         earth = crs_to_wgs84(crs, cloud.places(0, len(cloud)))
     except Invalid as error:
         if options.crs is not None:
             raise
-        context.warn(f"{error.detail}, with crs=…; until then the points are taken as local metres", where="crs")
+        context.warn(f"{error.detail}, with crs=…; until then the points are read as local metres", where="crs")
         return "", None
     if not np.isfinite(earth[:, :2]).all(axis=1).any():
         raise unreadable_error(
-            f"none of the points lies where the coordinate reference system {crs[:80]} has places", where="crs"
+            f"all points are outside the area of the coordinate reference system {crs[:80]}", where="crs"
         )
     return crs, earth
 
 
 def _usable(places: Array) -> NDArray[np.bool_]:
-    """Which points have a place."""
+    """Mark the points with valid coordinates."""
     return np.asarray((np.abs(places) <= MAX_METRES).all(axis=1))
 
 
 def _corner(earth: Array) -> Datum:
-    """The south-west corner of (longitude, latitude), to a ten-millionth of a degree."""
+    """Return the south-west corner of (longitude, latitude), rounded to 1e-7 degrees."""
     valid = np.isfinite(earth[:, :2]).all(axis=1)
     west, south = np.floor(earth[valid, :2].min(axis=0) * 1e7) / 1e7
     return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
 def _fit_resolution(low: Array, high: Array, options: ReadOptions, context: ReadContext) -> tuple[float, Offset]:
-    """Resolution, and what is subtracted from the points, so that their box lies in the tree."""
+    """Choose the resolution, and the offset subtracted from the points, so that they fit into the octree."""
     candidates = RESOLUTIONS if options.resolution is None else (options.resolution,)
     shift = np.zeros(3) if options.origin is None else np.array(options.origin)
     if options.origin is None and not _check_fit(low, high, candidates[0]):
@@ -313,19 +314,19 @@ def _fit_resolution(low: Array, high: Array, options: ReadOptions, context: Read
             if not all(_check_fit(low[2:], high[2:], r) for r in candidates[:1]):
                 shift[2] = np.round((low[2] + high[2]) / 2)
             context.warn(
-                f"the points lie up to {away:.0f} m from the origin, beyond the octree's ±{HALF * candidates[0]:g} m: "
-                f"for the voxels ({', '.join(f'{v:.0f}' for v in shift)}) is taken as the local origin; say crs=EPSG:… "
+                f"the points are up to {away:.0f} m from the origin, beyond the octree's ±{HALF * candidates[0]:g} m; "
+                f"({', '.join(f'{v:.0f}' for v in shift)}) is used as the local origin of the voxels: set crs=EPSG:… "
                 "or origin=x,y,z to place them"
             )
     for resolution in candidates:
         if _check_fit(low - shift, high - shift, resolution):
             if options.resolution is None and resolution != candidates[0]:
-                context.warn(f"the cloud is too large for voxels of {candidates[0]:g} m: they have {resolution:g} m")
+                context.warn(f"the cloud is too large for voxels of {candidates[0]:g} m; they have {resolution:g} m")
             return resolution, (float(shift[0]), float(shift[1]), float(shift[2]))
     need = float(np.maximum(np.abs(low - shift), np.abs(high - shift)).max()) / HALF
     raise unreadable_error(
-        f"voxels of {candidates[-1]:g} m reach {HALF * candidates[-1]:g} m from the origin, the points go beyond: set "
-        f"resolution to {need:.3g} or more, or another origin",
+        f"points exceed the range of voxels of {candidates[-1]:g} m, {HALF * candidates[-1]:g} m from the origin: set "
+        f"resolution to at least {need:.3g}, or another origin",
         where="resolution",
     )
 
@@ -335,7 +336,7 @@ def _check_fit(low: Array, high: Array, resolution: float) -> bool:
 
 
 def _fingerprint(voxels: VoxelMap) -> str:
-    """Which leaves a cloud was made into."""
+    """Compute the fingerprint of the leaves made from a cloud."""
     digest = hashlib.sha256(repr(float(voxels.resolution)).encode())
     for column in (voxels.depth, voxels.code, voxels.log_odds, voxels.colour):
         digest.update(b"" if column is None else np.ascontiguousarray(column).data)
@@ -348,10 +349,10 @@ NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 def colours(cloud: Cloud) -> NDArray[np.uint8] | None:
-    """Red, green and blue of each point: uint8 [n, 3]; None where the cloud has none.
+    """Return red, green and blue of each point as uint8 [n, 3], or None if the cloud has none.
 
-    PCL packs them into one number of four bytes (``rgb``, ``rgba``: blue in the lowest), whatever its type says; PLY
-    has one byte each, or floats of 0…1; LAS 16 bits each, or a byte's values by mistake.
+    PCL packs them into one number of four bytes of any type (``rgb``, ``rgba``: blue in the lowest byte); PLY has one
+    byte each, or floats of 0…1; LAS has 16 bits each, in some files with values of 8 bits.
     """
     packed = next((c for name in ("rgb", "rgba") if (c := cloud.columns.get(name)) is not None), None)
     if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:
@@ -371,8 +372,11 @@ def colours(cloud: Cloud) -> NDArray[np.uint8] | None:
 
 
 def plain(cloud: Cloud) -> dict[str, NDArray[Any]]:
-    """The columns under the names that most tools know, one value a point each: x, y, z, then nx, ny, nz and red,
-    green, blue (uint8) where there are any, then the others as they are called; ``name_0`` … of one with several."""
+    """Convert to columns with common names and one value per point.
+
+    x, y, z, then nx, ny, nz and red, green, blue (uint8) if present, then the others with their names; ``name_0`` … for
+    columns with several values per point.
+    """
     out = {axis: cloud.columns[axis] for axis in AXES}
     used = set(AXES)
     for names in NORMALS:
@@ -404,19 +408,19 @@ def plain(cloud: Cloud) -> dict[str, NDArray[Any]]:
 Frame = Literal["source", "local"]
 
 FRAME_DOC = (
-    "source: coordinates as uploaded; local: metres in the local frame; default: source in the format that was "
-    "uploaded, local in others"
+    "source: coordinates as uploaded; local: metres in the local frame; default: source in the uploaded format, "
+    "local in others"
 )
 NAME_DOC = "name of the voxel map; *: all; default: map, else the only one"
 LEVEL_DOC = "level of the voxel map; *: all; default: the one it is on"
 
 MAX_POINTS = 2**25
-"""Points that voxels are made into at most."""
+"""Maximum number of points generated from voxels."""
 
 
 @dataclass(frozen=True, slots=True)
 class CloudToWrite:
-    """What is to be written. data: the uploaded file where it can be served as it is; ``cloud()`` are the points."""
+    """Cloud to write. data: the uploaded file if it can be exported unchanged; ``cloud()`` returns the points."""
 
     cloud: Callable[[], Cloud]
     data: bytes | None
@@ -433,9 +437,9 @@ def source(
     forms: Sequence[str],
     parsers: Mapping[str, Parse],
 ) -> CloudToWrite:
-    """The points behind a voxel map: those of the file it was made of, else the centres of its occupied voxels.
+    """Return the points of a voxel map: those of its source file, else the centres of its occupied voxels.
 
-    forms: endings of the wanted format. Raises MissingLayer, NotFound, Ambiguous, or Invalid for too many points.
+    forms: extensions of the requested format. Raises MissingLayer, NotFound, Ambiguous, or Invalid for too many points.
     """
     keys = choose(sorted(layers.parts_of("voxels")), name, level)
     voxels = layers.parts[keys[0]]
@@ -445,13 +449,15 @@ def source(
     data = _stored_file(layers, keys[0], voxels, source_properties) if isinstance(source_properties, Mapping) else None
     if data is None or not isinstance(source_properties, Mapping):
         if frame == "source":
-            raise Invalid("frame=source asks for an uploaded cloud, and this voxel map was not made of one")
+            raise Invalid(
+                "frame=source requires an uploaded cloud, but this voxel map was not made from one: use frame=local"
+            )
         return CloudToWrite(lambda: centres(voxels, context), None, "", local=True)
     form = str(source_properties["file"]).rpartition(".")[2]
     moved = "crs" in source_properties or "origin" in source_properties
     local = moved and (frame == "local" or (frame is None and form not in forms))
     if moved and not local:
-        context.warn("the points stand in the coordinates they came in: ask with frame=local for the local frame")
+        context.warn("the points have the coordinates of the upload; frame=local converts them to the local frame")
     same_form = form in forms and not local
     parse = parsers[form]
 
@@ -463,11 +469,11 @@ def source(
 
 
 _NO_LIMITS = Limits(voxels=2**62, text_bytes=2**62, unpacked_bytes=2**62)
-"""For files that were taken in: limits may have changed since."""
+"""Limits for stored files: the settings may have changed since their upload."""
 
 
 def choose(keys: Sequence[PartKey], name: str | None, level: str | None) -> list[PartKey]:
-    """The voxel map that is asked for, and the file that belongs to it."""
+    """Choose the requested voxel map and its file."""
     supply = "upload one (a point cloud or an OctoMap file)"
     matches = select_part(keys, "voxels", name, level, noun="voxel map", option="name", supply=supply)
     belongs = [PartKey("resources", key.level, cloud_name(key.name)) for key in matches]
@@ -475,7 +481,7 @@ def choose(keys: Sequence[PartKey], name: str | None, level: str | None) -> list
 
 
 def _stored_file(layers: Layers, key: PartKey, voxels: VoxelMap, source_properties: Mapping[str, Any]) -> bytes | None:
-    """The file that a voxel map was made of, if it is there and tells of these very leaves."""
+    """Return the source file of a voxel map, if it is stored and its fingerprint matches the leaves."""
     part = layers.parts.get(PartKey("resources", key.level, cloud_name(key.name)))
     data = part.files.get(str(source_properties.get("file"))) if isinstance(part, Resources) else None
     if data is None or source_properties.get("leaves") != _fingerprint(voxels):
@@ -484,7 +490,7 @@ def _stored_file(layers: Layers, key: PartKey, voxels: VoxelMap, source_properti
 
 
 def _to_local(cloud: Cloud, source_properties: Mapping[str, Any], context: WriteContext) -> Cloud:
-    """The points in the local frame, as they were when they became voxels; normals turn along."""
+    """Convert points to the local frame, as for the voxels; normals are rotated, too."""
     columns = dict(cloud.columns)
     places = cloud.places(0, len(cloud))
     normals = next((n for n in NORMALS if all(name in columns and columns[name].ndim == 1 for name in n)), None)
@@ -496,12 +502,12 @@ def _to_local(cloud: Cloud, source_properties: Mapping[str, Any], context: Write
     places = places - np.array(source_properties.get("origin", (0.0, 0.0, 0.0)))
     columns |= {axis: places[:, k] for k, axis in enumerate(AXES)}
     if cloud.viewpoint != IDENTITY_VIEWPOINT:
-        context.drop("viewpoint", 1, "it stands in the coordinates of the source: ask with frame=source")
+        context.drop("viewpoint", 1, "it has the coordinates of the source: request it with frame=source")
     return Cloud(columns, cloud.width, cloud.height, comments=cloud.comments, further=cloud.further)
 
 
 def _turn(columns: dict[str, NDArray[Any]], names: Sequence[str], places: Array, crs: str, frame: LocalFrame) -> None:
-    """Normals of a projected CRS about the vertical into the local frame, by the angle in the cloud's middle."""
+    """Rotate normals of a projected CRS about the vertical to the local frame, by the angle at the cloud's centre."""
     finite = places[np.isfinite(places).all(axis=1)]
     if not len(finite):
         return
@@ -515,20 +521,20 @@ def _turn(columns: dict[str, NDArray[Any]], names: Sequence[str], places: Array,
 
 
 def centres(voxels: VoxelMap, context: WriteContext) -> Cloud:
-    """The centres of all occupied smallest voxels, in ascending order of their place, with their colours.
+    """Return the centres of all occupied smallest voxels, in ascending order of their codes, with their colours.
 
-    float32: to within a hundredth of a voxel everywhere in the tree. Raises Invalid where there are more than MOST.
+    float32: accurate to a hundredth of a voxel in the whole octree. Raises Invalid if there are more than MAX_POINTS.
     """
     counts = voxels.voxel_counts()
     if counts["occupied"] > MAX_POINTS:
         raise Invalid(
-            f"the {counts['occupied']} occupied voxels would be more than {MAX_POINTS} points: ask for octomap with a "
+            f"the {counts['occupied']} occupied voxels give more than {MAX_POINTS} points: request octomap with a "
             "depth or a bbox instead"
         )
-    context.drop("free voxels", voxels.leaf_counts()["free"], "a cloud has points where something is only")
+    context.drop("free voxels", voxels.leaf_counts()["free"], "a cloud has points for occupied voxels only")
     if not voxels.binary:
         other = int(np.count_nonzero(voxels.log_odds[voxels.occupied] != LOG_ODDS[1]))
-        context.drop("log-odds", other, "a point is there or not")
+        context.drop("log-odds", other, "a point has no probability")
     code, rows = expand_leaves(voxels, voxels.occupied)
     smallest = VoxelMap(
         voxels.resolution, np.full(len(code), DEPTH, np.uint8), code, np.zeros(len(code), np.float32), None
@@ -543,7 +549,7 @@ def centres(voxels: VoxelMap, context: WriteContext) -> Cloud:
 
 
 def file_name(name: str | None, ending: str) -> str:
-    """``map.pcd``, or the asked for name's."""
+    """Return ``map.pcd``, or a file name from the requested name."""
     return f"{file_stem(name or MAP)}.{ending}"
 
 
@@ -551,7 +557,7 @@ PARTS = Parts("voxels", "name", file_stem)
 
 
 def options_from_filename(endings: Sequence[str]) -> Callable[[str], dict[str, str]]:
-    """``lab.pcd`` asks for the voxel map ``lab``."""
+    """Create a parser of file names: ``lab.pcd`` selects the voxel map ``lab``."""
 
     def parse_name(name: str) -> dict[str, str]:
         stem, _, end = name.rpartition(".")

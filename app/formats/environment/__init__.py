@@ -1,21 +1,20 @@
-"""environment: a whole environment_template package as one archive, all that is known of a place in its folders.
+"""environment: a complete environment_template package as one archive.
 
-``config/location`` the datum, the fence and georeferenced pictures, ``config/metric/<grid>`` a map.yaml with its
-picture for each grid (``<name>/map.bt`` for voxels), ``config/topological`` the network, ``config/world`` the Gazebo
-world, points of interest and all other objects, ``config/properties.sh`` what the place is called and
-``config/environment.sh`` where its files are. Source: LCAS/environment_template, releases v1.0.x and older.
+``config/location`` contains the datum, the fence and georeferenced images, ``config/metric/<grid>`` a map.yaml with its
+image for each grid (``<name>/map.bt`` for voxels), ``config/topological`` the network, ``config/world`` the Gazebo
+world, points of interest and all other objects, ``config/properties.sh`` the name of the place and
+``config/environment.sh`` the paths of its files. Source: LCAS/environment_template, releases v1.0.x and older.
 
-Robots source the two scripts, so they are made anew and never copied: literal variables of an upload come back through
-``shell.exports``, and the variables that name files are worked out by the script from where it lies, for the files
-that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
-``complete`` adds what derivations can make of it.
+Robots source the two scripts, so they are always generated, never copied: literal variables of an upload are written
+with ``shell.exports``; the script computes variables that name files from its own location, for existing files only;
+as in the template, those of missing maps are empty. The archive contains stored maps; ``complete`` adds derived ones.
 
-``config/fleet_map`` holds the stored layers exactly (``environment.content``): a package whose maps nobody has touched
-gives back the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
-``.DS_Store``) are no edit.
+``config/fleet_map`` contains the stored layers exactly (``environment.content``): a package with unchanged maps
+restores the same environment; if a map was edited, the maps are read. Additional files that no format can read (a
+README, ``.DS_Store``) do not count as edits.
 
-Every map in it is another format's: reading is what an upload of the folder is (``app.upload_reader``), and writers
-come from ``WriteContext.make``.
+Every map in it has another format: reading equals an upload of the directory (``app.upload_reader``), and writers come
+from ``WriteContext.make``.
 """
 
 from __future__ import annotations
@@ -53,42 +52,42 @@ MAIN = "environment.zip"
 CONFIG = "config"
 FOLDERS = ("location", "metric", "topological", "world")
 RELEASE = "ENVIRONMENT_COMMON_LATEST_RELEASE"
-"""The one literal that stands in environment.sh itself; all others are the place's properties."""
+"""The only literal variable in environment.sh; all others are properties of the place."""
 
 CLOUDS = {"laz": "las"}
-"""Point clouds' endings that are not their format's name."""
+"""Format names of point cloud extensions that differ from the format's name."""
 
 NO_GO = ("nogo", "keepout")
-"""Names of the grid that NOGO_COSTMAP_YAML_FILE means."""
+"""Names of grids for NOGO_COSTMAP_YAML_FILE."""
 
 _FOLDER_NAMES = tuple(f"{CONFIG}/{folder}/".encode() for folder in FOLDERS)
 _PATH = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*/?")
-"""Paths as they may stand between double quotes in a script: nothing there means anything to a shell."""
+"""Valid paths between double quotes in a script: no characters that are special in a shell."""
 
 STORED_LAYERS: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
 
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What is put in beside what is stored."""
+    """Content in addition to the stored maps."""
 
-    complete: bool = parameter(False, "also derive the network, the map and the world where no layer tells them")
+    complete: bool = parameter(False, "also derive the network, the map and the world if they are not stored")
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
 def detect(name: str, data: bytes) -> bool:
-    """An archive with one of the template's folders in it."""
+    """Detect an archive that contains one of the template's directories."""
     if name.lower().endswith(".kmz") or not archives.is_archive(data):
         return False
     return any(folder in data for folder in _FOLDER_NAMES)
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """What the folder in the archive says, as if its files had been uploaded. Raises what their readers raise."""
+    """Read the directory in the archive as an upload of its files. Raises the errors of their readers."""
     if context.folder is None:
-        reason = "an environment package inside another one is not opened: upload it by itself"
+        reason = "an environment package inside another one is not opened: upload it separately"
         raise UnreadableFile(reason, [Problem(reason)])
     members = archives.unpack(files[context.main or next(iter(files))], context.limits)
     if not members:
@@ -100,16 +99,18 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``environment.zip``. Raises MissingLayer where there is nothing to put into it."""
+    """Write ``environment.zip``. Raises MissingLayer if there is nothing to write."""
     return {MAIN: archives.pack(_Writer(layers, context).files())}
 
 
 class _Writer:
-    """The files of one package, by path from ``config`` on; which file the variables name."""
+    """Writer of one package: files by path below ``config``, and the files that variables name."""
 
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         if context.make is None:
-            raise CannotConvert("an environment package holds maps of other formats, and none can be made here")
+            raise CannotConvert(
+                "an environment package contains maps of other formats, which cannot be written in this context"
+            )
         self.layers, self.context, self.make = layers, context, context.make
         self.complete = bool(getattr(context.options, "complete", False))
         self.out: dict[str, bytes] = {}
@@ -117,7 +118,7 @@ class _Writer:
         self.reported: set[PartKey] = set()
 
     def files(self) -> dict[str, bytes]:
-        """All of them. Each layer's maps are made in turn; what a format cannot hold is told by path."""
+        """Return the files. Writes the maps of each layer; dropped data is reported by path."""
         self.location()
         self.pictures()
         self.grids()
@@ -128,15 +129,17 @@ class _Writer:
         self.objects()
         variables = self.variables()
         if not self.out and not variables:
-            raise MissingLayer("there is nothing to make an environment package of: supply a map of any kind")
+            raise MissingLayer("an environment package needs at least one map: supply a map of any kind")
         self.report_unwritten()
         self.scripts(variables)
-        if self.context.stored is not None and not self.complete:  # else the maps say something else
+        if self.context.stored is not None and not self.complete:  # derived maps differ from the stored layers
             content = exact_content.pack(self.layers, self.out, self.context.stored)
             if len(content[exact_content.MAIN]) <= Limits().text_bytes:
                 self.out |= content
             else:
-                self.context.warn("the stored layers are too large to be in it exactly: it holds the maps only")
+                self.context.warn(
+                    "the stored layers are too large for an exact copy; the package contains the maps only"
+                )
         return {f"{CONFIG}/{path}": data for path, data in self.out.items()}
 
     # --- one map ---
@@ -144,19 +147,19 @@ class _Writer:
     def write_map(
         self, name: str, layers: Layers, values: Mapping[str, Any] | None = None, *, derived: bool = False
     ) -> NestedMap | None:
-        """A map by another format's writer; None, with the reason in the report, where there is none."""
+        """Write a map with another format's writer; return None, with the reason in the report, if it fails."""
         try:
             return self.make(name, layers, values or {}, derived)
         except FleetMapError as error:
-            self.context.warn(f"no {name} is in it: {error.detail}")
+            self.context.warn(f"the package contains no {name}: {error.detail}")
         return None
 
     def add_files(self, names: Mapping[str, str], inner: NestedMap, *, copy: bool = False) -> str:
-        """Add a map's files and return the path of its main file, with a number where another map has that path.
+        """Add a map's files and return the path of its main file, with a number if the path is in use.
 
         Args:
             names: path in the package by the map's own name of a file.
-            copy: whether another map has the same content: what this one drops is no loss.
+            copy: whether another map has the same content, so that data dropped by this one is not reported.
         """
         first = next(iter(inner.files))
         names = {**names, first: self.free_path(names[first], inner.files[first])}
@@ -178,14 +181,14 @@ class _Writer:
         return names[first]
 
     def free_path(self, path: str, data: bytes) -> str:
-        """A path that no other content has, also where upper and lower case are the same."""
+        """Return a path that no other content has, also on case-insensitive file systems."""
         if self.out.get(path) == data:
             return path
         end = _file_ending(path)
         return _unique_names(path.removesuffix(end), end, {other.casefold() for other in self.out})
 
     def select_layers(self, *layers: Layer) -> Layers:
-        """The stored parts of these layers."""
+        """Return the stored parts of these layers."""
         parts = {k: p for k, p in self.layers.parts.items() if k.layer in layers and not is_empty(p)}
         return Layers(parts, self.layers.datum, self.layers.levels)
 
@@ -198,7 +201,7 @@ class _Writer:
         site = self.select_layers("location")
         self.reported.update(site.parts)
         if self.layers.datum is not None:
-            # The grids say how large the map is.
+            # The grids give the extent of the map.
             inner = self.write_map("datum", self.select_layers("location", "occupancy"))
             if inner is not None:
                 self.add_files(dict.fromkeys(inner.files, "location/datum.yaml"), inner)
@@ -218,7 +221,7 @@ class _Writer:
             self.add_files({n: f"location/{stem}{_file_ending(n)}" for n in inner.files}, inner)
 
     def grids(self) -> None:
-        """Each grid in a folder of its name, which is how it is called when the folder is read."""
+        """Write each grid to a directory with its name, which readers use as the grid's name."""
         grids = self.layers.grids()
         if not grids and self.complete:
             inner = self.write_map("occupancy_grid", self.layers, derived=True)
@@ -240,14 +243,14 @@ class _Writer:
             self.paths["COSTMAP_YAML_FILE"] = paths[0]
         elif len(names) > 1:
             self.context.warn(
-                f"none of the grids {shorten_list(sorted(names))} is called {MAP}: COSTMAP_YAML_FILE is empty"
+                f"none of the grids {shorten_list(sorted(names))} is named {MAP}; COSTMAP_YAML_FILE is empty"
             )
         for name in NO_GO:
             if name in names:
                 self.paths.setdefault("NOGO_COSTMAP_YAML_FILE", names[name][0])
 
     def voxels(self) -> None:
-        """Each voxel map in a folder of its name, with the point cloud that it was made of."""
+        """Write each voxel map to a directory with its name, with its source point cloud."""
         keys = {k for k in self.layers.parts if k.layer == "voxels"}
         for key in sorted(keys):
             part = self.layers.parts[key]
@@ -263,7 +266,7 @@ class _Writer:
             made_of = end if cloud in self.layers.parts else ""
             if inner is not None:
                 self.reported.add(key)
-                # Of two files with as much to say the shorter name is believed: the points, which the voxels lack.
+                # Of two equivalent files the reader uses the shorter name: give it to the points, which voxels lack.
                 name = "octomap" if made_of else MAP
                 self.add_files({n: f"metric/{stem}/{name}{_file_ending(n)}" for n in inner.files}, inner)
             if not made_of:
@@ -288,7 +291,7 @@ class _Writer:
             self.add_files(dict.fromkeys(drawn.files, "topological/network.kml"), drawn, copy=True)
 
     def world(self) -> None:
-        """The stored worlds, each under its own name; else one of what is stored, where that is asked for."""
+        """Write the stored worlds, each with its own name; else one generated from the layers, if requested."""
         own_parts = {k: p for k, p in self.layers.vector("objects").items() if k.name == "gazebo"}
         worlds: dict[str, dict[str, Any]] = {}
         for part in own_parts.values():
@@ -312,8 +315,8 @@ class _Writer:
             inner = self.write_map("gazebo", source, values, derived=not own_parts)
             if inner is None:
                 continue
-            # What one world lacks of another one stands in that one's file here.
-            others_ = {f"ask with world={other}" for other in worlds}
+            # Objects of other worlds are not lost: they are in the other worlds' files.
+            others_ = {f"request it with world={other}" for other in worlds}
             inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d.why not in others_))
             self.reported.update(own_parts)
             self.reported.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
@@ -324,12 +327,12 @@ class _Writer:
             if companions:
                 self.paths["GAZEBO_CUSTOM_MODELS"] = "world/custom_models/"
         if first:
-            # As the template looks for it, else as a folder with one world has it.
+            # The name that the template expects, else that of a directory with one world.
             best = min(first, key=lambda p: (not p.startswith("world/gazebo"), len(p), p))
             self.paths["GAZEBO_WORLD_FILE"] = best
 
     def points(self) -> None:
-        """Points of interest of a topological map: a map of nodes without edges."""
+        """Write points of interest as a topological map of nodes without edges."""
         own_parts = {k: p for k, p in self.layers.vector("objects").items() if k.name == "tmap2" and len(p)}
         for key, part in own_parts.items():
             nodes = tuple({**p, "kind": "node"} for p in part.properties)
@@ -342,7 +345,7 @@ class _Writer:
             self.paths.setdefault("POI_FILE", self.add_files(dict.fromkeys(inner.files, path), inner))
 
     def objects(self) -> None:
-        """Objects by the format they came from; zones, GeoJSON's and those of no format in one GeoJSON file."""
+        """Write objects in their source format; zones and objects of GeoJSON or no format in one GeoJSON file."""
         remaining: dict[PartKey, Part] = {
             k: p for k, p in self.select_layers("zones").parts.items() if isinstance(p, Features)
         }
@@ -372,7 +375,7 @@ class _Writer:
                 self.reported.update(remaining)
 
     def family(self, name: str, parts: Mapping[PartKey, Part]) -> NestedMap | None:
-        """A map of the format that these objects came from; None where they cannot be all of it."""
+        """Write a map in the source format of these objects; None if it cannot contain all of them."""
         names = (name, "kmz") if name == "kml" else (name,)
         resources = {k: p for k, p in self.layers.parts.items() if k.layer == "resources" and k.name in names}
         if any(k.name == "kmz" for k in resources):
@@ -388,22 +391,24 @@ class _Writer:
             return None
 
     def report_unwritten(self) -> None:
-        """Tell what no file of the package holds."""
+        """Report parts that no file of the package contains."""
         for key, part in sorted(self.layers.parts.items()):
             if key in self.reported or is_empty(part) or key.name == NAME:
                 continue
             count = len(part) if isinstance(part, Features) else 1
             if count:
                 part_name = f"{key.layer} {key.level}/{key.name}"
-                self.context.drop(part_name, count, "no format that could hold it is there, or its map cannot be made")
+                self.context.drop(
+                    part_name, count, "no format in the package can contain it, or its map cannot be written"
+                )
         levels = {k.level for k in self.reported if k.layer in ("occupancy", "voxels", "imagery")} - {GROUND}
-        self.context.drop("levels of grids and pictures", len(levels), "the template's folders know one level")
+        self.context.drop("levels of grids and pictures", len(levels), "the template's directories have one level")
         if self.layers.levels != (Level(),):
             more = sum(level != Level() for level in self.layers.levels)
-            self.context.drop("elevations of levels", more, "the template's folders know one level")
+            self.context.drop("elevations of levels", more, "the template's directories have one level")
 
     def stem(self, key: PartKey, all_keys: set[PartKey]) -> str:
-        """A part's name as a folder's: on the ground its own, elsewhere with its level; never two alike."""
+        """Return a unique directory name for a part: its name on the ground, elsewhere with its level."""
         stems: dict[PartKey, str] = {}
         for k in sorted(all_keys):
             name = _plain(k.name if k.level == GROUND else f"{k.name}_{k.level}")
@@ -413,7 +418,7 @@ class _Writer:
     # --- the scripts ---
 
     def variables(self) -> dict[str, str]:
-        """Stored variables but for those that say where files are."""
+        """Return the stored variables except those with file paths."""
         all_variables: dict[str, Any] = {}
         for key, part in self.layers.vector("objects").items():
             stored = part.document.get(NAME) if key.name == NAME else None
@@ -423,7 +428,7 @@ class _Writer:
         self.context.drop(
             "variables that name files",
             len(file_names),
-            f"they name those of the package now: {shorten_list(file_names)}",
+            f"they are replaced with paths in the package: {shorten_list(file_names)}",
         )
         for reason in reasons:
             self.context.drop("variables", 1, reason)
@@ -453,17 +458,17 @@ class _Writer:
         self.out["environment.sh"] = "\n".join([*lines, ""]).encode()
 
     def path(self, name: str, path: str | None) -> str:
-        """A line that exports a path inside the package, wherever it lies; an empty one where there is no such file."""
+        """Format a line that exports a path relative to the package, or an empty value if there is no such file."""
         if path is None:
             return f"export {name}=''"
         exists = path in self.out or path == "properties.sh" or any(n.startswith(path) for n in self.out)
         if not _PATH.fullmatch(path) or not exists:
-            raise ValueError(f"{name} would name {path!r}, which is no file of the package")
+            raise ValueError(f"{name} refers to {path!r}, which is not a file of the package")
         return f'export {name}="$CONFIG_DIR/{path}"'
 
 
 def _display_layers(layers: Layers) -> Layers:
-    """The same for people to look at: without what only its own format knows, which stands in that format's file."""
+    """Return the layers for display: without source properties, which are in their own format's file."""
     parts: dict[PartKey, Part] = {}
     for key, part in layers.parts.items():
         if isinstance(part, Features):
@@ -476,13 +481,13 @@ def _display_layers(layers: Layers) -> Layers:
 
 
 def _plain(name: str) -> str:
-    """A name as one folder's or file's: letters, digits, ``_``, ``.`` and ``-``."""
+    """Convert a name to a file or directory name of letters, digits, ``_``, ``.`` and ``-``."""
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).lstrip(".-")[:64]
     return plain or "unnamed"
 
 
 def _unique_names(stem: str, end: str, taken: Container[str]) -> str:
-    """``stem`` with its ending, with the first number from 2 on where that is taken. taken: case-folded."""
+    """Return ``stem`` with its extension, with the first free number from 2 if in use. taken: case-folded."""
     path, number = f"{stem}{end}", 2
     while path.casefold() in taken:
         path, number = f"{stem}_{number}{end}", number + 1
@@ -490,13 +495,13 @@ def _unique_names(stem: str, end: str, taken: Container[str]) -> str:
 
 
 def _world_name(name: str) -> str:
-    """What a world's file is called: as it was, with an ending that says what it is."""
+    """Return a world's source file name, with an extension of worlds."""
     stem = _plain(name.rpartition("/")[2])
     return stem if stem.endswith((".world", ".world.xml", ".sdf")) else f"{stem}.world.xml"
 
 
 def _file_ending(name: str) -> str:
-    """``.tif``, ``.pgw``, ``.png.aux.xml``: all behind the first point."""
+    """Return everything from the first point: ``.tif``, ``.pgw``, ``.png.aux.xml``."""
     base = name.rpartition("/")[2]
     return base[base.index(".") :] if "." in base else ""
 

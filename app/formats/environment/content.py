@@ -1,13 +1,13 @@
-"""The stored layers exactly, beside the maps of an environment package that are written from them.
+"""Exact copy of the stored layers in an environment package, beside the maps written from them.
 
-Maps of other formats round, fill in and leave out; so a package carries in ``fleet_map/content.json`` what is stored,
-and the SHA-256 of each of its maps. While these are as they were written, reading the package gives back the very
-layers; once a map was edited, added or removed, the maps alone count.
+Other formats round, fill in and drop data; so ``fleet_map/content.json`` in a package contains the stored layers, and
+the SHA-256 of each map. As long as the maps are unchanged, reading the package restores the same layers; once a map was
+edited, added or removed, only the maps are read.
 
 content.json: ``version``; ``maps``, path -> SHA-256; ``datum``; ``levels``, [name, elevation]; ``parts``, each with
 ``layer``, ``level``, ``name``, ``attribution`` and the fields of its type. Geometry is hexadecimal WKB. An array is
-{``file``, ``type``, ``shape``}: little-endian numbers in a file of their own; a resource is the name of its file. Paths
-are relative to the folder ``config``; a resource that is also one of the maps is not stored twice.
+{``file``, ``type``, ``shape``}: little-endian numbers in a separate file; a resource is the name of its file. Paths
+are relative to the directory ``config``; a resource that is also one of the maps is not stored twice.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ VERSION = 1
 _TYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8", "|b1"})
 
 _KINDS: Mapping[str, type] = {"properties": dict, "crs": str, "binary": bool, "negate": bool}
-"""Types of fields that the layers themselves do not check."""
+"""Types of fields that the layer classes do not check."""
 
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What a package says of its environment. credits: licences and credits by part. added: files that are not its."""
+    """Content of a package. credits: licences and credits by part. added: files that do not belong to it."""
 
     layers: Layers
     credits: Mapping[PartKey, tuple[str, ...]]
@@ -55,7 +55,7 @@ class Content:
 
 
 def pack(layers: Layers, maps: Files, credits: Mapping[PartKey, Sequence[str]]) -> dict[str, bytes]:
-    """The content's files by path. maps: the files of the package, by path. credits: by part."""
+    """Write the content's files by path. maps: the files of the package, by path. credits: by part."""
     hashes = {path: hashlib.sha256(data).hexdigest() for path, data in sorted(maps.items())}
     blobs = _Blobs({digest: path for path, digest in reversed(hashes.items())})
     parts = [
@@ -77,7 +77,7 @@ def pack(layers: Layers, maps: Files, credits: Mapping[PartKey, Sequence[str]]) 
 
 @dataclass(slots=True)
 class _Blobs:
-    """Files of the content; equal ones are one. paths: by SHA-256, those that are there already."""
+    """Files of the content, equal ones stored once. paths: existing files by SHA-256."""
 
     paths: dict[str, str]
     files: dict[str, bytes] = field(default_factory=dict)
@@ -109,20 +109,22 @@ def _array(array: NDArray[Any], blobs: _Blobs) -> dict[str, Any]:
 
 
 def find(files: Files) -> str | None:
-    """The name of the content among the files of an upload, where they are a package with one."""
+    """Find the content file of a package in an upload, or return None."""
     return next((name for name in sorted(files) if f"/{name}".endswith(f"/config/{MAIN}")), None)
 
 
 def content_files(files: Files, main: str) -> set[str]:
-    """The names of the content's own files."""
+    """Return the names of the content's own files."""
     return {name for name in files if name.startswith(main.removesuffix(MAIN) + FOLDER)}
 
 
 def read(files: Files, main: str, limits: Limits, unread: Callable[[], Collection[str]]) -> Content | str:
-    """The content, or why the maps count instead of it. Raises what is natural where it is damaged.
+    """Read the content, or return the reason why the maps are read instead.
 
-    unread: the names of files that no format reads; it is called where files were added, since such a file changes no
-    map (a README, what a file manager leaves behind).
+    Raises various exceptions (KeyError, TypeError, ValueError …) if the content is damaged.
+
+    unread: returns the names of files that no format reads; called if files were added, since such files change no map
+    (a README, files of file managers).
     """
     top = json.load(files[main], limits)
     if not isinstance(top, dict) or top.get("version") != VERSION:
@@ -157,7 +159,7 @@ def _decode_part(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes
         if len(ids) > limits.features:
             raise TooLarge(f"the content has {len(ids)} features; the limit is {limits.features}")
         if not all(isinstance(p, dict) for p in (*row["properties"], row["document"])):
-            reason = f"the properties of the {key.layer} must be objects"
+            reason = f"the properties of the layer {key.layer} must be objects"
             raise UnreadableFile(reason, [Problem(reason)])
         geometry = np.empty(len(ids), object)
         geometry[:] = shapely.from_wkb(row["geometry"])
@@ -168,7 +170,7 @@ def _decode_part(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes
     values = {name: _value(value, files, limit) for name, value in row.items()}
     for name, expected_class in _KINDS.items():
         if not isinstance(values.get(name, expected_class()), expected_class):
-            raise TypeError(f"{name} of the {key.layer} is no {expected_class.__name__}")
+            raise TypeError(f"{name} of the layer {key.layer} must be {expected_class.__name__}")
     part: Part = kind(**values)
     if isinstance(part, GeoImage):
         _check_place(part)
@@ -176,19 +178,19 @@ def _decode_part(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes
 
 
 def _check_place(picture: GeoImage) -> None:
-    """Refuse a picture that lies nowhere, or whose CRS PROJ would look for in files."""
+    """Reject an image without a valid position, or with a CRS that makes PROJ open files."""
     if picture.crs != LOCAL and not geotiff.CRS_NAME.fullmatch(picture.crs):
         geotiff.crs_from_wkt(picture.crs)
     if (reason := geotiff.position_problem(picture)) is not None:
-        raise UnreadableFile(f"a picture: {reason}", [Problem(reason)])
+        raise UnreadableFile(f"an image: {reason}", [Problem(reason)])
 
 
 def _value(value: Any, files: Mapping[str, bytes], limit: int) -> Any:
-    """A field: an array of at most so many rows or pixels, a tuple of numbers, or what it is."""
+    """Decode a field: an array of at most ``limit`` rows or pixels, a tuple of numbers, or the value itself."""
     if isinstance(value, dict) and value.keys() == {"file", "type", "shape"}:
         shape = tuple(map(int, value["shape"]))
         if value["type"] not in _TYPES or min(shape, default=0) < 0:
-            raise ValueError(f"{value['type']!r} {shape} is no array of numbers")
+            raise ValueError(f"{value['type']!r} {shape} is not an array of numbers")
         if math.prod(shape[:2]) > 4 * limit or math.prod(shape) > 64 * limit:
             raise TooLarge(f"an array of the content is {shape}; the limit is {limit}")
         return np.frombuffer(files[value["file"]], np.dtype(value["type"])).reshape(shape)

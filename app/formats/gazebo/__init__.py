@@ -1,22 +1,23 @@
 """Gazebo worlds: SDFormat 1.4 to 1.11, with the models, meshes and materials they need.
 
-A file is a world (``.world``, ``.world.xml``, ``.sdf``), a lone ``model.sdf`` (a world of one model), or one of the
-lists that environment_common makes worlds from (``objects.yaml``, ``known_obstacles.yaml``; see ``gazebo.yaml_lists``).
+A file is a world (``.world``, ``.world.xml``, ``.sdf``), a single ``model.sdf`` (a world of one model), or one of the
+lists that environment_common generates worlds from (``objects.yaml``, ``known_obstacles.yaml``; see
+``gazebo.yaml_lists``).
 
-Canonical: each direct model, include and light of a world is an object of the kind ``model``, ``include`` or ``light``,
-called by its name, with its ``pose`` and, where the upload tells its solids, ``shapes``, ``size`` and a footprint in
-local metres. The rest of its element is kept as text in ``properties.gazebo.sdf``, that of the world (physics, scene,
-plugins, wind …) in ``document.gazebo.worlds``. Where a pose says more than six numbers (``relative_to``,
-``placement_frame``, an include's own pose) its text stays, with the ``pose`` it means beside it: it holds as long as
-nobody moves the object. The worlds of one upload lie in one part side by side; ``world`` says which is written.
+Canonical: each direct model, include and light of a world is an object of kind ``model``, ``include`` or ``light``. Its
+id is its name; it has its ``pose`` and, if the upload contains its solids, ``shapes``, ``size`` and a footprint in
+local metres. The rest of its element is stored as text in ``properties.gazebo.sdf``, that of the world (physics, scene,
+plugins, wind …) in ``document.gazebo.worlds``. If a pose has more than six numbers (``relative_to``,
+``placement_frame``, an include's own pose), its text is stored beside the resulting ``pose`` and is valid until the
+object is moved. The worlds of one upload share one part; the option ``world`` selects the one to write.
 
-``<state>`` is not kept: what it moves is warned of and noted under ``properties.gazebo.state``. Files of models are
-kept byte for byte as resources, as ``models/NAME/…``.
+``<state>`` is dropped: objects that it moves give a warning and are noted in ``properties.gazebo.state``. Model files
+are stored byte for byte as resources, as ``models/NAME/…``.
 
 Frame: ``spherical_coordinates`` is the datum. Its heading is the angle from east to the world's x axis,
 counter-clockwise seen from above (libignition-math: LOCAL2 to SPHERICAL), so the datum's heading, clockwise, is its
-negative. Gazebo's frame is the tangent plane and ours a projection: 1 km from the datum they differ by millimetres.
-Latitude and longitude 0 are Gazebo's default and no place.
+negative. Gazebo's frame is the tangent plane, the local frame a projection: 1 km from the datum they differ by
+millimetres. Latitude and longitude 0 are Gazebo's default and give no datum.
 """
 
 from __future__ import annotations
@@ -31,15 +32,17 @@ from app.formats.gazebo.writing import MAIN, WriteOptions, choose, write
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A root element ``<sdf>`` with a world, model or light, or a list of the generator's."""
+    """Detect a root element ``<sdf>`` with a world, model or light, or a list of environment_common."""
     if sdf.is_sdf(data):
         return sdf.contains_element(data, b"world", b"model", b"light")
     return yaml_lists.detect(name, data)
 
 
 def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
-    """Worlds and lists are maps of their own; a model only where there is no world in the upload and no other model
-    includes it. With each come the model folders and files that it needs, also through other models."""
+    """Sort an upload into maps, each with the model directories and files that it needs, also indirectly.
+
+    Each world and list is a map; a model is one only if the upload has no world and no other model includes it.
+    """
     library = Library(files)
     lists = [n for n in mains if not sdf.is_sdf(files[n])]
     worlds = [n for n in mains if sdf.is_sdf(files[n]) and sdf.contains_element(files[n], b"world")]
@@ -55,7 +58,7 @@ def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _lone_models(library: Library, models: Sequence[str]) -> dict[str, list[str]]:
-    """Of an upload without a world the models that ``model.config`` chooses and no other model includes."""
+    """Return the models that ``model.config`` selects and no other model includes, for an upload without a world."""
     mains = []
     for name in models:
         folder = name.rpartition("/")[0]
@@ -65,7 +68,7 @@ def _lone_models(library: Library, models: Sequence[str]) -> dict[str, list[str]
     out = {name: [*required_files(library, name), *model_files(library, name)] for name in mains}
     inner = {other for name, companions in out.items() for other in companions if other != name}
     free = {name: companions for name, companions in out.items() if name not in inner}
-    # Models that include each other all the way round: one of them tells what is wrong.
+    # Models that include each other in a cycle: reading one of them reports the error.
     return free or dict(sorted(out.items())[:1])
 
 

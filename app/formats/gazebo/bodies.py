@@ -1,4 +1,4 @@
-"""Static Gazebo models of what no world has told of: objects with shapes, footprints and lines, and a grid's walls."""
+"""Static Gazebo models of objects from other formats (shapes, footprints, lines) and of a grid's walls."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from app.model.grid import UNKNOWN, OccupancyGrid
 from app.parameters import parameter
 
 WALL = 0.1
-"""Thickness in metres of walls, and of what is drawn as thin as they are, where nothing says it."""
+"""Default thickness of walls and lines as thin as walls, in metres."""
 
 PLATE = 0.02
-"""Thickness in metres of what is only drawn on the ground."""
+"""Thickness of areas drawn on the ground, in metres."""
 
 HEIGHTS: Mapping[str, str] = {
     "wall": "wall_height",
@@ -40,10 +40,10 @@ HEIGHTS: Mapping[str, str] = {
     "tree": "tree_height",
     "pole": "pole_height",
 }
-"""Of kinds that stand in the way and may tell no height, the parameter that does."""
+"""Parameter with the default height, by kind of obstacle."""
 
 DRAWN = frozenset({"region", "zone", "area", "door"})
-"""Kinds that are seen and not felt."""
+"""Kinds with visuals but no collisions."""
 
 COLOURS: Mapping[str, str] = {
     "building": "building_colour",
@@ -52,39 +52,37 @@ COLOURS: Mapping[str, str] = {
     "door": "door_colour",
     "region": "area_colour",
 }
-"""Of kinds that have a colour where they tell none, the parameter that does."""
+"""Parameter with the default colour, by kind."""
 
 Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class BodyDefaults:
-    """What bodies get that no source tells."""
+    """Default measures and colours of bodies."""
 
-    wall_height: float = parameter(2.5, "height of walls that tell none", minimum=0.01, maximum=1000.0, unit="m")
-    building_height: float = parameter(
-        6.0, "height of buildings that tell none", minimum=0.01, maximum=1000.0, unit="m"
-    )
+    wall_height: float = parameter(2.5, "height of walls without one", minimum=0.01, maximum=1000.0, unit="m")
+    building_height: float = parameter(6.0, "height of buildings without one", minimum=0.01, maximum=1000.0, unit="m")
     barrier_height: float = parameter(
-        1.2, "height of barriers, fences and hedges that tell none", minimum=0.01, maximum=1000.0, unit="m"
+        1.2, "height of barriers, fences and hedges without one", minimum=0.01, maximum=1000.0, unit="m"
     )
-    obstacle_height: float = parameter(
-        1.0, "height of obstacles that tell none", minimum=0.01, maximum=1000.0, unit="m"
-    )
-    tree_height: float = parameter(3.0, "height of trees that tell none", minimum=0.01, maximum=1000.0, unit="m")
-    pole_height: float = parameter(2.0, "height of poles that tell none", minimum=0.01, maximum=1000.0, unit="m")
-    door_height: float = parameter(2.1, "height of doors that tell none", minimum=0.01, maximum=1000.0, unit="m")
+    obstacle_height: float = parameter(1.0, "height of obstacles without one", minimum=0.01, maximum=1000.0, unit="m")
+    tree_height: float = parameter(3.0, "height of trees without one", minimum=0.01, maximum=1000.0, unit="m")
+    pole_height: float = parameter(2.0, "height of poles without one", minimum=0.01, maximum=1000.0, unit="m")
+    door_height: float = parameter(2.1, "height of doors without one", minimum=0.01, maximum=1000.0, unit="m")
     wall_thickness: float | None = parameter(
         None,
-        "of walls and other thin lines that tell no width; default: 0.1, as in derived grids",
+        "thickness of walls and other thin lines without a width; default: 0.1, as in derived grids",
         minimum=0.001,
         maximum=100.0,
         unit="m",
     )
-    floor_thickness: float = parameter(0.1, "of floors that tell no height", minimum=0.001, maximum=100.0, unit="m")
+    floor_thickness: float = parameter(
+        0.1, "thickness of floors without a height", minimum=0.001, maximum=100.0, unit="m"
+    )
     pole_radius: float | None = parameter(
         None,
-        "of obstacles of which only the place is known; default: their kind's, 0.15 of a pole, as in derived grids",
+        "radius of obstacles given as points; default: by kind, for example 0.15 for poles, as in derived grids",
         minimum=0.001,
         maximum=100.0,
         unit="m",
@@ -107,8 +105,8 @@ class BodyDefaults:
     ground_colour: tuple[float, float, float] = parameter(
         (0.8, 0.8, 0.8), "colour of the ground: red, green, blue", minimum=0.0, maximum=1.0
     )
-    ground: bool = parameter(True, "a plane to stand on, where a world is made")
-    sun: bool = parameter(True, "a light, where a world is made that has none")
+    ground: bool = parameter(True, "add a ground plane to a generated world")
+    sun: bool = parameter(True, "add a light to a generated world that has none")
 
 
 MAX_GROUND_METRES = 1e5
@@ -117,12 +115,12 @@ Rings = list[list[list[float]]]
 
 
 def slug(text: str) -> str:
-    """A name as part of a path or address."""
+    """Convert a name to a part of a path or URI."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._") or "map"
 
 
 def valid(text: str) -> str:
-    """A name that SDFormat accepts: no ``::``, no reserved ``__name__`` or ``world``, no control characters."""
+    """Convert a text to a valid SDFormat name: no ``::``, ``__name__``, ``world`` or control characters."""
     name = "".join(c for c in text.replace("::", "_") if is_writable(c)).strip()[:200]
     name = name.replace("::", "_")
     if not name or name == "world" or (name.startswith("__") and name.endswith("__")):
@@ -131,7 +129,7 @@ def valid(text: str) -> str:
 
 
 def free_name(text: str, taken: set[str]) -> str:
-    """A valid name that nothing else has; it is taken from now on."""
+    """Return a valid unused name and add it to ``taken``."""
     name = base = valid(text)
     k = 1
     while name in taken:
@@ -142,7 +140,7 @@ def free_name(text: str, taken: set[str]) -> str:
 
 
 def sun(name: str) -> etree._Element:
-    """A directional light from above."""
+    """Create a directional light from above."""
     light = etree.Element("light", name=name, type="directional")
     light.append(sdf.pose_element((0.0, 0.0, 10.0, 0.0, 0.0, 0.0)))
     sdf.child(light, "cast_shadows", "true")
@@ -153,19 +151,19 @@ def sun(name: str) -> etree._Element:
 
 
 class Bodies:
-    """Makes models, collects the files they need, and tells what was made up and what was left out."""
+    """Builder of models; collects their files and reports filled-in values and dropped data."""
 
     def __init__(self, context: WriteContext, resources: Mapping[str, bytes], defaults: BodyDefaults) -> None:
         self.context, self.resources, self.usual = context, resources, defaults
         self.files: dict[str, bytes] = {}
         self.newest = (1, 4)
-        self.hilly = False  # whether a height map is the ground
+        self.hilly = False  # whether the ground is a height map
         self._filled: set[tuple[str, float | Colour, str, str]] = set()
         self._dropped: Counter[tuple[str, str]] = Counter()
         self._box: list[tuple[float, float, float, float]] = []
 
     def report(self) -> None:
-        """Declare what was filled in and dropped so far."""
+        """Report the values filled in and data dropped so far."""
         for noun, value, why, option in sorted(self._filled, key=lambda item: (item[0], item[2])):
             self.context.fill(noun, list(value) if isinstance(value, tuple) else value, why, option or None)
         for (noun, why), count in sorted(self._dropped.items()):
@@ -174,7 +172,10 @@ class Bodies:
         self._dropped.clear()
 
     def model(self, one: Feature, elevation: float, taken: set[str]) -> etree._Element | None:
-        """A static model of an object in local metres, or None where it has no body. elevation: metres, its level's."""
+        """Build a static model of an object in local metres, or return None if it has no body.
+
+        elevation: elevation of its level, in metres.
+        """
         properties = one.properties
         kind = str(properties.get("kind"))
         try:
@@ -194,7 +195,7 @@ class Bodies:
             self._dropped[f"objects of kind {kind}", error.detail[:200]] += 1
             return None
         if not shapes:
-            self._dropped[f"objects of kind {kind}", "no solid is known: supply a height, shapes or a model"] += 1
+            self._dropped[f"objects of kind {kind}", "its solid is unknown: supply a height, shapes or a model"] += 1
             return None
         name = properties.get("name")
         name = free_name(name if isinstance(name, str) and name else one.id, taken)
@@ -203,9 +204,9 @@ class Bodies:
         return self._static(name, pose, shapes, COLOURS.get(kind), properties.get("gazebo"))
 
     def _measure_or_default(
-        self, noun: str, option: str, why: str = "the objects tell none", *, otherwise: float = 0.0
+        self, noun: str, option: str, why: str = "the objects have none", *, otherwise: float = 0.0
     ) -> float:
-        """A measure that the options say, else the other one; it is declared."""
+        """Return a measure from the options, else the other value, and report it as filled in."""
         setting = getattr(self.usual, option)
         value = float(otherwise if setting is None else setting)
         self._filled.add((noun, value, why, option))
@@ -218,7 +219,7 @@ class Bodies:
             self._box.append((west, south, east, north))
 
     def _with_files(self, shapes: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
-        """The shapes whose words are known and whose files are there; the files go along."""
+        """Return the supported shapes whose files are stored, and add these files."""
         out = []
         for shape in shapes:
             if is_absent(shape):
@@ -227,7 +228,7 @@ class Bodies:
                 continue
             if str(shape.get("type")) not in sdf.SHAPES:
                 self._dropped[
-                    f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"
+                    f"shapes of objects of kind {kind}", f"Gazebo does not support {str(shape.get('type'))[:40]}"
                 ] += 1
                 continue
             if shape["type"] in ("mesh", "heightmap"):
@@ -243,14 +244,16 @@ class Bodies:
             try:
                 sdf.geometry_element(shape, shape.get("uri"))
             except (LookupError, TypeError, ValueError):
-                self._dropped[f"shapes of objects of kind {kind}", f"a {shape['type']} without its measures"] += 1
+                self._dropped[f"shapes of objects of kind {kind}", f"a {shape['type']} has no valid dimensions"] += 1
                 continue
             out.append(shape)
         return out
 
     def _from_geometry(self, one: Feature, kind: str, elevation: float) -> tuple[list[dict[str, Any]], list[float]]:
-        """Shapes and pose of an outline in local metres, as ``app.model.obstacles`` has it; none where no height is
-        known. What stands in no way is seen, and nothing collides with it."""
+        """Return shapes and pose of an outline in local metres (see ``app.model.obstacles``).
+
+        No shapes if the height is unknown. Kinds that are no obstacles get a visual without a collision.
+        """
         properties, geometry = one.properties, one.geometry
         if shapely.is_empty(geometry):
             return [], []
@@ -286,15 +289,17 @@ class Bodies:
         return shapes, [float(middle[0]), float(middle[1]), round(elevation + base, 9) + 0.0, 0.0, 0.0, 0.0]
 
     def _flat_shapes(self, properties: Mapping[str, Any], kind: str, flat: Any, height: float) -> list[dict[str, Any]]:
-        """What is seen of an outline that stands in no way: as high as it says, a door as it stands open, else a plate
-        on the ground; none of a kind that is not drawn and says no height."""
+        """Return the visual shapes of an outline that is no obstacle.
+
+        Its own height if it has one, an open door, or a plate on the ground; none for kinds that are not drawn.
+        """
         if not (math.isfinite(height) and height > 0.0):
             if kind == "door":
-                why = "the objects tell none; doors stand open: nothing collides"
+                why = "the objects have none; doors are open and have no collision"
                 height = self._measure_or_default("height of door", "door_height", why)
             elif kind in DRAWN:
                 height = PLATE
-                self._filled.add((f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it", ""))
+                self._filled.add((f"height of {kind}", PLATE, "drawn on the ground without a collision", ""))
             else:
                 return []
         shapes: list[dict[str, Any]] = []
@@ -308,18 +313,18 @@ class Bodies:
         return [{**shape, "visual": True} for shape in shapes]
 
     def _height(self, kind: str) -> float:
-        """How high a body is that does not say it; the top of what is solid for a laser, whatever it is."""
+        """Return the default height of a body: the top of anything that is solid for a laser."""
         return self._measure_or_default(f"height of {kind}", HEIGHTS.get(kind, "obstacle_height"))
 
     def _width(self, one: Feature) -> float | None:
-        """How wide a line or a point is that does not say it, where the options do; declared in any case."""
+        """Return the default width of a line or point if the options set one; reported in any case."""
         kind = str(one.properties.get("kind"))
         dimension = shapely.get_dimensions(one.geometry)
         if dimension > 1 or obstacles.has_width(one.properties) or obstacles.object_width(one.properties) is None:
             return None
         default = obstacles.object_width(one.properties) or 0.0
-        if dimension == 1 and default > WALL:  # a hedge or a river is none of the lines that are as thin as walls
-            self._filled.add((f"width of {kind}", default, "the objects tell none", ""))
+        if dimension == 1 and default > WALL:  # kinds wider than walls: hedge, river
+            self._filled.add((f"width of {kind}", default, "the objects have none", ""))
             return None
         if dimension == 1:
             return self._measure_or_default(f"width of {kind}", "wall_thickness", otherwise=default)
@@ -335,9 +340,9 @@ class Bodies:
         colour: str | None,
         source_properties: Any,
     ) -> etree._Element:
-        """A static model with a collision and a visual for each shape, or what of both it has.
+        """Build a static model with a collision and a visual for each shape, or only one of the two.
 
-        colour: the parameter that says the colour of shapes that tell none, if one does.
+        colour: parameter with the colour of shapes that have none, if there is one.
         """
         model = etree.Element("model", name=name)
         if any(pose):
@@ -361,16 +366,16 @@ class Bodies:
         return model
 
     def _colour_or_default(self, option: str) -> str:
-        """A colour that the options say; it is declared."""
+        """Return a colour from the options and report it as filled in."""
         value: Colour = getattr(self.usual, option)
         noun = next((kind for kind, name in COLOURS.items() if name == option), option.removesuffix("_colour"))
-        self._filled.add((f"colour of {noun}", value, "no source tells one", option))
+        self._filled.add((f"colour of {noun}", value, "no source specifies one", option))
         return f"{value[0]:g} {value[1]:g} {value[2]:g} 1"
 
     # --- ground and walls ----------------------------------------------------------------------------------------
     @property
     def ground_size(self) -> list[float]:
-        """Width and depth in metres of a ground that all made objects and walls stand on, at least 100 × 100."""
+        """Return width and depth in metres of a ground under all generated objects and walls, at least 100 × 100."""
         return self._ground()[1]
 
     def _ground(self) -> tuple[list[float], list[float]]:
@@ -383,20 +388,20 @@ class Bodies:
         return [float(v) for v in middle], [float(v) for v in size]
 
     def ground(self) -> etree._Element:
-        """A plane at height 0."""
+        """Create a plane at height 0."""
         middle, size = self._ground()
         shape = {"type": "plane", "normal": [0.0, 0.0, 1.0], "size": size}
         return self._static("ground_plane", [*middle, 0.0, 0.0, 0.0, 0.0], [shape], "ground_colour", None)
 
     def walls(self, grid: OccupancyGrid, name: str, threshold: int, elevation: float) -> etree._Element | None:
-        """A grid's occupied cells as one static model, whose mesh lies in ``models/<name>/meshes``."""
+        """Build one static model of a grid's occupied cells, with its mesh in ``models/<name>/meshes``."""
         occupied = (grid.cells >= threshold) & (grid.cells != UNKNOWN)
         if not occupied.any():
-            self.context.warn(f"no cell has a value of {threshold} or more: there are no walls", where=name)
+            self.context.warn(f"no cell has a value of {threshold} or more; no walls are written", where=name)
             return None
         file = f"{name}/meshes/{name}.stl"
         self.files[f"{MODELS}/{file}"] = stl(extrude(occupied, grid.resolution, self.usual.wall_height))
-        self.context.fill("height of walls", self.usual.wall_height, "a grid tells none", "wall_height")
+        self.context.fill("height of walls", self.usual.wall_height, "a grid has none", "wall_height")
         x, y, yaw = grid.origin
         corners = grid.corners()
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -406,7 +411,7 @@ class Bodies:
 
 
 def _colour(shape: Mapping[str, Any]) -> str | None:
-    """The colour that a shape tells: three or four numbers from 0 to 1, as Gazebo reads them."""
+    """Return a shape's own colour: three or four numbers from 0 to 1, as Gazebo reads them."""
     colour = shape.get("colour")
     if not isinstance(colour, (list, tuple)) or len(colour) not in (3, 4):
         return None
@@ -420,7 +425,7 @@ def _is_script(material: Any) -> bool:
 
 
 def _material(visual: etree._Element, colour: str | None, script: Any) -> None:
-    """The colour of a kind, or the material script that a list names."""
+    """Add the colour of a kind, or the material script that a list names."""
     if _is_script(script):
         material = sdf.child(sdf.child(visual, "material"), "script")
         uri = script.get("uri")
@@ -437,24 +442,24 @@ def _material(visual: etree._Element, colour: str | None, script: Any) -> None:
 
 
 def _positive(value: Any, otherwise: float) -> float:
-    """A number of metres; the other one where there is none. A base may be negative."""
+    """Return a finite number of metres (negative for a base below ground), else ``otherwise``."""
     usable = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if usable else otherwise
 
 
 def _relative_to(geometry: Any, middle: NDArray[np.float64]) -> Any:
-    """A geometry seen from above, in metres around a point."""
+    """Convert a geometry to 2-D metres relative to a point."""
     return shapely.transform(shapely.force_2d(geometry), lambda at: at - middle)
 
 
 def _lower(shapes: list[dict[str, Any]], depth: float) -> list[dict[str, Any]]:
-    """The shapes so much lower."""
+    """Move shapes down by ``depth`` metres."""
     poses = [shape.get("pose", [0.0] * 6) for shape in shapes]
     return [{**shape, "pose": [*p[:2], p[2] - depth, *p[3:]]} for shape, p in zip(shapes, poses, strict=True)]
 
 
 def _areas(area: Any, height: float) -> list[dict[str, Any]]:
-    """Polygons, each as a box where it is a rectangle, else as rings to be extruded."""
+    """Convert polygons to boxes if rectangular, else to rings to extrude."""
     if shapely.area(area) <= 0.0:
         return []
     if shapely.get_type_id(area) != 3:
@@ -483,7 +488,10 @@ def _areas(area: Any, height: float) -> list[dict[str, Any]]:
 
 
 def _segments(line: Any, height: float, width: float, *, square: bool) -> list[dict[str, Any]]:
-    """A line as a box for each segment, which overlap where they meet. square: whether its ends reach on as far."""
+    """Convert a line to one box per segment; boxes overlap at joints.
+
+    square: whether the line's ends are extended by half the width, too.
+    """
     at = shapely.get_coordinates(line)
     steps = np.diff(at, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -502,9 +510,9 @@ def _segments(line: Any, height: float, width: float, *, square: bool) -> list[d
 
 # --- a grid's walls ----------------------------------------------------------------------------------------------
 def rectangles(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The occupied cells as rectangles (first column, past the last, first row, past the last): int64 [n, 4].
+    """Cover the occupied cells with rectangles: int64 [n, 4], (first column, end column, first row, end row).
 
-    Runs of a row, those of equal extent in consecutive rows joined: each cell is in exactly one.
+    Runs of equal extent in consecutive rows are joined; each cell is in exactly one rectangle. Ends are exclusive.
     """
     rows, starts, ends = _runs(occupied)
     order = np.lexsort((rows, ends, starts))
@@ -517,7 +525,7 @@ def rectangles(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Row, first column and past the last of each run of True along the rows of [h, w]."""
+    """Return row, first column and exclusive end column of each run of True along the rows of [h, w]."""
     change = np.zeros((mask.shape[0], mask.shape[1] + 1), bool)
     change[:, 0], change[:, -1] = mask[:, 0], mask[:, -1]
     np.not_equal(mask[:, 1:], mask[:, :-1], out=change[:, 1:-1])
@@ -526,8 +534,11 @@ def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 
 def extrude(occupied: NDArray[np.bool_], resolution: float, height: float) -> NDArray[np.float32]:
-    """The surface of all occupied cells from 0 to this height: float32 [n, 3, 3], outward, metres from the corner of
-    cell (0, 0). Tops and bottoms are rectangles, sides the runs of cell edges between occupied and not."""
+    """Build the outward surface of all occupied cells from 0 to this height: float32 [n, 3, 3].
+
+    In metres from the corner of cell (0, 0). Tops and bottoms are rectangles, sides are runs of cell edges between
+    occupied and other cells.
+    """
     x0, x1, y0, y1 = rectangles(occupied).T
     flat = np.stack([_corner(x0, y0), _corner(x1, y0), _corner(x1, y1), _corner(x0, y1)], axis=1)
     quads = [_level(flat, 1), _level(flat[:, ::-1], 0)]
@@ -550,12 +561,12 @@ def _corner(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _level(corners: NDArray[np.int64], z: int) -> NDArray[np.int64]:
-    """[n, k, 2] as [n, k, 3] at this height."""
+    """Extend corners [n, k, 2] to [n, k, 3] at this height."""
     return np.concatenate([corners, np.full((*corners.shape[:2], 1), z, np.int64)], axis=2)
 
 
 def stl(triangles: NDArray[np.float32]) -> bytes:
-    """Binary STL of float32 [n, 3, 3]."""
+    """Encode triangles float32 [n, 3, 3] as binary STL."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     out = np.zeros(len(triangles), record)
     out["corners"] = triangles

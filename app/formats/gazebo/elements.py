@@ -1,4 +1,4 @@
-"""The elements of SDFormat.
+"""Element names of SDFormat.
 
 Source: gazebosim/sdformat, sdf/1.0 to sdf/1.12 (``<element name=…>`` of all descriptions).
 """
@@ -53,4 +53,4 @@ _NAMES = """
     xx xy xyz xz y yp yq yr yy yz z zp zq zr zz
 """
 ELEMENTS = frozenset(_NAMES.split())
-"""Their names, of all versions and places: what stands where is not told apart."""
+"""Element names of all versions and parents; nesting is not distinguished."""

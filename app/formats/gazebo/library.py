@@ -1,4 +1,4 @@
-"""The files of an upload as Gazebo finds them: models by name, and the files that they refer to."""
+"""File lookup in an upload as in Gazebo: models by name, and the files that they refer to."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from app.formats import Files
 from app.formats.gazebo.sdf import NEWEST, without_comments
 
 MODELS = "models"
-"""The folder beside ``world.sdf`` that Gazebo is to look for models in."""
+"""Directory beside ``world.sdf`` with the models; add it to Gazebo's model path."""
 
 BODILESS = frozenset({"sun", "ground_plane"})
-"""Models that uploads seldom hold and that stand in no robot's way."""
+"""Models that uploads rarely contain and that are no obstacles."""
 _REFERENCE = re.compile(
     rb"<(uri|filename|albedo_map|normal_map|roughness_map|metalness_map|environment_map|light_map|emissive_map|"
     rb"ambient_occlusion_map|glossiness_map|specular_map|diffuse|normal|texture|sky|cubemap_uri)\b[^<>]*>([^<>]{1,1024})</"
@@ -22,7 +22,7 @@ _UNSAFE = re.compile(r"[\x00-\x1f\\%~$]")
 
 
 class Library:
-    """The files of an upload, found by what SDF calls them. Nothing outside of them is ever looked for."""
+    """Files of an upload, found by SDF references. Files outside the upload are never read."""
 
     def __init__(self, files: Files) -> None:
         self.files = files
@@ -37,7 +37,7 @@ class Library:
         self._cache: dict[tuple[str, str], str | None] = {}
 
     def find(self, reference: str, near: str) -> str | None:
-        """The file or folder of the upload that a reference in the file ``near`` means; None where there is none."""
+        """Find the upload's file or directory for a reference in the file ``near``, or return None."""
         folder = near.rpartition("/")[0]
         key = (reference, folder)
         if key not in self._cache:
@@ -67,27 +67,27 @@ class Library:
         return min(fitting, key=lambda name: (-_common_folders(name, folder), name.count("/"), name), default=None)
 
     def model_root(self, reference: str, file: str) -> str:
-        """The folder around the model that a reference begins with: ``a/b`` for ``model://NAME/x`` in a/b/NAME/x."""
+        """Return the parent directory of a referenced model: ``a/b`` for ``model://NAME/x`` in a/b/NAME/x."""
         path = plain_path(reference) or ""
         if reference.lower().startswith("file://") and path.startswith(f"{MODELS}/"):
             path = path[len(MODELS) + 1 :]
         return file[: -len(path)].rstrip("/") if path and file.endswith(path) else file.rpartition("/")[0]
 
     def inside(self, folder: str) -> list[str]:
-        """The files of a folder and of those in it, sorted."""
+        """Return the files below a directory, sorted."""
         if folder not in self._inside:
             self._inside[folder] = sorted(n for n in self.files if n.startswith(folder + "/"))
         return self._inside[folder]
 
     def files_beside(self, file: str) -> list[str]:
-        """A file and those beside it that are called like it: a mesh's materials and texture."""
+        """Return a file and its neighbours with the same stem: a mesh's materials and texture."""
         folder, _, base = file.rpartition("/")
         name = base.rpartition(".")[0] or base
         same = [f"{folder}/{b}" if folder else b for b in self._by_base if b.rpartition(".")[0] == name]
         return [file, *sorted(n for n in same if n in self.files and n != file)]
 
     def model_file(self, folder: str) -> str | None:
-        """The SDF file of a model's folder: the newest version that ``model.config`` names, else ``model.sdf``."""
+        """Return the SDF file of a model directory: the newest version in ``model.config``, else ``model.sdf``."""
         config = self.files.get(f"{folder}/model.config") or self.files.get(f"{folder}/manifest.xml") or b""
         candidates: list[tuple[tuple[int, int], str]] = []
         for version, name in _CONFIG.findall(without_comments(config)):
@@ -106,13 +106,13 @@ _CONFIG = re.compile(rb"<sdf(?:\s+version\s*=\s*[\"']([^\"'<>]{0,20})[\"'])?[^<>
 
 
 def parse_version(text: str | None) -> tuple[int, int] | None:
-    """``1.7`` as (1, 7); None where it is no version."""
+    """Parse ``1.7`` as (1, 7); return None if it is not a version."""
     match = re.fullmatch(r"\s*(\d{1,3})\.(\d{1,3})(\.\d{1,3})?\s*", text or "", re.ASCII)
     return (int(match[1]), int(match[2])) if match else None
 
 
 def plain_path(reference: str) -> str | None:
-    """The path of a reference below some folder of models; None for addresses of other machines and unsafe paths."""
+    """Return a reference's path below a model directory, or None for remote addresses and unsafe paths."""
     text = reference.strip()
     if _FETCHED.match(text):
         return None
@@ -126,14 +126,14 @@ def plain_path(reference: str) -> str | None:
 
 
 def is_remote(reference: str) -> bool:
-    """Whether a reference names another machine or package system (never fetched)."""
+    """Check for a reference to another machine or package system (never fetched)."""
     return _FETCHED.match(reference.strip()) is not None
 
 
 def references(data: bytes) -> list[str]:
-    """What an SDF file refers to, found without parsing it: each address once, in order.
+    """Find the references of an SDF file without parsing it: each address once, in order.
 
-    Also in comments: a model that stands in one for the time being goes along with its world.
+    Includes comments: a model that is temporarily commented out is stored with its world.
     """
     out: dict[str, None] = {}
     for _, text in _REFERENCE.findall(data):
@@ -146,12 +146,12 @@ def references(data: bytes) -> list[str]:
 
 
 def required_files(library: Library, main: str, more: Iterable[str] = ()) -> dict[str, str]:
-    """What a world needs of an upload, directly or through other models: path in the upload -> path as it is served.
+    """Return the files that a world needs, directly or indirectly: path in the upload -> path in the exported map.
 
-    A model's folder is needed as a whole and is served as ``models/NAME/…``; a mesh beside the models as
-    ``models/<file>``; what a world names relative to itself keeps its place beside it. more: further references.
+    A model directory is needed completely and is exported as ``models/NAME/…``, a mesh beside the models as
+    ``models/<file>``; files named relative to the world keep their relative path. more: further references.
     """
-    roots: dict[str, tuple[str, str]] = {}  # a needed folder or file -> the folder above it, and the one it goes to
+    roots: dict[str, tuple[str, str]] = {}  # needed directory or file -> (its parent, target directory)
     todo, seen = [main], set()
     extra = list(more)
     while todo:
@@ -190,7 +190,7 @@ def required_files(library: Library, main: str, more: Iterable[str] = ()) -> dic
 
 
 def _join_path(folder: str, path: str) -> str | None:
-    """A path relative to a folder, without leaving the upload; None where it would."""
+    """Join a relative path to a directory; return None if the result leaves the upload."""
     parts = folder.split("/") if folder else []
     for part in path.split("/"):
         if part in ("", "."):
@@ -205,7 +205,7 @@ def _join_path(folder: str, path: str) -> str | None:
 
 
 def _common_folders(name: str, folder: str) -> int:
-    """How many folders two paths have in common, from the first on."""
+    """Count the leading directories that two paths share."""
     count = 0
     for a, b in zip(name.split("/"), folder.split("/") if folder else [], strict=False):
         if a != b:

@@ -1,4 +1,4 @@
-"""What stands in models: shapes with their places, through included and nested models and their frames."""
+"""Shapes of models and their poses, through included and nested models and their frames."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from app.formats.gazebo.sdf import (
 )
 
 MAX_NESTED_MODELS = 32
-"""Models in models: real worlds have three."""
+"""Maximum nesting depth of models; real worlds have three levels."""
 
 MAX_SHAPES = 250_000
-"""Shapes of one file, all includes unfolded."""
+"""Maximum number of shapes of one file after resolving all includes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A solid of a model: its words (no pose), and its place in the model's frame as float64 [4, 4]."""
+    """Solid of a model: its description (without pose), and its pose in the model's frame as float64 [4, 4]."""
 
     words: Mapping[str, Any]
     place: Matrix
 
     def as_dict(self, *, visual: bool = False) -> dict[str, Any]:
-        """As an item of ``properties.shapes``."""
+        """Return the shape as an item of ``properties.shapes``."""
         out = dict(self.words)
         pose = six(self.place)
         if any(pose):
@@ -53,7 +53,7 @@ class Shape:
 
 @dataclass(slots=True)
 class Body:
-    """The solids of a model in its own frame, and the frames in it that others may name."""
+    """Solids of a model in its own frame, and the model's frames that others can refer to."""
 
     collisions: list[Shape] = field(default_factory=list)
     visuals: list[Shape] = field(default_factory=list)
@@ -63,11 +63,11 @@ class Body:
     kind: str = "model"
 
     def frame(self, name: str) -> Matrix | None:
-        """A frame in the model (``link``, ``model::link``) as float64 [4, 4]; None where there is none."""
+        """Return a frame in the model (``link``, ``model::link``) as float64 [4, 4], or None."""
         return None if self.frames is None else self.frames.find(name)
 
     def shapes(self) -> list[dict[str, Any]]:
-        """What collides; of a model where nothing does, or not all that does is in the upload, also what is seen."""
+        """Return the collision shapes; also the visual ones if collisions are missing or incomplete in the upload."""
         out = [s.as_dict() for s in self.collisions]
         if not out or any(is_absent(s) for s in out):
             out += [s.as_dict(visual=True) for s in self.visuals]
@@ -75,7 +75,7 @@ class Body:
 
 
 class ModelFlattener:
-    """Models with all that they include as solids in one frame.
+    """Resolver of models and their includes to solids in one frame.
 
     served: path in the upload -> path among the objects' resources.
     """
@@ -89,12 +89,12 @@ class ModelFlattener:
         self._missing: dict[str, int] = {}
 
     def body(self, model: etree._Element, file: str) -> Body:
-        """A model, or a light, without its own pose."""
+        """Resolve a model or a light, without its own pose."""
         out = Body(name=model.get("name", ""), pose=parse_pose(model), kind=str(model.tag))
         if model.tag != "model":
             return out
         if self._depth >= MAX_NESTED_MODELS:
-            raise unreadable_error(f"models in models are nested more than {MAX_NESTED_MODELS} deep", model)
+            raise unreadable_error(f"models are nested more than {MAX_NESTED_MODELS} levels deep", model)
         self._depth += 1
         frames = _Frames(self, file)
         inner: list[tuple[str, Body]] = []
@@ -138,11 +138,11 @@ class ModelFlattener:
     def _check_count(self, more: int, element: etree._Element) -> None:
         self._count += more
         if self._count > MAX_SHAPES:
-            reason = f"the models have more than {MAX_SHAPES} shapes once their includes are unfolded"
+            reason = f"the models have more than {MAX_SHAPES} shapes with all includes"
             raise TooLarge(reason, [Problem(reason, line=element.sourceline, where=element_path(element))])
 
     def include(self, element: etree._Element, file: str) -> Body | None:
-        """The model that an ``<include>`` names; None, noted as missing, where the upload does not have it."""
+        """Resolve the model of an ``<include>``; a model that is not in the upload is noted as missing (None)."""
         reference = element_text(element, "uri")
         target = self.library.find(reference, file) if reference else None
         path = None
@@ -154,11 +154,11 @@ class ModelFlattener:
         return self.file(path, element)
 
     def missing(self, reference: str) -> None:
-        """Note a reference that the upload cannot answer, for one warning in the end."""
+        """Count a reference that is not in the upload, for one warning in the end."""
         self._missing[reference] = self._missing.get(reference, 0) + 1
 
     def file(self, path: str, element: etree._Element | None = None) -> Body | None:
-        """The model of a file; each file is unfolded once. Raises UnreadableFile for one that includes itself."""
+        """Resolve the model of a file, once per file. Raises UnreadableFile if it includes itself."""
         if path in self._open:
             raise unreadable_error(f"{path} includes itself", element)
         if path not in self._files:
@@ -179,7 +179,7 @@ class ModelFlattener:
         return self._files[path]
 
     def geometry(self, element: etree._Element | None, file: str) -> list[dict[str, Any]]:
-        """The shapes of a ``<geometry>``: none where it is empty; see ``is_absent``."""
+        """Return the shapes of a ``<geometry>``, none if it is empty; see ``is_absent``."""
         if element is None:
             return []
         out: list[dict[str, Any]] = []
@@ -199,7 +199,7 @@ class ModelFlattener:
         return out
 
     def _shape(self, tag: str, e: etree._Element, file: str) -> dict[str, Any] | None:
-        """A shape. One that is unknown or whose file is not in the upload is noted as missing, and stays solid."""
+        """Convert a shape element. Unsupported shapes and missing files are counted as missing and stay solid."""
         if tag == "box":
             return {"type": tag, "size": vector(e, "size", 3, (1.0, 1.0, 1.0))}
         if tag in ("cylinder", "capsule"):
@@ -234,27 +234,27 @@ class ModelFlattener:
         return {"type": tag, "uri": f"<{tag}>"}
 
     def report(self) -> None:
-        """One warning for each kind of thing that is not there."""
+        """Warn once for each missing reference."""
         for reference, count in sorted(self._missing.items()):
             often = f" ({count} times)" if count > 1 else ""
             if reference.startswith("<"):
-                text = f"a geometry of the kind {reference[:40]}{often} is kept, but no solid is known for it"
+                text = f"unsupported geometry {reference[:40]}{often}; it is stored without a solid"
             elif not reference:
-                text = f"an include or mesh without an address{often} is kept as it is"
+                text = f"an include or mesh has no URI{often}; it is stored unchanged"
             elif is_remote(reference):
-                text = f"{reference[:200]}{often} is not fetched: supply its folder in models/ with the upload"
+                text = f"{reference[:200]}{often} is remote and not fetched; upload its directory in models/"
             else:
-                text = f"{reference[:200]}{often} is not in the upload: supply its files in models/"
+                text = f"{reference[:200]}{often} is not in the upload; upload its files in models/"
             self.context.warn(text, where=reference[:200] or None)
 
 
 def is_absent(shape: Mapping[str, Any]) -> bool:
-    """Whether a shape is a solid that the upload does not tell: a mesh without its file, an unknown geometry."""
+    """Check for a solid that the upload does not define: a mesh without its file, an unsupported geometry."""
     return "uri" in shape and "file" not in shape
 
 
 def absent_model(include: etree._Element) -> list[dict[str, Any]]:
-    """The solids of an ``<include>`` whose model is not in the upload: unknown, but for Gazebo's own sun and ground."""
+    """Return placeholder solids of an ``<include>`` without its model; none for Gazebo's own sun and ground."""
     reference = element_text(include, "uri")
     name = reference.rstrip("/").rpartition("/")[2].lower().replace(" ", "_")
     return [] if name in BODILESS else [{"type": "model", "uri": reference}]
@@ -268,19 +268,19 @@ def _with_path(error: UnreadableFile | TooLarge, path: str) -> UnreadableFile | 
 def _pair(point: etree._Element) -> list[float]:
     values = numbers(element_text(point), point)
     if len(values) != 2:
-        raise unreadable_error(f"a point must have 2 numbers, it has {len(values)}", point)
+        raise unreadable_error(f"a point must have 2 numbers, not {len(values)}", point)
     return values
 
 
 def placement(element: etree._Element, inside: Body) -> Matrix | None:
-    """The inverse of the frame in a model that its pose is meant for (``placement_frame``), if there is one."""
+    """Return the inverse of the model frame that its pose refers to (``placement_frame``), or None."""
     name = element.get("placement_frame") or element_text(element, "placement_frame")
     at = inside.frame(name) if name else None
     return None if at is None else np.asarray(np.linalg.inv(at), np.float64)
 
 
 class _Frames:
-    """The frames of a model (or of a world) by name, each resolved once along ``relative_to``."""
+    """Frames of a model (or of a world) by name, each resolved once along ``relative_to``."""
 
     def __init__(self, unfolder: ModelFlattener, file: str) -> None:
         self.unfolder, self.file = unfolder, file
@@ -289,18 +289,20 @@ class _Frames:
         self._placed: dict[str, Matrix] = {}
 
     def add(self, name: str, pose: Pose | None, attached: str, element: etree._Element) -> None:
-        """A link, frame or joint. attached: the frame its pose stands in where it names none itself."""
+        """Add a link, frame or joint. attached: frame of its pose if it names none."""
         self._entries.setdefault(name, (pose or ZERO, attached, None, element))
 
     def add_model(self, name: str, pose: Pose, body: Body, back: Matrix | None, element: etree._Element) -> None:
-        """A nested model, with the frames in it. back: what ``placement`` gave."""
+        """Add a nested model with its frames. back: result of ``placement``."""
         if name not in self._entries:
             self._inner[name] = body
         self._entries.setdefault(name, (pose, "", back, element))
 
     def place(self, name: str) -> Matrix:
-        """A frame in the model's frame. A name that is not known, or whose frames go round in a circle, is warned of
-        and stands where the model does."""
+        """Return a frame's pose in the model's frame as float64 [4, 4].
+
+        An unknown name or a cycle of frames gives a warning and the model's own frame.
+        """
         if name in self._placed:
             return self._placed[name]
         chain: list[str] = []
@@ -327,23 +329,23 @@ class _Frames:
             if frame is not None:
                 return np.asarray(self.place(outer) @ frame, np.float64)
         element = self._entries[chain[-1]][3] if chain else None
-        circle = "goes round in a circle" if name in chain else "is not known"
+        circle = "is part of a cycle" if name in chain else "is unknown"
         line = None if element is None else element.sourceline
         location = None if element is None else element_path(element)
         self.unfolder.context.warn(
-            f"the frame {name[:80]!r} {circle}: its parent's is taken", line=line, where=location
+            f"the frame {name[:80]!r} {circle}; the parent's frame is used", line=line, where=location
         )
         return np.eye(4)
 
     def within(self, pose: Pose | None, parent: Matrix, element: etree._Element) -> Matrix:
-        """Something with a pose in a frame of this model."""
+        """Return a pose in a frame of this model as float64 [4, 4] in the model's frame."""
         if pose is None:
             return parent
         if not pose.relative:
             return np.asarray(parent @ pose.matrix, np.float64)
         if pose.relative in self._entries or "::" in pose.relative or pose.relative == "__model__":
             return np.asarray(self._relative(pose.relative) @ pose.matrix, np.float64)
-        reason = f"the frame {pose.relative[:80]!r} is not known: its parent's is taken"
+        reason = f"the frame {pose.relative[:80]!r} is unknown; the parent's frame is used"
         self.unfolder.context.warn(reason, line=element.sourceline, where=element_path(element))
         return np.asarray(parent @ pose.matrix, np.float64)
 
@@ -351,7 +353,7 @@ class _Frames:
         return self.place(name) if name in self._entries else self._base(name, ())
 
     def find(self, name: str) -> Matrix | None:
-        """A frame of this model or, as ``model::frame``, of one in it; None where there is none."""
+        """Return a frame of this model or, as ``model::frame``, of a nested one; None if unknown."""
         if name in self._entries:
             return self.place(name)
         outer, _, inner_name = name.partition("::")

@@ -31,7 +31,7 @@ SAME_POSE = 1e-6
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The worlds of a file. Raises UnreadableFile (with file, line and element) or TooLarge."""
+    """Read the worlds of a file. Raises UnreadableFile (with file, line and element) or TooLarge."""
     main = context.main or next(iter(files))
     library = Library(files)
     if not sdf.is_sdf(files[main]) and yaml_lists.detect(main, files[main]):
@@ -43,7 +43,10 @@ def read(files: Files, context: ReadContext) -> Layers:
     version = parse_version(root.get("version"))
     if version is None or not (1, 4) <= version <= sdf.NEWEST:
         version_text = root.get("version")
-        context.warn(f"SDFormat version {version_text!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
+        context.warn(
+            f"SDFormat version {version_text!r} is not one of 1.4 to 1.11; the file is read as 1.7",
+            line=root.sourceline,
+        )
     served = required_files(library, main)
     reader = _Reader(ModelFlattener(library, served, context), main, {served[n]: files[n] for n in served}, context)
     worlds = root.findall("world")
@@ -54,14 +57,14 @@ def read(files: Files, context: ReadContext) -> Layers:
         alone = etree.Element("world")
         alone.extend(list(sdf.iter_models(root)))
         if not len(alone):
-            raise sdf.unreadable_error("there is no world, model or light in it", root)
+            raise sdf.unreadable_error("the file contains no world, model or light", root)
         reader.world(alone, _key(main), root.get("version", ""), alone=True)
     reader.unfolder.report()
     return reader.layers()
 
 
 def model_files(library: Library, main: str) -> list[str]:
-    """What lies in a lone model's own folder."""
+    """Return the files in a single model's own directory."""
     folder = main.rpartition("/")[0]
     if not folder or (main.rpartition("/")[2] != "model.sdf" and f"{folder}/model.config" not in library.files):
         return []
@@ -69,14 +72,14 @@ def model_files(library: Library, main: str) -> list[str]:
 
 
 def _key(main: str) -> str:
-    """A world's name in the store: its file's path without the ending."""
+    """Return a world's key: its file path without the extension."""
     folder, slash, base = main.rpartition("/")
     return folder + slash + sdf.stem(base)
 
 
 @dataclass(slots=True)
 class _Reader:
-    """The objects and the rest of a file's worlds."""
+    """Reader of the objects and the rest of a file's worlds."""
 
     unfolder: ModelFlattener
     main: str
@@ -87,7 +90,7 @@ class _Reader:
     datum: Datum | None = None
 
     def layers(self) -> Layers:
-        """All of it. Objects of one name get ids of their own."""
+        """Return the layers. Objects with the same name get unique ids."""
         ids = unique_ids(name for name, _, _ in self.rows)
         rows = [(i, g, p) for i, (_, g, p) in zip(ids, self.rows, strict=True)]
         level = self.context.level
@@ -98,7 +101,7 @@ class _Reader:
         return Layers(parts, self.datum)
 
     def world(self, world: etree._Element, key: str, version: str, *, alone: bool = False) -> None:
-        """Take a world apart."""
+        """Read a world: its objects, and the rest as a document."""
         elements = []
         frames = WorldFrames(self.unfolder, self.main)
         for element in world.iterchildren("frame"):
@@ -118,7 +121,11 @@ class _Reader:
             source_pose = element_pose or body_pose or sdf.ZERO
             simple = not source_pose.relative and back is None
             if name in seen:
-                self.context.warn("two objects of the world have this name", line=element.sourceline, where=name[:80])
+                self.context.warn(
+                    "duplicate object name in the world; the objects get unique ids",
+                    line=element.sourceline,
+                    where=name[:80],
+                )
             pose = list(source_pose.values) if simple or name in seen else sdf.six(frames.place(name))
             seen.add(name)
             source_properties: dict[str, Any] = {"world": key}
@@ -148,7 +155,7 @@ class _Reader:
         return self.unfolder.body(element, self.main)
 
     def _name(self, element: etree._Element, body: Body | None) -> str:
-        """What the object is called: an include without a name like its model."""
+        """Return the object's name; an include without one is named like its model."""
         name = sdf.element_text(element, "name") if element.tag == "include" else element.get("name", "")
         if not name:
             reference = sdf.element_text(element, "uri").rstrip("/")
@@ -182,10 +189,10 @@ class _Reader:
         properties[NAME] = source_properties
         self.rows.append((name, shape, properties))
 
-    # what the world was saved with
+    # saved state and datum
 
     def _state(self, world: etree._Element) -> dict[str, list[float]]:
-        """Poses of the models of the last ``<state>``, by name."""
+        """Return the poses of the models in the last ``<state>``, by name."""
         out = {}
         for state in world.iterchildren("state"):
             for model in state.iterchildren("model", "light"):
@@ -193,7 +200,7 @@ class _Reader:
                 if pose is not None:
                     out[model.get("name", "")] = list(pose.values)
             if state.find("insertions") is not None:
-                reason = "the state's <insertions> are not kept: save the world with them as models"
+                reason = "the <insertions> of the <state> are dropped; save the world with them as models"
                 self.context.warn(reason, line=state.sourceline, where="state")
         return out
 
@@ -201,24 +208,28 @@ class _Reader:
         off = [p["name"] for _, _, p in self.rows if p.get(NAME, {}).get("world") == key and "state" in p[NAME]]
         if off:
             self.context.warn(
-                f"the saved <state> moves {len(off)} of {len(names)} objects ({_shorten(off)}); it is not kept, the "
-                "poses of the world itself are",
+                f"the saved <state> is dropped: it moves {len(off)} of {len(names)} objects ({_shorten(off)}); the "
+                "poses in <world> are kept",
                 where="state",
             )
         strangers = sorted(set(moved) - names)
         if strangers:
             self.context.warn(
-                f"the <state> names {len(strangers)} that are not there: {_shorten(strangers)}", where="state"
+                f"the <state> names {len(strangers)} unknown objects: {_shorten(strangers)}; they are ignored",
+                where="state",
             )
 
     def _datum(self, element: etree._Element | None) -> Datum | None:
-        """The datum that spherical coordinates mean; None where they tell no place on earth."""
+        """Return the datum of spherical coordinates, or None if they give no geographic position."""
         if element is None:
             return None
         surface = sdf.element_text(element, "surface_model") or "EARTH_WGS84"
         axes = sdf.element_text(element, "world_frame_orientation") or "ENU"
         if surface != "EARTH_WGS84" or axes != "ENU":
-            self.context.warn(f"a world on {surface} with axes {axes} gives no datum", line=element.sourceline)
+            self.context.warn(
+                f"surface model {surface} with axes {axes} is unsupported; the world gives no datum",
+                line=element.sourceline,
+            )
             return None
         latitude, longitude, elevation, heading = (
             sdf.vector(element, tag, 1, (0.0,))[0]
@@ -227,16 +238,16 @@ class _Reader:
         if latitude == 0.0 and longitude == 0.0:
             return None
         if heading == 180.0:
-            reason = "heading_deg 180 is taken as it stands; worlds for old Gazebo versions used it against a bug"
+            reason = "heading_deg 180 is used as given; worlds for old Gazebo versions set it to work around a bug"
             self.context.warn(reason, line=element.sourceline, where="heading_deg")
         turned = math.remainder(-heading, 360.0)
         datum = Datum(latitude, longitude, elevation, turned)
         current = self.context.frame.datum if self.context.frame is not None else None
         if current is not None and current != datum:
             self.context.warn(
-                f"its place {latitude!r}, {longitude!r} (heading {turned:g}°) is not the environment's datum "
-                f"{current.latitude!r}, {current.longitude!r} (heading {current.heading:g}°), which stays: change the "
-                "environment's datum, or the world",
+                f"the world's origin {latitude!r}, {longitude!r} (heading {turned:g}°) differs from the environment's "
+                f"datum {current.latitude!r}, {current.longitude!r} (heading {current.heading:g}°), which is kept; "
+                "change the environment's datum or the world",
                 line=element.sourceline,
                 where="spherical_coordinates",
             )
@@ -247,7 +258,7 @@ class _Reader:
 
 @dataclass(slots=True)
 class Footprints:
-    """Footprints and sizes of objects; those of equal shapes are worked out once."""
+    """Footprints and sizes of objects, computed once for equal shapes."""
 
     resources: Mapping[str, bytes]
     context: ReadContext
@@ -257,7 +268,7 @@ class Footprints:
     _warned: set[str] = field(default_factory=set)
 
     def footprint_and_size(self, properties: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
-        """The footprint in local metres (a point where no solid is known) and the size in the object's own frame."""
+        """Return the footprint in local metres (a point without solids) and the size in the object's frame."""
         pose = properties["pose"]
         point = shapely.Point(pose[:2])
         if not properties.get("shapes"):
@@ -290,7 +301,7 @@ class Footprints:
         return area, None if size is None else [round(float(v), 9) + 0.0 for v in size]
 
     def _is_readable(self, shape: Mapping[str, Any], name: str) -> bool:
-        """Whether a solid can be read; of one that is not in the upload the reader has warned already."""
+        """Check that a solid can be read; for one that is not in the upload a warning exists already."""
         try:
             (self._flat or solids.Solids(self.resources)).shape(shape)
         except (Invalid, TooLarge) as error:
@@ -303,11 +314,11 @@ class Footprints:
         if error.detail not in self._warned:
             self._warned.add(error.detail)
             file = error.problems[0].file if error.problems else None
-            self.context.warn(f"its solids are not known: {error.detail}"[:500], file=file, where=name[:80])
+            self.context.warn(f"the solids are unknown: {error.detail}"[:500], file=file, where=name[:80])
 
 
 def _shorten(names: Sequence[str]) -> str:
-    """The first names of many."""
+    """Join the first names of a long list."""
     return ", ".join(n[:60] for n in names[:12]) + (" …" if len(names) > 12 else "")
 
 
@@ -316,7 +327,7 @@ def _is_same_pose(a: Sequence[float], b: Sequence[float]) -> bool:
 
 
 def _read_list(library: Library, main: str, context: ReadContext) -> Layers:
-    """The generator's list of objects as a world of its own."""
+    """Read an environment_common list of objects as a separate world."""
     listing = yaml_lists.read(library, main, context)
     resources = {path: library.files[name] for name, path in listing.served.items()}
     footprints = Footprints(resources, context)

@@ -1,15 +1,15 @@
 """SDFormat (Gazebo's worlds and models) as trees: references, poses and frames, geometry <-> ``properties.shapes``.
 
-Rules of SDFormat 1.4 to 1.11, from its specification and from what libsdformat does with them:
+Rules of SDFormat 1.4 to 1.11, from its specification and the behaviour of libsdformat:
 
 - A pose is x, y, z, roll, pitch, yaw (metres; radians, or degrees with ``degrees="true"``; a unit quaternion x, y, z,
   w with ``rotation_format="quat_xyzw"``); rotations are about the fixed axes x, y, z in this order.
-- A pose stands in the frame that ``relative_to`` (before 1.7 ``frame``, where it is not empty) names; else in the
-  model's frame, in the link's for a collision or visual, in the child link's for a joint.
-- The pose of an ``<include>`` takes the place of the model's own; without one the model's own holds.
-- ``model.config`` names a model's files by version: the newest that is known is read.
+- A pose is in the frame named by ``relative_to`` (before 1.7 ``frame``, if not empty); else in the model's frame, for a
+  collision or visual in the link's, for a joint in the child link's.
+- The pose of an ``<include>`` replaces the model's own pose.
+- ``model.config`` names a model's files by version: the newest supported one is read.
 - A reference is looked up in the upload only: ``model://NAME/path`` as the end of a path, nearest to the file that
-  names it. What the upload does not have stays a reference.
+  names it. A reference that the upload does not contain stays a reference.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ROOT = re.compile(rb"<sdf[\s>/]")
 
 
 def is_sdf(data: bytes) -> bool:
-    """Whether the root element is ``<sdf>``, whatever blanks and comments stand before it."""
+    """Check that the root element is ``<sdf>``, after any whitespace and comments."""
     at = 3 if data.startswith(b"\xef\xbb\xbf") else 0
     while blank := _BLANK.match(data, at):
         at = blank.end()
@@ -51,13 +51,13 @@ def is_sdf(data: bytes) -> bool:
 
 
 def contains_element(data: bytes, *tags: bytes) -> bool:
-    """Whether there is an element of one of these names outside of comments."""
+    """Check for an element with one of these names outside comments."""
     bare = without_comments(data)
     return any(re.search(rb"<" + tag + rb"[\s>/]", bare) for tag in tags)
 
 
 def without_comments(data: bytes) -> bytes:
-    """The text between the comments, in linear time; a comment without an end goes to the end."""
+    """Remove comments in linear time; an unclosed comment extends to the end."""
     out, at = [], 0
     while (start := data.find(b"<!--", at)) >= 0:
         out.append(data[at:start])
@@ -69,14 +69,14 @@ def without_comments(data: bytes) -> bytes:
 
 
 def unreadable_error(reason: str, element: etree._Element | None = None, where: str | None = None) -> UnreadableFile:
-    """The error for something that cannot be used, with the element's line."""
+    """Create the error for an element, with its line."""
     line = None if element is None else element.sourceline
     location = where or (None if element is None else element_path(element))
     return UnreadableFile(reason, [Problem(reason, line=line, where=location)])
 
 
 def element_path(element: etree._Element) -> str:
-    """An element as users find it: its names from the world down."""
+    """Return an element's location for users: names from the world down."""
     parts: list[str] = []
     at: etree._Element | None = element
     while at is not None and at.tag not in ("sdf", "world"):
@@ -87,10 +87,10 @@ def element_path(element: etree._Element) -> str:
 
 
 def parse(data: bytes, limits: Limits) -> etree._Element:
-    """The ``<sdf>`` element without comments and indentation."""
+    """Parse the ``<sdf>`` element, without comments and indentation."""
     root = xml.parse(data, limits, remove_blank_text=True)
     if root.tag != "sdf":
-        raise unreadable_error(f"the root element must be <sdf>, it is <{str(root.tag)[:80]}>", root)
+        raise unreadable_error(f"the root element must be <sdf>, not <{str(root.tag)[:80]}>", root)
     return root
 
 
@@ -99,13 +99,13 @@ _BOOLEANS = ("static", "self_collide", "allow_auto_disable", "cast_shadows")
 
 
 def report_suspicious_values(root: etree._Element, context: ReadContext) -> None:
-    """Report values that SDFormat reads but that hardly mean what they say: turns in degrees, sizes of zero."""
+    """Warn about valid but suspicious values: angles in degrees, sizes of zero."""
     doubts: dict[str, list[etree._Element]] = {}
     for pose in root.iter("pose"):
         turned = pose.get("degrees") or pose.get("rotation_format")
         angles = [] if turned else element_text(pose).split()[3:6]
         if any(_FLOAT.match(a) and abs(float(a)) > _fields.MAX_USUAL_ANGLE for a in angles):
-            doubts.setdefault("a <pose> turned by more than 2π: are its angles in radians?", []).append(pose)
+            doubts.setdefault("a <pose> has an angle above 2π; angles must be in radians", []).append(pose)
     for name in _EXTENTS:
         for extent in root.iter(name):
             tokens = element_text(extent).split()
@@ -114,11 +114,11 @@ def report_suspicious_values(root: etree._Element, context: ReadContext) -> None
                 and "geometry" in {a.tag for a in extent.iterancestors()}
                 and not any(_FLOAT.match(w) is None or float(w) for w in tokens)
             ):
-                doubts.setdefault(f"a <{name}> of 0: the shape has no extent", []).append(extent)
+                doubts.setdefault(f"<{name}> is 0; the shape has no extent", []).append(extent)
     for name in _BOOLEANS:
         for flag in root.iter(name):
             if element_text(flag).lower() not in ("0", "1", "true", "false"):
-                doubts.setdefault(f"<{name}> is {element_text(flag)[:40]!r}, which is taken for false", []).append(flag)
+                doubts.setdefault(f"<{name}> is {element_text(flag)[:40]!r}; it is read as false", []).append(flag)
     for reason, elements in doubts.items():
         often = f" ({len(elements)} times)" if len(elements) > 1 else ""
         context.warn(f"{reason}{often}", line=elements[0].sourceline, where=element_path(elements[0]))
@@ -128,19 +128,19 @@ _FLOAT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\Z", re.ASCII)
 
 
 def element_text(element: etree._Element | None, tag: str | None = None) -> str:
-    """An element's (or its child's) text without blanks around it; empty where there is none."""
+    """Return an element's (or its child's) stripped text, empty if there is none."""
     if element is not None and tag is not None:
         element = element.find(tag)
     return "" if element is None else (element.text or "").strip()
 
 
 def is_true(text: str) -> bool:
-    """SDFormat's boolean."""
+    """Parse an SDFormat boolean."""
     return text.strip().lower() in ("1", "true")
 
 
 def numbers(text: str, element: etree._Element, maximum: float = MAX_METRES) -> list[float]:
-    """The numbers of a text. Raises UnreadableFile where there is anything else, or one is not finite or too large."""
+    """Parse a text of numbers. Raises UnreadableFile if one is invalid, not finite or beyond ±maximum."""
     out = []
     for token in text.split():
         try:
@@ -148,26 +148,31 @@ def numbers(text: str, element: etree._Element, maximum: float = MAX_METRES) -> 
         except ValueError:
             value = math.nan
         if not abs(value) <= maximum:
-            raise unreadable_error(f"{token[:40]!r} is no finite number within ±{maximum:g}", element)
+            raise unreadable_error(f"invalid number {token[:40]!r}: must be finite and within ±{maximum:g}", element)
         out.append(value + 0.0)
     return out
 
 
 def vector(element: etree._Element | None, tag: str, count: int, default: Sequence[float]) -> list[float]:
-    """So many numbers of a child, or the default where it is not there. Raises UnreadableFile for another count."""
+    """Parse ``count`` numbers of a child, or return the default if it is missing.
+
+    Raises UnreadableFile for another count.
+    """
     child = None if element is None else element.find(tag)
     if child is None or not element_text(child):
         return list(default)
     values = numbers(element_text(child), child)
     if len(values) != count:
-        raise unreadable_error(f"<{tag}> must have {count} numbers, it has {len(values)}", child)
+        raise unreadable_error(f"<{tag}> must have {count} numbers, not {len(values)}", child)
     return values
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """What a ``<pose>`` says: [x, y, z, roll, pitch, yaw] in metres and radians, the frame it names, and whether there
-    is nothing else in it (a canonical pose can stand for it)."""
+    """Parsed ``<pose>``: [x, y, z, roll, pitch, yaw] in metres and radians, and the frame that it names.
+
+    plain: the element contains nothing else, so that a canonical pose can replace it.
+    """
 
     values: tuple[float, ...] = (0.0,) * 6
     relative: str = ""
@@ -175,7 +180,7 @@ class Pose:
 
     @property
     def matrix(self) -> Matrix:
-        """As float64 [4, 4]."""
+        """Return the pose as float64 [4, 4]."""
         return matrix(self.values)
 
 
@@ -183,7 +188,7 @@ ZERO = Pose()
 
 
 def parse_pose(parent: etree._Element) -> Pose | None:
-    """The pose of an element, or None where it says none."""
+    """Parse the pose of an element, or return None if it has none."""
     element = parent.find("pose")
     if element is None:
         return None
@@ -191,10 +196,10 @@ def parse_pose(parent: etree._Element) -> Pose | None:
     attributes = {k: v for k, v in xml.attributes(element).items() if v and k != "degrees"}
     if element.get("rotation_format") == "quat_xyzw":
         if len(values) not in (0, 7):
-            raise unreadable_error(f"a pose with a quaternion must have 7 numbers, it has {len(values)}", element)
+            raise unreadable_error(f"a pose with a quaternion must have 7 numbers, not {len(values)}", element)
         values = [*values[:3], *_quaternion_angles(values[3:], element)] if values else [0.0] * 6
     elif len(values) > 6:
-        raise unreadable_error(f"a pose must have 6 numbers, it has {len(values)}", element)
+        raise unreadable_error(f"a pose must have 6 numbers, not {len(values)}", element)
     else:
         values += [0.0] * (6 - len(values))
         if is_true(element.get("degrees", "")):
@@ -219,38 +224,38 @@ def _quaternion_angles(quaternion: Sequence[float], element: etree._Element) -> 
 
 
 def six(transform: Matrix) -> list[float]:
-    """float64 [4, 4] as [x, y, z, roll, pitch, yaw], rounded to a nanometre and a nanoradian."""
+    """Convert float64 [4, 4] to [x, y, z, roll, pitch, yaw], rounded to a nanometre and a nanoradian."""
     r = transform[:3, :3]
     across = math.hypot(r[0, 0], r[1, 0])
     pitch = math.atan2(-r[2, 0], across)
     if across > 1e-9:
         roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
-    else:  # looking straight up or down: only the sum of roll and yaw counts
+    else:  # pitch of ±90°: only the sum of roll and yaw is defined
         roll, yaw = 0.0, math.atan2(-r[0, 1], r[1, 1])
     return [round(float(v), 9) + 0.0 for v in (*transform[:3, 3], roll, pitch, yaw)]
 
 
 def pose_element(values: Sequence[float]) -> etree._Element:
-    """``<pose>`` of [x, y, z, roll, pitch, yaw]."""
+    """Create a ``<pose>`` from [x, y, z, roll, pitch, yaw]."""
     element = etree.Element("pose")
     element.text = " ".join(number(v) for v in values)
     return element
 
 
 def child(parent: etree._Element, tag: str, text: str | None = None, **attributes: str) -> etree._Element:
-    """A new last child."""
+    """Append a child element."""
     element = etree.SubElement(parent, tag, attributes)
     element.text = text
     return element
 
 
 def format_numbers(values: Iterable[float]) -> str:
-    """Numbers as an SDF text."""
+    """Format numbers as an SDF text."""
     return " ".join(number(float(v)) for v in values)
 
 
 def geometry_element(shape: Mapping[str, Any], uri: str | None) -> etree._Element:
-    """``<geometry>`` of a shape. uri: the address of its mesh or height map."""
+    """Create the ``<geometry>`` of a shape. uri: address of its mesh or height map."""
     out = etree.Element("geometry")
     kind = str(shape.get("type"))
     if kind == "polyline":
@@ -289,7 +294,7 @@ SHAPES = frozenset(_WORDS) | {"polyline"}
 
 
 def serialise(root: etree._Element) -> bytes:
-    """The document as indented text; the same each time."""
+    """Serialise the document as indented text, deterministically."""
     etree.indent(root, "  ")
     root.tail = None
     text: bytes = etree.tostring(root, encoding="utf-8")
@@ -297,7 +302,7 @@ def serialise(root: etree._Element) -> bytes:
 
 
 def compact(element: etree._Element) -> str:
-    """An element as text in one line, to be kept."""
+    """Serialise an element in one line, for storage."""
     tail, element.tail = element.tail, None
     text = etree.tostring(element, encoding="unicode")
     element.tail = tail
@@ -305,7 +310,7 @@ def compact(element: etree._Element) -> str:
 
 
 def stem(name: str) -> str:
-    """What a world's file is called, without folder and endings."""
+    """Return the name of a world's file without directory and extensions."""
     base = PurePosixPath(name).name
     for end in (".world.xml", ".world", ".sdf", ".xml", ".yaml", ".yml"):
         if base.lower().endswith(end) and len(base) > len(end):
@@ -314,5 +319,5 @@ def stem(name: str) -> str:
 
 
 def iter_models(root: etree._Element) -> Iterator[etree._Element]:
-    """The models and lights that stand at the root of a file without a world."""
+    """Iterate over the models and lights at the root of a file without a world."""
     yield from root.iterchildren("model", "light", "actor")

@@ -1,4 +1,4 @@
-"""Writing worlds: what was uploaded as it was, and bodies for all that has none."""
+"""Writing worlds: uploaded objects unchanged, and new bodies for objects of other formats."""
 
 from __future__ import annotations
 
@@ -28,39 +28,41 @@ from app.syntax.decimals import DEGREES, number
 
 MAIN = "world.sdf"
 NO_WALLS = ("keepout", "speed", "nogo")
-"""Grids that are masks: they are no walls unless one is asked for by its name."""
+"""Names of grids that are masks: they become walls only if requested by name."""
 
 OF_GRIDS = "occupancy"
-"""The family of objects that were made of a grid (``occupancy_to_objects``)."""
+"""Family of objects derived from a grid (``occupancy_to_objects``)."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions(BodyDefaults):
-    """Which world, and what is made of objects and grids that no world has told of."""
+    """World to write, and conversion of objects and grids from other formats."""
 
     world: str | None = parameter(
-        None, "name of the stored world's file (with or without folders); default: gazebo…, else the shortest"
+        None, "name of the stored world's file, with or without directories; default: gazebo…, else the shortest name"
     )
     content: Literal["auto", "world", "all"] = parameter(
         "auto",
-        "world: the stored world as it is; all: the other formats' objects and the grid's walls with it; auto: the "
-        "world where one is stored, else all",
+        "world: the stored world unchanged; all: with objects of other formats and the grid's walls; auto: the stored "
+        "world if there is one, else all",
     )
     version: Literal["1.4", "1.5", "1.6", "1.7", "1.8", "1.9", "1.10", "1.11"] | None = parameter(
-        None, "SDFormat version that the file says; default: the stored world's, else 1.7"
+        None, "SDFormat version in the file; default: the stored world's, else 1.7"
     )
     georeference: bool = parameter(
-        False, "put the environment's datum in the place of spherical_coordinates 0, 0, which are Gazebo's default"
+        False, "replace spherical_coordinates 0, 0 (Gazebo's default) with the environment's datum"
     )
     grid: str | None = parameter(None, "grid whose occupied cells become walls; default: map, else the only one")
-    level: str | None = parameter(None, "level of the objects and the grid; default: all, and the grid's own")
-    threshold: int = parameter(65, "cell value from which on a cell is a wall", minimum=1, maximum=100)
+    level: str | None = parameter(
+        None, "level of the objects and the grid; default: all levels for objects, the grid's own level"
+    )
+    threshold: int = parameter(65, "minimum value of cells that become walls", minimum=1, maximum=100)
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
-    """All objects and their files, and one grid for walls: the named one, else ``map``, else the only one.
+    """Choose all objects and their files, and one grid for walls: the named one, else ``map``, else the only one.
 
-    Objects that were made of a level's grid stand for it, unless it is named.
+    Objects derived from a level's grid replace it, unless it is named.
     """
     matches = [k for k in keys if k.layer in ("objects", "resources") and options.level in (None, k.level)]
     grids = [k for k in keys if k.layer == "occupancy"]
@@ -72,7 +74,7 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
             return matches
     if not grids and options.grid is None:
         if not any(k.layer == "objects" for k in matches):
-            raise MissingLayer("there is nothing to build a world of: supply objects or an occupancy grid")
+            raise MissingLayer("a Gazebo world needs objects or an occupancy grid: supply one of them")
         return matches
     supply = "supply a map.yaml with its image, or objects"
     return matches + select_part(
@@ -81,13 +83,13 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``world.sdf`` and ``models/…``."""
+    """Write ``world.sdf`` and ``models/…``."""
     return _Writer(layers, context, context.options).files()
 
 
 @dataclass(frozen=True, slots=True)
 class _StoredWorld:
-    """A stored world: what it says, its objects, and where they lie."""
+    """Stored world: its document, its objects, and their part."""
 
     key: str
     entry: Mapping[str, Any]
@@ -103,7 +105,7 @@ class _StoredWorld:
 
 
 class _Writer:
-    """One world from what is stored."""
+    """Writer of one world."""
 
     def __init__(self, layers: Layers, context: WriteContext, options: WriteOptions) -> None:
         self.layers, self.context, self.options = layers, context, options
@@ -142,20 +144,22 @@ class _Writer:
             matches = [w for w in self.stored if world_name in (w.key, sdf.stem(w.key))]
             if not matches:
                 names = ", ".join(w.key for w in self.stored) or "none"
-                raise NotFound(f"there is no world {world_name!r}; there are: {names}")
+                raise NotFound(f"unknown world {world_name!r}: choose one of {names}")
             return matches[0]
         if len(self.stored) > 1:
             names = ", ".join(w.key for w in self.stored[1:])
-            self.context.warn(f"written is the world {self.stored[0].key}; ask for another one with world=: {names}")
+            self.context.warn(
+                f"several stored worlds; {self.stored[0].key} is written, world= selects another: {names}"
+            )
         return self.stored[0] if self.stored else None
 
     def files(self) -> dict[str, bytes]:
-        """The world first."""
+        """Return the files, the world first."""
         source_world = self._select_world()
         for other in self.stored:
             if other is not source_world:
                 self.context.drop(
-                    f"objects of the world {other.key}", len(other.objects), f"ask with world={other.key}"
+                    f"objects of the world {other.key}", len(other.objects), f"request it with world={other.key}"
                 )
         world = self._frame(source_world)
         for one in sorted(source_world.objects if source_world is not None else [], key=lambda o: _natural(o.id)):
@@ -165,7 +169,7 @@ class _Writer:
         everything = self.options.content == "all" or (
             self.options.content == "auto" and not (source_world is not None and source_world.is_world)
         )
-        why = "a world is stored: ask for them with content=all"
+        why = "a world is stored: request them with content=all"
         if everything:
             rows = []
             for key, part in self.others:
@@ -177,10 +181,10 @@ class _Writer:
             self.context.drop("objects of other formats", sum(len(p) for _, p in self.others), why)
         for key, grid in self.layers.grids().items():
             if masks.NAME in grid.properties and self.options.grid is None:
-                continue  # it tells where robots should go, not what stands there
+                continue  # it describes rules for robots, not obstacles
             has_objects = any(other.level == key.level for other, _ in self.others)
             if self.options.grid is None and everything and has_objects and _is_slice(grid):
-                continue  # its walls are these objects
+                continue  # its walls are already present as objects
             if everything or self.options.grid is not None:
                 name = free_name(f"walls_{slug(key.name)}", self.taken)
                 model = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
@@ -196,7 +200,7 @@ class _Writer:
         return self._bundle(world, source_world, bodies)
 
     def _frame(self, source_world: _StoredWorld | None) -> etree._Element:
-        """The world's element with all that is no object."""
+        """Create the world's element with everything but objects."""
         if source_world is not None and "sdf" in source_world.entry:
             world = _element(str(source_world.entry["sdf"]), ("world",))
             if world is not None:
@@ -208,17 +212,17 @@ class _Writer:
                 for tag in ("frame", "actor", "joint", "population", "road"):
                     self.taken.update(e.get("name", "") for e in world.iterchildren(tag))
                 return world
-            self.context.warn(f"what was kept of the world {source_world.key} cannot be read: it is left out")
+            self.context.warn(f"the stored elements of the world {source_world.key} cannot be read; they are skipped")
         return etree.Element("world", name=valid(sdf.stem(source_world.key) if source_world else self.context.title))
 
     def _restore_object(self, one: Feature) -> None:
-        """An object of the stored world as it was, under its present name and pose."""
+        """Write an object of the stored world unchanged, with its current name and pose."""
         source_properties = one.properties.get(NAME, {})
         text = source_properties.get("sdf")
         element = _element(text, OBJECTS) if isinstance(text, str) else None
         if element is None:
             if isinstance(text, str):
-                self.context.warn("its element cannot be read: made anew from its shapes", where=one.id)
+                self.context.warn("the stored element cannot be read; it is rebuilt from its shapes", where=one.id)
             self.loose.append(one)
             return
         name = one.properties.get("name")
@@ -236,7 +240,7 @@ class _Writer:
             element.attrib.clear()
             element.attrib.update({"name": name, **attributes})
         if name in self.taken:
-            self.context.warn("two objects of the world have this name, which Gazebo refuses", where=name)
+            self.context.warn("duplicate object name in the world; Gazebo rejects it", where=name)
         self.taken.add(name)
         pose = one.properties.get("pose")
         pose = [float(v) for v in pose] if _is_pose(pose) and pose is not None else [0.0] * 6
@@ -251,27 +255,27 @@ class _Writer:
         self.elements.append((name, element))
 
     def _make_models(self, bodies: Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
-        """Static models of objects that no world has told of."""
+        """Write static models of objects from other formats."""
         for level, one in sorted(rows, key=lambda row: _natural(row[1].id)):
             model = bodies.model(one, self.layers.elevation(level), self.taken)
             if model is not None:
                 self.elements.append((model.get("name", ""), model))
 
     def _furnish(self, bodies: Bodies) -> None:
-        """A ground to stand on and a light, where a world is made."""
+        """Add a ground plane and a light to a generated world."""
         if "ground_plane" not in self.taken and self.options.ground and not bodies.hilly:
             self.elements.append(("ground_plane", bodies.ground()))
-            self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground", "ground")
+            self.context.fill("ground plane", bodies.ground_size, "no stored world has a ground", "ground")
         lit = any(
             e.tag == "light" or sdf.element_text(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.elements
         )
         if not lit and self.options.sun:
             name = free_name("sun", self.taken)
             self.elements.append((name, sun(name)))
-            self.context.fill("sun", "directional light", "no world tells of a light", "sun")
+            self.context.fill("sun", "directional light", "no stored world has a light", "sun")
 
     def _place(self, world: etree._Element, source_world: _StoredWorld | None) -> None:
-        """The datum as spherical coordinates; what the stored world says stays where it means the same."""
+        """Write the datum as spherical coordinates; equivalent ones of the stored world stay unchanged."""
         datum = self.layers.datum
         old_coordinates = world.find("spherical_coordinates")
         if datum is None:
@@ -280,9 +284,7 @@ class _Writer:
         if old_coordinates is not None:
             meant = source_world.entry.get("datum") if source_world is not None else None
             if meant is None and not self.options.georeference:
-                reason = (
-                    "the world's spherical_coordinates are not the environment's datum: georeference=true puts it there"
-                )
+                reason = "spherical_coordinates differ from the environment's datum; georeference=true replaces them"
                 self.context.warn(reason, where="spherical_coordinates")
                 return
             if meant is not None and [float(v) for v in meant] == position:
@@ -302,7 +304,7 @@ class _Writer:
         valid_version = source_version if source_version in sdf.VERSIONS else None
         if self.options.version is not None:
             if valid_version is not None and valid_version != self.options.version:
-                self.context.warn(f"the world was written as SDFormat {valid_version}: its elements are not converted")
+                self.context.warn(f"the world was written as SDFormat {valid_version}; its elements are not converted")
             return self.options.version
         return source_version or "1.7"
 
@@ -313,7 +315,7 @@ class _Writer:
             if self.options.version is None and not (source_world is not None and source_world.is_world):
                 version = needed_version
             else:
-                self.context.warn(f"some shapes need SDFormat {needed_version}")
+                self.context.warn(f"some shapes need SDFormat {needed_version}; older readers reject them")
         root = etree.Element("sdf", version=version)
         root.append(world)
         main = sdf.serialise(root)
@@ -332,7 +334,7 @@ class _Writer:
 
 
 def _natural(text: str) -> tuple[tuple[int, str], ...]:
-    """A sort key by which ``pole_10`` comes after ``pole_9``."""
+    """Return a sort key that puts ``pole_10`` after ``pole_9``."""
     out, digits, letters = [], "", ""
     for letter in text:
         if letter.isascii() and letter.isdigit():
@@ -350,7 +352,7 @@ def _natural(text: str) -> tuple[tuple[int, str], ...]:
 
 
 def _is_slice(grid: OccupancyGrid) -> bool:
-    """Whether a grid was made of the objects beside it (``app.generate``)."""
+    """Check that a grid was rasterised from the objects beside it (``app.generate``)."""
     slice_properties = grid.properties.get("slice")
     return isinstance(slice_properties, Mapping) and slice_properties.get("of") == "objects"
 
@@ -364,7 +366,7 @@ def _is_pose(value: Any) -> bool:
 
 
 def _element(text: str, tags: Sequence[str]) -> etree._Element | None:
-    """A kept element; None where it is none of these."""
+    """Parse a stored element, or return None if its tag is not one of ``tags``."""
     try:
         element = xml.parse(text.encode(), Limits(), remove_blank_text=True)
     except (BadUpload, etree.LxmlError, ValueError):

@@ -1,16 +1,16 @@
-"""The YAML lists that environment_common makes Gazebo worlds from, as objects.
+"""YAML lists that environment_common generates Gazebo worlds from, read as objects.
 
-Three kinds, told by their content:
+Three kinds, distinguished by content:
 
 - ``components``: ``type: {object, reference}``. A custom object is another such list, ``custom_models/<reference>``,
   placed at the component's ``anchor`` (x, y, yaw); anything else is a box, sphere, cylinder, plane or mesh with
   ``position``, ``orientation`` and, if ``collision`` is true, a body. A custom object is one object with all its parts.
 - ``models``: instances ``{name, type, position, orientation}``, as a list or by name; the type is a model of the
-  upload. ``ground`` is a plane of ``width`` by ``height`` where it says ``flat``.
-- named rows of ``coordinates`` with one ``orientation``: known obstacles, a point each.
+  upload. ``ground`` is a plane of ``width`` by ``height`` if it is ``flat``.
+- named rows of ``coordinates`` with one ``orientation``: known obstacles, one point each.
 
-The generator takes the anchor's position off instead of adding it, which mirrors what is anchored; what is meant, and
-done here, is the component's pose in the anchor's frame.
+The generator subtracts the anchor's position instead of adding it, which mirrors anchored components. This reader
+applies the intended meaning: the component's pose in the anchor's frame.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ _MESH = re.compile(rb"dae[ \t]*:[ \t]*[\"']?([^\"'\s,}#]{1,256})")
 _TYPE = re.compile(rb"^[ \t-]*type[ \t]*:[ \t]*[\"']?([^\"'\s,{}#]{1,256})", re.MULTILINE)
 
 MAX_NESTED_OBJECTS = 8
-"""Custom objects in custom objects; the generator itself knows one step."""
+"""Maximum nesting depth of custom objects; the generator itself supports one level."""
 
 Place = tuple[float, ...]
 
 
 def detect(name: str, data: bytes) -> bool:
-    """Whether a YAML file is one of these lists."""
+    """Detect one of these lists."""
     if not name.lower().endswith((".yaml", ".yml")):
         return False
     if _COMPONENTS.search(data):
@@ -61,7 +61,7 @@ def detect(name: str, data: bytes) -> bool:
 
 
 def _custom(library: Library, reference: str, near: str) -> str | None:
-    """The list or model that a reference names: in ``custom_models`` beside the list first."""
+    """Find the list or model of a reference, first in ``custom_models`` beside the list."""
     for path in (f"custom_models/{reference}", reference):
         for ending in ("", ".yaml", ".yml"):
             file = library.find(f"model://{path}{ending}", near)
@@ -71,7 +71,7 @@ def _custom(library: Library, reference: str, near: str) -> str | None:
 
 
 def find_required_files(library: Library, main: str) -> list[str]:
-    """The custom objects, models and meshes that a list needs, directly or through others, and ``models.yaml``."""
+    """Return the custom objects, models and meshes that a list needs, also indirectly, and ``models.yaml``."""
     out: dict[str, None] = {}
     todo = [main]
     while todo:
@@ -99,7 +99,7 @@ def find_required_files(library: Library, main: str) -> list[str]:
 
 @dataclass(slots=True)
 class ParsedList:
-    """Objects as (name, properties), the rest of the list, and path in the upload -> path of a resource."""
+    """Content of a list: objects as (name, properties), the rest, and path in the upload -> resource path."""
 
     objects: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     rest: dict[str, Any] = field(default_factory=dict)
@@ -107,7 +107,7 @@ class ParsedList:
 
 
 def read(library: Library, main: str, context: ReadContext) -> ParsedList:
-    """A list with all it refers to. Raises UnreadableFile or TooLarge."""
+    """Read a list with everything it refers to. Raises UnreadableFile or TooLarge."""
     data = yaml.load(library.files[main], context.limits)
     reader = _Reader(library, main, context)
     if isinstance(data, Mapping) and "components" in data:
@@ -120,7 +120,7 @@ def read(library: Library, main: str, context: ReadContext) -> ParsedList:
         reader.rows(data)
         section_names = set(data) if isinstance(data, Mapping) else set()
     else:
-        raise _unreadable_error("it must be a list of objects", "")
+        raise _unreadable_error("must be a list of objects", "")
     if isinstance(data, Mapping):
         reader.result.rest = (
             {"rest": extra_members}
@@ -137,12 +137,12 @@ def _unreadable_error(reason: str, location: str) -> UnreadableFile:
 
 def _number(value: Any, location: str, maximum: float = MAX_METRES) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= maximum:
-        raise _unreadable_error(f"must be a finite number within ±{maximum:g}, got {str(value)[:40]!r}", location)
+        raise _unreadable_error(f"must be a finite number within ±{maximum:g}, not {str(value)[:40]!r}", location)
     return float(value) + 0.0
 
 
 def _members(members: Any, names: Sequence[str], location: str, default: float = 0.0) -> list[float]:
-    """Numbers of a mapping (``{x: …, y: …}``), the default where one is not there."""
+    """Parse numbers of a mapping (``{x: …, y: …}``); missing ones get the default."""
     if members is None:
         members = {}
     if not isinstance(members, Mapping):
@@ -151,7 +151,7 @@ def _members(members: Any, names: Sequence[str], location: str, default: float =
 
 
 def _pose(members: Mapping[str, Any], location: str) -> Place:
-    """[x, y, z, roll, pitch, yaw] of ``position`` and ``orientation``."""
+    """Parse ``position`` and ``orientation`` to [x, y, z, roll, pitch, yaw]."""
     position = _members(members.get("position"), ("x", "y", "z"), f"{location}.position")
     turned = _members(members.get("orientation"), ("roll", "pitch", "yaw"), f"{location}.orientation")
     return (*position, *turned)
@@ -173,7 +173,7 @@ def _list(items: Any, location: str) -> list[Mapping[str, Any]]:
 
 
 class _Reader:
-    """A list being read."""
+    """Reader of one list."""
 
     def __init__(self, library: Library, main: str, context: ReadContext) -> None:
         self.library, self.main, self.context = library, main, context
@@ -190,7 +190,7 @@ class _Reader:
     # components
 
     def components(self, items: Any) -> None:
-        """One object for each component of the list itself."""
+        """Read one object for each component of the list itself."""
         for k, item in enumerate(_list(items, "components")):
             location = f"components[{k}]"
             kind, reference = self._type(item, location)
@@ -214,7 +214,7 @@ class _Reader:
     def _type(self, item: Mapping[str, Any], location: str) -> tuple[str, str]:
         members = item.get("type")
         if not isinstance(members, Mapping) or "reference" not in members:
-            raise _unreadable_error("must say {object: custom or primitive, reference: what}", f"{location}.type")
+            raise _unreadable_error("must be {object: custom or primitive, reference: NAME}", f"{location}.type")
         return str(members.get("object", "")), _text(members["reference"], f"{location}.type.reference")
 
     def _anchor(self, item: Mapping[str, Any], location: str) -> Place:
@@ -226,7 +226,7 @@ class _Reader:
         return _pose(anchor, f"{location}.anchor")
 
     def _custom(self, reference: str, near: str, location: str, above: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-        """The shapes of a custom object in its own frame."""
+        """Iterate over the shapes of a custom object in its own frame."""
         path = _custom(self.library, reference, near)
         if path is None or path not in self.library.files or not detect(path, self.library.files[path]):
             if path is not None and path not in self.library.files:
@@ -237,7 +237,8 @@ class _Reader:
             return
         if path in above or len(above) >= MAX_NESTED_OBJECTS:
             raise _unreadable_error(
-                f"custom object {reference} includes itself, or is nested more than {MAX_NESTED_OBJECTS} deep", location
+                f"custom object {reference} includes itself or is nested more than {MAX_NESTED_OBJECTS} levels deep",
+                location,
             )
         if path not in self._lists:
             document = yaml.load(self.library.files[path], self.context.limits)
@@ -263,7 +264,7 @@ class _Reader:
         return out | {"pose": pose} if any(pose) else out
 
     def _shape(self, item: Mapping[str, Any], reference: str, near: str, location: str) -> dict[str, Any]:
-        """A primitive without its pose; ``visual`` where it says no ``collision``. See ``sdf.is_absent``."""
+        """Convert a primitive without its pose; ``visual`` if it has no ``collision``. See ``sdf.is_absent``."""
         out: dict[str, Any]
         if reference == "sphere":
             out = {"type": reference, "radius": _number(item.get("radius"), f"{location}.radius")}
@@ -293,7 +294,7 @@ class _Reader:
     # models
 
     def models(self, models: Any, ground: Any) -> None:
-        """Instances of models, and the ground."""
+        """Read instances of models, and the ground."""
         if isinstance(ground, Mapping) and ground.get("flat") is True:
             size = [_number(ground.get(key), f"ground.{key}") for key in ("width", "height")]
             plane = {"type": "plane", "normal": [0.0, 0.0, 1.0], "size": size}
@@ -334,7 +335,7 @@ class _Reader:
             self._add(name, properties)
 
     def _model(self, folder: str, reference: str) -> list[dict[str, Any]]:
-        """The shapes of a model folder."""
+        """Return the shapes of a model directory."""
         self.result.served.update(required_files(self.library, self.main, [f"model://{reference}"]))
         file = self.library.model_file(folder)
         body = None if file is None else self.unfolder.file(file)
@@ -347,7 +348,7 @@ class _Reader:
     # rows
 
     def rows(self, node: Any, path: tuple[str, ...] = ()) -> None:
-        """Obstacles: every mapping with ``coordinates``, however deep, called by the names above it."""
+        """Read obstacles: mappings with ``coordinates`` at any depth, named by their path."""
         if isinstance(node, Mapping):
             if isinstance(node.get("coordinates"), list):
                 self._row(node, path)
@@ -358,7 +359,7 @@ class _Reader:
             for inner in node:
                 self.rows(inner, path)
         elif node is not None:
-            raise _unreadable_error(f"must be rows with coordinates, got {str(node)[:40]!r}", "/".join(path))
+            raise _unreadable_error(f"must be rows with coordinates, not {str(node)[:40]!r}", "/".join(path))
 
     def _row(self, row: Mapping[str, Any], path: tuple[str, ...]) -> None:
         location = "/".join(path)

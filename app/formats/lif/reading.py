@@ -35,23 +35,23 @@ from app.syntax import json
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """Networks by level, and stations as objects, in local metres. Raises UnreadableFile naming the item."""
+    """Read networks by level, and stations as objects, in local metres. Raises UnreadableFile with the item."""
     if not (context.wants("topology") or context.wants("objects")):
         return Layers()
     top = json.load(files[context.main or next(iter(files))], context.limits)
     if not isinstance(top, dict) or not isinstance(top.get("layouts", top.get("origins")), list):
-        reason = "a LIF file is one object with an array of layouts"
+        reason = "a LIF file must be an object with an array of layouts"
         raise UnreadableFile(reason, [Problem(reason, where="layouts")])
     reader = _Reader(top, context)
     layers = reader.layers()
-    if reader.is_first:  # drafts of version 2 have other members in each revision
+    if reader.is_first:  # members of version 2 change with each draft
         _fields.check(top, SHAPE, context)
     return layers
 
 
 @dataclass(slots=True)
 class _Item:
-    """A node, edge or station of the file."""
+    """Node, edge or station of the file."""
 
     members: dict[str, Any]
     location: str
@@ -64,7 +64,7 @@ class _Item:
 
 @dataclass(slots=True)
 class _Level:
-    """What becomes of one level: places of its nodes, its edges and stations with what they need of the nodes."""
+    """Content of one level: indices of its nodes, its edges and stations with references to nodes."""
 
     nodes: list[int] = field(default_factory=list)
     edges: list[tuple[_Item, int, int]] = field(default_factory=list)
@@ -90,7 +90,7 @@ class _Reader:
             raise TooLarge(f"the file has {total} items; the limit is {context.limits.features}")
 
     def version(self) -> None:
-        """Report a version that is not known, or missing."""
+        """Warn about an unsupported or missing version."""
         meta = self.top.get("metaInformation")
         version = meta.get("lifVersion") if isinstance(meta, dict) else None
         if not isinstance(version, str):
@@ -98,19 +98,19 @@ class _Reader:
         elif version.split(".")[0] not in ("0", "1"):
             self.is_first = False
             self.context.warn(
-                f"version {version[:40]} is a draft, read as far as it is known; it is served as it came",
+                f"version {version[:40]} is a draft; it is read as far as supported and written back unchanged",
                 where="metaInformation.lifVersion",
             )
 
     def layouts(self) -> Iterable[tuple[Any, str]]:
-        """(layout, where it stands), also those inside of origins."""
+        """Iterate over (layout, location), also of layouts inside origins."""
         for k, row in enumerate(self._list(self.top, "layouts", "")):
             yield row, f"layouts[{k}]"
         origins = self._list(self.top, "origins", "")
         if "origins" in self.top:
             self.document["origins"] = heads = []
         if len(origins) > 1:
-            self.context.warn("origins need not fit together: all are taken for the local one", where="origins")
+            self.context.warn("origins may differ; all are read as the local origin", where="origins")
         for k, origin in enumerate(origins):
             location = f"origins[{k}]"
             if not isinstance(origin, dict):
@@ -128,16 +128,14 @@ class _Reader:
         return value or []
 
     def layout(self, row: Any, location: str) -> None:
-        """Take in a layout's items."""
+        """Read a layout's items."""
         if not isinstance(row, dict):
             raise_unreadable("must be an object", location)
         layout_id = row.get("layoutId")
         if not isinstance(layout_id, str) or not is_name(layout_id):
-            raise_unreadable("a layout needs an id, a text", f"{location}.layoutId")
+            raise_unreadable("a layout needs a text id", f"{location}.layoutId")
         if any(head["layoutId"] == layout_id for head in self.heads):
-            raise_unreadable(
-                f"the layout {layout_id!r} stands twice: give layouts different ids", f"{location}.layoutId"
-            )
+            raise_unreadable(f"duplicate layout {layout_id!r}: layout ids must be unique", f"{location}.layoutId")
         self.heads.append({w: v for w, v in row.items() if w not in LISTS})
         level = row.get("layoutLevelId")
         if level is None or level == "":
@@ -152,10 +150,10 @@ class _Reader:
                     raise_unreadable("must be an object", spot)
                 name = item.get(f"{kind}Id")
                 if isinstance(name, (int, float)) and not isinstance(name, bool):
-                    self.context.warn(f"{name!r} is no text; it is served as one", where=f"{spot}.{kind}Id")
+                    self.context.warn(f"{name!r} is not text; it is written as text", where=f"{spot}.{kind}Id")
                     name = str(name)
                 if not isinstance(name, str):
-                    raise_unreadable("needs an id, a text", f"{spot}.{kind}Id")
+                    raise_unreadable("needs a text id", f"{spot}.{kind}Id")
                 items.append(_Item(item, spot, check_name(name, f"{spot}.{kind}Id"), layout_id, at, level))
 
     def layers(self) -> Layers:
@@ -167,7 +165,7 @@ class _Reader:
                 taken.add(i)
             if repeats := duplicates([item.name for item in items]):
                 self.context.warn(
-                    f"{len(repeats)} {kind} share an id: {shorten_list(repeats)}; references mean the first one"
+                    f"{len(repeats)} duplicate ids of {kind}: {shorten_list(repeats)}; references use the first one"
                 )
         for item, i in zip(stations, unique_ids(identifier(s.name) for s in stations), strict=True):
             item.id = i
@@ -196,17 +194,17 @@ class _Reader:
             parts[PartKey("topology", self.context.level, NETWORK)] = empty
         for noun, n in sorted(self.doubts.items()):
             self.context.warn(f"{n} {noun}")
-        return Layers(parts)  # LIF does not say how high its levels are
+        return Layers(parts)  # LIF has no elevations of levels
 
     def position(self, value: Any, location: str, kind: str) -> tuple[float, float, float]:
-        """x, y in metres, and 0."""
+        """Parse a position: x and y in metres, and 0."""
         location = f"{location}.{kind}Position"
         if not isinstance(value, dict) or "x" not in value or "y" not in value:
             raise_unreadable("must be an object with x and y", location)
         return number(value["x"], f"{location}.x"), number(value["y"], f"{location}.y"), 0.0
 
     def source_members(self, item: _Item, kind: str, *keys: str) -> dict[str, Any]:
-        """What only this format knows of an item; ``keys`` members are canonical."""
+        """Return an item's source properties; the members ``keys`` are canonical."""
         position = item.members.get(f"{kind}Position")
         extra_members = {w: v for w, v in item.members.items() if w not in (f"{kind}Id", *keys)}
         if isinstance(position, dict):
@@ -229,13 +227,13 @@ class _Reader:
         out: dict[str, Any] = {"kind": "node", "name": item.name, **self.name_members(item, "node")}
         entries = vehicle_entries(source_properties["item"], "node")
         if not entries:
-            self.doubts["nodes name no type of vehicle, so that none may use them"] += 1
+            self.doubts["nodes have no vehicle type; no vehicle may use them"] += 1
         theta = _common_number(entries, "theta")
         if theta is not None and abs(theta) <= math.pi + SAME_ANGLE:
             out["orientation"] = quaternion(float(theta))
         far = sum(is_number(e.get("theta")) and abs(e["theta"]) > math.pi + SAME_ANGLE for e in entries)
         if far:
-            self.doubts["values of theta are beyond ±π: radians are meant; they are kept, but not believed"] += far
+            self.doubts["values of theta exceed ±π radians; they are stored but not used as orientations"] += far
         out[NAME] = source_properties
         return out
 
@@ -246,7 +244,7 @@ class _Reader:
         properties: Sequence[dict[str, Any]],
         levels: dict[str, _Level],
     ) -> None:
-        """Put an edge on its level; one to nowhere stays with the node it knows, else with its layout."""
+        """Add an edge to its level; a dangling edge is stored with its existing node, else with its layout."""
         ends = [edge.members.get("startNodeId"), edge.members.get("endNodeId")]
         a, b = (index_by_name.get(str(e)) if isinstance(e, (str, int)) else None for e in ends)
         if a is not None and b is not None:
@@ -256,7 +254,8 @@ class _Reader:
             return
         missing = str(ends[0] if a is None else ends[1])[:60]
         self.context.warn(
-            f"the edge {edge.name} leads to {missing!r}, which is no node; it is kept", where=edge.location
+            f"the edge {edge.name} leads to the unknown node {missing!r}; it is stored and written back only",
+            where=edge.location,
         )
         dangling_edge = {"layout": edge.layout, "at": edge.at, "item": edge.members}
         home = next((k for k in (a, b) if k is not None), None)
@@ -266,18 +265,21 @@ class _Reader:
     def check_station(self, station: _Item, index_by_name: Mapping[str, int]) -> None:
         node_ids = station.members.get("interactionNodeIds")
         if not isinstance(node_ids, list) or not all(isinstance(i, str) for i in node_ids):
-            self.context.warn("needs an array of the nodes where it is reached", where=station.location)
+            self.context.warn(
+                "needs an array of its interaction nodes; it is stored without them", where=station.location
+            )
             return
         unknown = [i for i in node_ids if i not in index_by_name]
         if unknown:
             self.context.warn(
-                f"the station is reached at {shorten_list(unknown)}, which is no node", where=station.location
+                f"unknown interaction nodes of the station: {shorten_list(unknown)}; they are stored unchanged",
+                where=station.location,
             )
 
     def network(
         self, content: _Level, xyz: Array, nodes: Sequence[_Item], properties: Sequence[dict[str, Any]]
     ) -> Features:
-        """The topology of a level."""
+        """Build the topology of a level."""
         sources, targets = [a for _, a, _ in content.edges], [b for _, _, b in content.edges]
         lines = edge_lines(xyz, sources, targets)
         rows: list[Properties] = [properties[k] for k in content.nodes]
@@ -285,7 +287,7 @@ class _Reader:
             source_properties = self.source_members(edge, "edge", "startNodeId", "endNodeId")
             entries = vehicle_entries(source_properties["item"], "edge")
             if not entries:
-                self.doubts["edges name no type of vehicle, so that none may use them"] += 1
+                self.doubts["edges have no vehicle type; no vehicle may use them"] += 1
             out = {"kind": "edge", "source": nodes[a].id, "target": nodes[b].id, **self.name_members(edge, "edge")}
             speed = _common_number(entries, "maxSpeed")
             if speed is not None and speed >= 0:
@@ -301,7 +303,7 @@ class _Reader:
         return from_columns(ids, geometry, rows, "local", {NAME: self.document})
 
     def stations(self, items: Sequence[_Item]) -> Features:
-        """Stations as objects: points, or without a geometry where the file does not say where they stand."""
+        """Convert stations to objects: points, or without geometry if the file has no position."""
         geometry: NDArray[np.object_] = np.empty(len(items), object)
         rows: list[Properties] = []
         for k, item in enumerate(items):
@@ -321,32 +323,32 @@ class _Reader:
 
 
 def is_number(value: Any) -> bool:
-    """A JSON number, finite or not; a truth value is none."""
+    """Check for a JSON number, finite or not; booleans are none."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def vehicle_properties_key(item: Mapping[str, Any], kind: str) -> str | None:
-    """The member that holds what types of vehicle have of their own."""
+    """Return the name of the member with the entries by vehicle type."""
     keys = (getattr(LIF_1, kind), getattr(LIF_2, kind))
     return next((w for w in keys if isinstance(item.get(w), list)), None)
 
 
 def vehicle_entries(item: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
-    """What types of vehicle have of their own at an item; nothing where an entry is no object."""
+    """Return an item's entries by vehicle type, none if an entry is not an object."""
     key = vehicle_properties_key(item, kind)
     entries = item[key] if key else []
     return entries if all(isinstance(e, dict) for e in entries) else []
 
 
 def _common_number(entries: Sequence[Mapping[str, Any]], key: str) -> Any:
-    """The number that all entries have in common, else None."""
+    """Return the number that all entries share, else None."""
     values = [e.get(key) for e in entries]
     same = values and all(is_number(v) and v == values[0] and type(v) is type(values[0]) for v in values)
     return values[0] if same else None
 
 
 def _without(item: Mapping[str, Any], kind: str, key: str) -> dict[str, Any]:
-    """The item, its entries without a word."""
+    """Return the item without ``key`` in its entries."""
     list_word = vehicle_properties_key(item, kind)
     if list_word is None:
         return dict(item)
@@ -354,7 +356,7 @@ def _without(item: Mapping[str, Any], kind: str, key: str) -> dict[str, Any]:
 
 
 def trajectory_of(line: Sequence[Sequence[float]]) -> dict[str, Any]:
-    """A line of n positions as the NURBS of degree 1 through them: knots from 0 to 1, evenly spread."""
+    """Convert a line of n positions to the NURBS of degree 1 through them, with uniform knots from 0 to 1."""
     n = len(line)
     inner = [k / (n - 1) for k in range(1, n - 1)]
     points = [{"x": x, "y": y} for x, y in line]
@@ -362,7 +364,7 @@ def trajectory_of(line: Sequence[Sequence[float]]) -> dict[str, Any]:
 
 
 def _polyline(entries: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]] | None:
-    """The positions of a trajectory that all entries share, where it is one that ``trajectory_of`` writes."""
+    """Return the positions of a trajectory that all entries share, if ``trajectory_of`` can write it."""
     trajectory = entries[0].get("trajectory") if entries else None
     points = trajectory.get("controlPoints") if isinstance(trajectory, dict) else None
     if not isinstance(points, list) or len(points) < 3 or any(e.get("trajectory") != trajectory for e in entries):

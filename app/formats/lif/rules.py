@@ -1,4 +1,4 @@
-"""What the Layout Interchange Format's specification requires.
+"""Rules of the Layout Interchange Format's specification.
 
 Source: VDMA LIF 1.0.0, section 8 (members and their types, ids unique within the file, angles in radians from -π to π);
 the drafts of 2.0 call vehicle types mobile robot types and put layouts into origins.
@@ -21,11 +21,11 @@ ORIENTATIONS = ("GLOBAL", "TANGENTIAL")
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A file against the specification."""
+    """Check a file with the rules of the specification."""
     main = next(iter(files))
     top = orjson.loads(files[main])
     if not isinstance(top, dict):
-        yield error_finding("a LIF is one JSON object", main)
+        yield error_finding("a LIF file must be one JSON object", main)
         return
     meta = top.get("metaInformation")
     draft = isinstance(meta, dict) and str(meta.get("lifVersion", "")).startswith("2")
@@ -51,10 +51,10 @@ def check(files: Files) -> Iterator[Problem]:
         yield from _items(layout, ids, ends, main, location)
     for key, values in ids.items():
         if repeats := duplicates(values):
-            yield error_finding(f"{len(repeats)} are not unique within the file: {names(repeats)}", main, where=key)
+            yield error_finding(f"{len(repeats)} ids are not unique within the file: {names(repeats)}", main, where=key)
     node_ids = set(ids["nodeId"])
     if absent := [item for item, refs in ends if not all(isinstance(r, str) and r in node_ids for r in refs)]:
-        reason = f"{len(absent)} edges or stations name a node that is not there: {names(absent)}"
+        reason = f"{len(absent)} edges or stations refer to unknown nodes: {names(absent)}"
         yield error_finding(reason, main, where=path)
 
 
@@ -93,7 +93,7 @@ def _vehicles(item: dict[str, Any], end: str, main: str, location: str) -> Itera
     )
     entries = item.get(key)
     if not isinstance(entries, list) or not entries:
-        yield error_finding("needs an entry for one type of vehicle at least", main, where=f"{location}.{key}")
+        yield error_finding("needs at least one vehicle type", main, where=f"{location}.{key}")
         return
     for k, one in enumerate(entries):
         item_location = f"{location}.{key}[{k}]"
@@ -102,11 +102,11 @@ def _vehicles(item: dict[str, Any], end: str, main: str, location: str) -> Itera
             continue
         theta = one.get("theta")
         if theta is not None and not is_number(theta):
-            yield error_finding(f"must be a number, is {shown(theta)}", main, where=f"{item_location}.theta")
+            yield error_finding(f"must be a number, not {shown(theta)}", main, where=f"{item_location}.theta")
         elif theta is not None and abs(theta) > math.pi + 1e-6:
             yield warning_finding(
-                f"{theta:g} is no angle in radians from -π to π", main, where=f"{item_location}.theta"
+                f"must be an angle in radians from -π to π, not {theta:g}", main, where=f"{item_location}.theta"
             )
         if one.get("orientationType") not in (None, *ORIENTATIONS):
-            reason = f"must be one of {', '.join(ORIENTATIONS)}, is {shown(one['orientationType'])}"
+            reason = f"must be one of {', '.join(ORIENTATIONS)}, not {shown(one['orientationType'])}"
             yield error_finding(reason, main, where=f"{item_location}.orientationType")

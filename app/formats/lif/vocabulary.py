@@ -1,4 +1,4 @@
-"""The words of LIF: what a file holds, and what its versions call it."""
+"""Members of LIF files, and their names in each version."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.syntax import json
 NAME = "lif"
 VERSION = "1.0.0"
 EPOCH = "1970-01-01T00:00:00.00Z"
-"""Where a source tells no time: the same network must give the same bytes."""
+"""Default time if the source has none: the same network must give the same bytes."""
 
 ORDER = json.rank_keys(
     "metaInformation projectIdentification lifId creator exportTimestamp lifVersion origins originId layoutId "
@@ -22,7 +22,7 @@ ORDER = json.rank_keys(
     "vehicleTypeNodeProperties vehicleTypeEdgeProperties vehicleTypeId actionType actionDescription "
     "requirementType blockingType actionParameters key value degree knotVector controlPoints"
 )
-"""How the keys follow each other, as in the specification."""
+"""Order of the keys, as in the specification."""
 
 LISTS = frozenset({"nodes", "edges", "stations"})
 _ACTION = record(
@@ -73,7 +73,7 @@ SHAPE = record(
         )
     ],
 )
-"""What a file of version 1 holds. Source: VDMA LIF 1.0.0, section 8."""
+"""Schema of a file of version 1. Source: VDMA LIF 1.0.0, section 8."""
 
 CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | CROSS_PART_PROPERTIES
 CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", NAME}) | CROSS_PART_PROPERTIES
@@ -82,14 +82,14 @@ CANONICAL_STATION = frozenset({"kind", "name", NAME}) | CROSS_PART_PROPERTIES
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How a version of the format calls what types of vehicle have of their own, and the member that names a type."""
+    """Member names of a version of the format: entries by vehicle type, and the type in them."""
 
     node: str
     edge: str
     type: str
 
     def vehicle_type_member(self, name: str) -> dict[str, Any]:
-        """The member that names a type of vehicle."""
+        """Return the member that names a vehicle type."""
         if self.type == "mobileRobotTypes":
             return {self.type: [{"manufacturer": name, "seriesName": name}]}
         return {self.type: name}

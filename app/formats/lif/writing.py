@@ -1,4 +1,4 @@
-"""Writing LIF: each level as a layout."""
+"""Writing LIF: one layout per level."""
 
 from __future__ import annotations
 
@@ -50,30 +50,34 @@ from app.syntax.decimals import METRES
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What the file says where no source does."""
+    """Values that no source specifies."""
 
-    vehicle_type: str = parameter("any", "type of vehicle of nodes and edges whose source names none")
-    creator: str = parameter("Fleet Map Server", "creator of a file that no source names one for")
-    project: str | None = parameter(None, "project of a file that no source names one for; default: the map's name")
-    orientation_type: Literal["TANGENTIAL", "GLOBAL"] = parameter(
-        "TANGENTIAL", "what the orientation of vehicles on new edges is measured from"
+    vehicle_type: str = parameter("any", "vehicle type of nodes and edges without one")
+    creator: str = parameter("Fleet Map Server", "creator of the file if no source specifies one")
+    project: str | None = parameter(
+        None, "project of the file if no source specifies one; default: the name of the map"
     )
-    vehicle_orientation: float = parameter(0.0, "of vehicles on new edges", minimum=-3.2, maximum=3.2, unit="rad")
-    rotation_allowed: bool = parameter(False, "whether vehicles may turn on new edges")
-    layout_version: str = parameter("1", "version of layouts that no source has")
+    orientation_type: Literal["TANGENTIAL", "GLOBAL"] = parameter(
+        "TANGENTIAL", "reference of vehicle_orientation on edges of other formats"
+    )
+    vehicle_orientation: float = parameter(
+        0.0, "orientation of vehicles on edges of other formats", minimum=-3.2, maximum=3.2, unit="rad"
+    )
+    rotation_allowed: bool = parameter(False, "allow vehicles to rotate on edges of other formats")
+    layout_version: str = parameter("1", "version of layouts without one")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``layout.lif.json``: each level is a layout of its own, or the ones that its source has.
+    """Write ``layout.lif.json``: one layout per level, or the layouts of the source.
 
-    Wgs84 items are brought to local metres (MissingDatum without a datum). CannotConvert where there is no node.
+    WGS 84 items are converted to local metres (MissingDatum without a datum). Raises CannotConvert if there is no node.
     """
     return {"layout.lif.json": _Writer(layers, context).data()}
 
 
 @dataclass(slots=True)
 class _Layout:
-    """A layout being written: what it says of itself, and its items with where they stood."""
+    """Layout being written: its own members, and its items with their source index."""
 
     head: dict[str, Any]
     items: dict[str, list[tuple[tuple[bool, int, tuple[int, str]], dict[str, Any]]]] = field(
@@ -87,7 +91,7 @@ class _Writer:
         self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
         self.net = merge_networks(layers, context)
         if not self.net.nodes:
-            raise CannotConvert("the network has no node, and a layout needs one: supply a network with nodes")
+            raise CannotConvert("a layout needs nodes, but the network has none: supply a network with nodes")
         self.filled: Counter[str] = Counter()
         self.lost: Counter[str] = Counter()
         documents = [get_source_properties(part.document, NAME) for part in layers.vector("topology").values()]
@@ -102,7 +106,7 @@ class _Writer:
         self.dialect = self._dialect()
 
     def _dialect(self) -> Dialect:
-        """The one that the source's items speak."""
+        """Return the dialect of the source's items."""
         property_sets = [n.properties for n in self.net.nodes] + [e.properties for e in self.net.edges]
         for p in property_sets:
             source_members = get_source_properties(get_source_properties(p, NAME), "item")
@@ -114,7 +118,7 @@ class _Writer:
         return LIF_1
 
     def data(self) -> bytes:
-        """The whole text."""
+        """Return the file."""
         names = self._names(self.net.nodes)
         for node, name in zip(self.net.nodes, names, strict=True):
             self._add_to_layout("nodes", node.properties, node.level, name, self._node(node, name))
@@ -142,16 +146,16 @@ class _Writer:
         if "lifId" not in meta and "projectIdentification" not in meta:
             meta["projectIdentification"] = self.options.project or self.context.title
             project = meta["projectIdentification"]
-            self.context.fill("metaInformation.projectIdentification", project, "no source names it", "project")
+            self.context.fill("metaInformation.projectIdentification", project, "no source specifies it", "project")
         for key, value in (("creator", self.options.creator), ("exportTimestamp", EPOCH), ("lifVersion", VERSION)):
             if key not in meta:
                 meta[key] = value
                 option = key if key == "creator" else None
-                self.context.fill(f"metaInformation.{key}", value, "no source names it", option)
+                self.context.fill(f"metaInformation.{key}", value, "no source specifies it", option)
         return {**top, "metaInformation": meta}
 
     def _origins(self) -> list[tuple[dict[str, Any], list[str]]]:
-        """(head, ids of its layouts) of the origins that the source has; other layouts join the first one."""
+        """Return (members, ids of its layouts) of the source's origins; other layouts join the first one."""
         origins: list[tuple[dict[str, Any], list[str]]] = []
         placed: set[str] = set()
         for document in self.documents:
@@ -177,7 +181,7 @@ class _Writer:
         return out
 
     def _add_to_layout(self, section: str, p: Properties, level: str, name: str, item: dict[str, Any]) -> None:
-        """Put an item into its layout: the one its source says, the first of its level, or a new one."""
+        """Add an item to its layout: that of its source, the first of its level, or a new one."""
         source_members = get_source_properties(p, NAME)
         layout_id, at = source_members.get("layout"), source_members.get("at")
         if not isinstance(layout_id, str) or layout_id not in self.layouts:
@@ -198,18 +202,18 @@ class _Writer:
         self.layouts[layout_id].items[section].append((key, item))
 
     def _names(self, items: Sequence[Node | Edge]) -> list[str]:
-        """The ids of the file: those of the sources, where they are distinct."""
+        """Return the ids in the file: those of the sources if they are unique."""
         names = []
         for item in items:
             source_id = get_source_properties(item.properties, NAME).get("id")
             names.append(source_id if isinstance(source_id, str) and is_name(source_id) else item.id)
         out = unique_ids(names)
         if repeats := [a for a, b in zip(names, out, strict=True) if a != b]:
-            self.context.warn(f"{len(repeats)} ids stood for several items and got a number: {shorten_list(repeats)}")
+            self.context.warn(f"{len(repeats)} duplicate ids: {shorten_list(repeats)}; a number makes them unique")
         return out
 
     def _base(self, p: Properties, kind: str, name: str) -> dict[str, Any]:
-        """The members of an item's source, with its id and its name."""
+        """Return the members of an item's source, with its id and its name."""
         item = {
             w: v for w, v in get_source_properties(get_source_properties(p, NAME), "item").items() if w != f"{kind}Id"
         }
@@ -222,9 +226,9 @@ class _Writer:
     def _vehicles(
         self, p: Properties, out: dict[str, Any], kind: str, template: Mapping[str, Any]
     ) -> list[dict[str, Any]]:
-        """The entries of types of vehicle, copies; one for the type of the options where another format tells none.
+        """Return copies of the entries by vehicle type; items of other formats get one for the type in the options.
 
-        An item of a LIF file without entries stays so: no vehicle may use it.
+        An item of a LIF file without entries gets none: no vehicle may use it.
         """
         key = vehicle_properties_key(out, kind)
         entries = [dict(e) for e in vehicle_entries(out, kind)]
@@ -280,7 +284,7 @@ class _Writer:
             shapes = part.in_local(self.layers.frame)
             for i, p, shape in zip(part.ids, part.properties, shapes, strict=True):
                 if p.get("kind") != "station":
-                    self.lost["objects that are no stations"] += 1
+                    self.lost["objects that are not stations"] += 1
                     continue
                 source_id = get_source_properties(p, NAME).get("id")
                 name = source_id if isinstance(source_id, str) and is_name(source_id) else i
@@ -296,7 +300,7 @@ class _Writer:
                 self._add_to_layout("stations", p, key.level, name, out)
 
     def _dangling(self) -> None:
-        """Edges to nowhere, of the nodes that know them and of the files as a whole, each once."""
+        """Write dangling edges stored with nodes and with files, each once."""
         lists = [get_source_properties(node.properties, NAME).get("dangling") for node in self.net.nodes]
         lists += [document.get("dangling") for document in self.documents]
         seen = set()
@@ -308,31 +312,29 @@ class _Writer:
 
     def _report(self) -> None:
         context = self.context
-        why = "no source names a type of vehicle"
+        why = "no source specifies a vehicle type"
         for kind in ("nodes", "edges"):
             if self.filled[kind]:
                 reason = f"{self.filled[kind]} {kind}: {why}"
-                context.fill(f"{kind}: type of vehicle", self.options.vehicle_type, reason, "vehicle_type")
+                context.fill(f"{kind}: vehicle type", self.options.vehicle_type, reason, "vehicle_type")
         if self.filled["edges"]:
             option_names = {"orientationType": "orientation_type"}
             if self.dialect == LIF_1:
                 option_names |= {"vehicleOrientation": "vehicle_orientation", "rotationAllowed": "rotation_allowed"}
             for key, option in option_names.items():
-                reason = f"{self.filled['edges']} edges do not say it"
+                reason = f"{self.filled['edges']} edges do not specify it"
                 context.fill(f"edges: {key}", getattr(self.options, option), reason, option)
         if self.filled["layouts"]:
-            context.fill(
-                "layouts", f"{self.filled['layouts']}, one for each level", "no source has a layout of the level"
-            )
+            context.fill("layouts", f"{self.filled['layouts']}, one per level", "no source has a layout of the level")
             context.fill("layouts: layoutVersion", self.options.layout_version, "no source has it", "layout_version")
         if self.filled["stations"]:
-            context.fill("stations: interactionNodeIds", [], f"{self.filled['stations']} stations name no nodes")
+            context.fill("stations: interactionNodeIds", [], f"{self.filled['stations']} stations have no nodes")
         for noun, n in sorted(self.lost.items()):
-            context.drop(noun, n, "LIF has no place for it")
+            context.drop(noun, n, "LIF cannot store it")
 
 
 def _objects(value: Any) -> list[dict[str, Any]]:
-    """The objects of a list."""
+    """Return the objects of a list."""
     return [v for v in value if isinstance(v, dict)] if isinstance(value, list) else []
 
 

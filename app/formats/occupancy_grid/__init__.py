@@ -1,11 +1,12 @@
-"""Occupancy grids as Nav2's map_server keeps them: a YAML of resolution, origin and thresholds beside a grey picture.
+"""Occupancy grids of Nav2's map_server: a YAML file with resolution, origin and thresholds, and a grey image.
 
-A pixel g (0…255) is x = 1 - g/255 occupied (``negate``: g/255). ``trinary``: 100 where x ≥ occupied_thresh, then 0
-where x ≤ free_thresh (free wins), else unknown; ``scale``: between the thresholds round(100 (x - free)/(occupied -
-free)); ``raw``: g itself up to 100, else unknown. A pixel that is not opaque is unknown (trinary, scale). The picture's
+A pixel g (0…255) is x = 1 - g/255 occupied (``negate``: g/255). ``trinary``: 100 if x ≥ occupied_thresh, then 0 if
+x ≤ free_thresh (free takes precedence), else unknown; ``scale``: between the thresholds round(100 (x - free)/
+(occupied - free)); ``raw``: g itself up to 100, else unknown.
+A pixel that is not opaque is unknown (trinary, scale). The image's
 top row is the map's last one. Comparisons are in float32. Source: nav2_map_server, map_io.cpp.
 
-A costmap filter mask (keepout, speed) is such a grid with one more file, ``<grid>_filter_info.yaml``: see ``_masks``.
+A costmap filter mask (keepout, speed) is such a grid with an additional ``<grid>_filter_info.yaml``: see ``_masks``.
 
 Frame: local; ``origin`` = [x, y, yaw] of the lower left corner, metres and radians. Nav2 ignores the yaw.
 """
@@ -34,7 +35,7 @@ HEAD = 2**16
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A YAML that names an image and at least two of a grid's other keys. A picture alone may be of anything."""
+    """Detect YAML with an image and at least two of a grid's other keys. A single image is not detected."""
     del name
     head = data[:HEAD]
     if b"image" not in head or b"\0" in head:
@@ -45,20 +46,22 @@ def detect(name: str, data: bytes) -> bool:
 
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
-    """The picture that a YAML names, and a mask's parameters. For a picture: the YAML of the same stem."""
+    """Find the image of a YAML file, and a mask's parameters; for an image, the YAML file with the same stem."""
     if is_image(main, data):
         stem = main.rpartition(".")[0]
         return [n for n in names if n in (stem + ".yaml", stem + ".yml")]
     try:
         image = yaml.load(data, Limits(yaml_nodes=10_000))["image"]
         return [n for n in [find_image(str(image), main, names)[0]] if n] + _masks.companions(main, names)
-    except (*BAD_INPUT, FleetMapError):  # the reader says what is wrong with it
+    except (*BAD_INPUT, FleetMapError):  # the reader reports the error
         return []
 
 
 def options_from_filename(name: str) -> dict[str, str]:
-    """``keepout.yaml``, ``keepout.pgm`` and ``keepout_filter_info.yaml`` are the grid ``keepout``; ``keepout.png`` asks
-    for a PNG, too."""
+    """Select the grid ``keepout`` for ``keepout.yaml``, ``.pgm`` and ``keepout_filter_info.yaml``.
+
+    ``keepout.png`` also selects PNG.
+    """
     stem, _, end = name.rpartition(".")
     if f".{end}" in YAML_ENDS:
         stem = stem.removesuffix(_masks.SUFFIX)

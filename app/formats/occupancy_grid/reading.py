@@ -1,4 +1,4 @@
-"""Reading map_server files: a YAML and its picture, or a picture alone."""
+"""Reading map_server files: a YAML file with its image, or an image alone."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ MODES: tuple[Mode, ...] = ("trinary", "scale", "raw")
 SHAPE = _fields.record(
     "image mode negate occupied_thresh free_thresh map_type",
     resolution=_fields.Number(
-        1e-6, 1e4, usual=(1e-3, 10.0), hint="a cell this large holds a room; is it in metres?", unit="metres"
+        1e-6, 1e4, usual=(1e-3, 10.0), hint="a cell of this size contains a room; is it in metres?", unit="metres"
     ),
     origin=(_fields.COORDINATE, _fields.COORDINATE, replace(_fields.ANGLE, low=-MAX_METRES, high=MAX_METRES)),
 )
-"""What a map's YAML holds. Source: Nav2's map_io, slam_toolbox."""
+"""Schema of a map's YAML file. Source: Nav2's map_io, slam_toolbox."""
 REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 YAML_ENDS = (".yaml", ".yml")
 IMAGE_ENDS = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
@@ -37,36 +37,36 @@ IMAGE_ENDS = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """How to take a picture that comes without a YAML."""
+    """Parameters of an image without a YAML file."""
 
     resolution: float | None = parameter(
-        None, "size of a cell, for a picture without a YAML", minimum=1e-6, maximum=1e4, unit="m"
+        None, "size of a cell, for an image without a YAML file", minimum=1e-6, maximum=1e4, unit="m"
     )
     origin: tuple[float, float, float] = parameter(
-        (0.0, 0.0, 0.0), "x,y,yaw of the lower left corner (metres, radians), for a picture without a YAML"
+        (0.0, 0.0, 0.0), "x,y,yaw of the lower left corner (metres, radians), for an image without a YAML file"
     )
-    negate: bool = parameter(False, "white is occupied, for a picture without a YAML")
+    negate: bool = parameter(False, "white is occupied, for an image without a YAML file")
     occupied_thresh: float = parameter(
-        0.65, "from this share of black on a cell is occupied, for a picture without a YAML", minimum=0.0, maximum=1.0
+        0.65, "minimum share of black of occupied cells, for an image without a YAML file", minimum=0.0, maximum=1.0
     )
     free_thresh: float = parameter(
-        0.196, "up to this share of black a cell is free, for a picture without a YAML", minimum=0.0, maximum=1.0
+        0.196, "maximum share of black of free cells, for an image without a YAML file", minimum=0.0, maximum=1.0
     )
     mode: Literal["trinary", "scale", "raw"] = parameter(
-        "trinary", "what the greys mean (as in Nav2), for a picture without a YAML"
+        "trinary", "meaning of grey values (as in Nav2), for an image without a YAML file"
     )
 
 
 def is_image(name: str, data: bytes) -> bool:
-    """Whether this is a picture, by content or by name."""
+    """Detect an image by content or name."""
     return images.detect_kind(data) is not None or name.lower().endswith(IMAGE_ENDS)
 
 
 def find_image(reference: str, main: str, names: Iterable[str]) -> tuple[str | None, str]:
-    """The picture of the upload that a YAML means, and a warning if it is not simply where the YAML says.
+    """Find the upload's image for a reference in a YAML file, and a warning if it is not at the referenced path.
 
-    Only a plain relative path is followed; of any other one (absolute, with ``..``, a drive, a variable) the base name
-    is looked up: beside the YAML, else the only one of the upload.
+    Only plain relative paths are followed; for others (absolute, with ``..``, a drive, a variable) the base name is
+    looked up: beside the YAML file, else the only one in the upload.
     """
     folder = main.rpartition("/")[0]
     beside = f"{folder}/" if folder else ""
@@ -83,16 +83,16 @@ def find_image(reference: str, main: str, names: Iterable[str]) -> tuple[str | N
         match = beside + base
     else:
         same = [n for n in name_set if n.rpartition("/")[2] == base]
-        if len(same) != 1:  # of several one would be a guess, and a robot would drive by it
+        if len(same) != 1:  # choosing one of several would be a guess that robots rely on
             return None, ""
         match = same[0]
     if match == beside + reference:
         return match, ""
-    return match, f"the image {reference[:200]!r} is not part of the upload; {match!r} was taken for it"
+    return match, f"the image {reference[:200]!r} is not part of the upload; {match!r} is used"
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """One grid. Raises UnreadableFile (with key and line) or TooLarge."""
+    """Read one grid. Raises UnreadableFile (with key and line) or TooLarge."""
     main = context.main or next(iter(files))
     options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
     if not is_image(main, files[main]):
@@ -101,7 +101,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if beside is not None and options.resolution is None:
         return _read_yaml(files, beside, options, context)
     if options.resolution is None:
-        reason = "a picture alone does not say how large its cells are: add its YAML, or the option resolution"
+        reason = "an image alone has no cell size: add its YAML file, or set the option resolution"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="resolution")])
     parameters = {
         "resolution": options.resolution,
@@ -118,9 +118,9 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
     data = files[main]
     document = yaml.load(data, context.limits)
     if not isinstance(document, dict):
-        raise UnreadableFile(f"{main}: a map's YAML is a mapping with the keys {', '.join(REQUIRED)}")
+        raise UnreadableFile(f"{main}: a map's YAML file must be a mapping with the keys {', '.join(REQUIRED)}")
     if options != ReadOptions():
-        context.warn("the options of a picture without a YAML are not used: there is a YAML", file=main)
+        context.warn("the options for images without a YAML file are ignored; there is a YAML file", file=main)
     problems: list[Problem] = []
 
     def add_problem(key: str, reason: str) -> None:
@@ -138,13 +138,13 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         if key not in missing:
             parameters[key] = number = _number(document[key])
             if number is None or not low <= number <= high:
-                add_problem(key, f"{key} must be a number between {low:g} and {high:g}, got {_shown(document[key])}")
+                add_problem(key, f"{key} must be a number between {low:g} and {high:g}, not {_shown(document[key])}")
     if "origin" not in missing:
         origin = document["origin"]
         numbers = [_number(v) for v in origin] if isinstance(origin, list) else []
         if len(numbers) != 3 or any(v is None or abs(v) > MAX_METRES for v in numbers):
             add_problem(
-                "origin", f"origin must be three numbers [x, y, yaw] within ±{MAX_METRES:g}, got {_shown(origin)}"
+                "origin", f"origin must be three numbers [x, y, yaw] within ±{MAX_METRES:g}, not {_shown(origin)}"
             )
         parameters["origin"] = tuple(numbers)
     if "negate" not in missing:
@@ -153,17 +153,17 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         if isinstance(negate, bool) or number in (0.0, 1.0):
             parameters["negate"] = bool(negate if isinstance(negate, bool) else number)
         else:
-            add_problem("negate", f"negate must be 0, 1, true or false, got {_shown(negate)}")
+            add_problem("negate", f"negate must be 0, 1, true or false, not {_shown(negate)}")
     if parameters["mode"] not in MODES:
-        add_problem("mode", f"mode must be trinary, scale or raw, got {_shown(parameters['mode'])}")
+        add_problem("mode", f"mode must be trinary, scale or raw, not {_shown(parameters['mode'])}")
     image = document.get("image")
     if "image" not in missing and not (isinstance(image, str) and image):
-        add_problem("image", f"image must be the name of a picture, got {_shown(image)}")
+        add_problem("image", f"image must be the name of an image file, not {_shown(image)}")
     if problems:
         raise UnreadableFile("; ".join(f"{p.file}: {p.problem}" for p in problems), problems)
     picture = _picture_name(str(image), files, main, context)
     if parameters["free_thresh"] > parameters["occupied_thresh"]:
-        reason = "free_thresh is above occupied_thresh: where both hold a cell is free"
+        reason = "free_thresh is above occupied_thresh; cells that match both are free"
         context.warn(reason, file=main, line=_line(data, "free_thresh"), where="free_thresh")
     _fields.check(document, SHAPE, context)
     extra = {key: value for key, value in document.items() if key not in KEYS}
@@ -173,10 +173,10 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
 
 
 def _picture_name(image: str, files: Files, main: str, context: ReadContext) -> str:
-    """The picture of the upload that the YAML's ``image`` means. Raises UnreadableFile where there is none."""
+    """Return the name of the upload's image for the YAML file's ``image``. Raises UnreadableFile if missing."""
     picture, warning = find_image(image, main, files)
     if picture is None or picture == main:
-        reason = f"the image {image[:200]!r} is not in the upload: add this file, beside the YAML"
+        reason = f"the image {image[:200]!r} is not in the upload: add this file, next to the YAML file"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, _line(files[main], "image"), "image")])
     if warning:
         context.warn(warning, file=main, line=_line(files[main], "image"), where="image")
@@ -191,7 +191,7 @@ def _layers(
     yaw = parameters["origin"][2]
     if yaw != 0.0:
         line = _line(files[main], "origin") if main != picture else None
-        reason = f"the origin is turned by {yaw:g} rad; Nav2 ignores that: ask for the map with normalize=true"
+        reason = f"the origin has a yaw of {yaw:g} rad, which Nav2 ignores; request the map with normalize=true"
         context.warn(reason, file=main, line=line, where="origin")
     mask_file = (
         next((n for n in _masks.companions(main, list(files)) if n != picture), None) if main != picture else None
@@ -229,8 +229,10 @@ def _layers(
 def _cells(
     shades: images.Grey, rule: Table, mode: Mode, shade: int | None
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Canonical cells (bottom row first) of a picture, a strip of rows at a time, and which opaque ones have the wanted
-    grey; None where there are none."""
+    """Convert an image to canonical cells (bottom row first), a strip of rows at a time.
+
+    Also returns a mask of the opaque cells with the given grey value, or None if there are none.
+    """
     cells = np.empty((shades.height, shades.width), np.uint8)
     grey = None if shade is None else np.zeros(cells.shape, bool)
     table = rule.tobytes()
@@ -246,7 +248,7 @@ def _cells(
 
 
 def _number(value: Any) -> float | None:
-    """A finite number, also one that is quoted (yaml-cpp takes it so)."""
+    """Parse a finite number, also a quoted one (as yaml-cpp does)."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     if isinstance(value, str) and not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", value, re.ASCII):
@@ -260,6 +262,6 @@ def _shown(value: Any) -> str:
 
 
 def _line(data: bytes, key: str) -> int | None:
-    """The line (from 1) on which a top-level key stands."""
+    """Return the line (from 1) of a top-level key."""
     match = re.search(rb'^[ \t{]*["\']?' + key.encode() + rb'["\']?[ \t]*:', data, re.MULTILINE)
     return None if match is None else data.count(b"\n", 0, match.end()) + 1

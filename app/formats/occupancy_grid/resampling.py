@@ -1,4 +1,4 @@
-"""Grids for consumers that want other cells, or an origin without a yaw."""
+"""Resampling of grids to another cell size, or to an origin without yaw."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from app.syntax import images
 
 _RANK = np.concatenate([[0], np.arange(2, OCCUPIED + 2), np.zeros(UNKNOWN - OCCUPIED - 1), [1]]).astype(np.uint8)
 _OF_RANK = np.concatenate([[FREE, UNKNOWN], np.arange(1, OCCUPIED + 1), np.zeros(256 - OCCUPIED - 2)]).astype(np.uint8)
-"""Free < unknown < any known value above free: the order in which one cell is made of several."""
+"""Order in which cells are merged: free < unknown < any value above free."""
 
 
 def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
-    """The same place in cells of another size, from the same corner.
+    """Resample a grid to another cell size, with the same corner.
 
-    A coarser cell has the highest value that it covers, where unknown counts just above free: no obstacle gets lost,
-    nothing unseen becomes free. A finer cell has the value of the cell at its centre. Raises Invalid if too many cells.
+    A coarser cell has the highest value that it covers, with unknown just above free: no obstacle disappears, no
+    unknown cell becomes free. A finer cell has the value of the cell at its centre. Raises Invalid if too many cells.
     """
     ratio = resolution / grid.resolution
     shape = [max(1, math.ceil(n / ratio - 1e-6)) for n in grid.cells.shape]
@@ -38,7 +38,7 @@ def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
         edges = np.arange(n + 1) * ratio
         starts = np.minimum(np.floor(edges[:-1] + 1e-6).astype(np.intp), old - 1)
         ends = np.clip(np.ceil(edges[1:] - 1e-6).astype(np.intp), starts + 1, old)
-        # Cells may share a row of old ones, so no single reduceat: the highest of each width, step by step.
+        # New cells may share an old row, so no single reduceat: take the maximum row by row.
         out = np.take(ranks, starts, axis)
         for step in range(1, int((ends - starts).max())):
             np.maximum(out, np.take(ranks, np.minimum(starts + step, ends - 1), axis), out=out)
@@ -47,10 +47,10 @@ def resample(grid: OccupancyGrid, resolution: float) -> OccupancyGrid:
 
 
 def normalize(grid: OccupancyGrid) -> OccupancyGrid:
-    """The same place with yaw 0 and an origin that is a whole multiple of the resolution; unknown outside.
+    """Resample a grid to yaw 0 and an origin at a multiple of the resolution; unknown outside.
 
-    A cell has the value of the old cell at its centre, or that of an occupied one whose centre it holds, whichever is
-    higher: no obstacle gets lost. Raises Invalid if too many cells.
+    A cell has the value of the old cell at its centre, or of an occupied one whose centre it contains, whichever is
+    higher: no obstacle disappears. Raises Invalid if too many cells.
     """
     size, (x, y, yaw) = grid.resolution, grid.origin
     steps = [v / size for v in (x, y)]
@@ -87,5 +87,5 @@ def normalize(grid: OccupancyGrid) -> OccupancyGrid:
 def _check_count(count: int, location: str) -> None:
     maximum = Limits().pixels
     if count > maximum:
-        reason = f"the map would have {count} cells; at most {maximum} are made: ask for a coarser resolution"
+        reason = f"the map would have {count} cells, the maximum is {maximum}: request a coarser resolution"
         raise Invalid(reason, [Problem(reason, where=location)])

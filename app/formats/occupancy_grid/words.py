@@ -1,4 +1,4 @@
-"""What reader and writer share: the keys of a map's YAML, and what a grey of its picture means."""
+"""Shared by reader and writer: keys of a map's YAML file, and the meaning of its image's grey values."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ NAME = "occupancy_grid"
 KEYS = ("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
 MAP_SAVER_PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
-"""The pixels that map_saver writes."""
+"""Pixel values that map_saver writes."""
 
 Table = NDArray[np.uint8]
 
 
 def reads_unknown_as_free(rule: Table, mode: Mode, *, negate: bool) -> bool:
-    """Whether the grey that map_saver writes for unknown is read as free."""
+    """Check whether the grey value that map_saver writes for unknown is read as free."""
     return mode == "trinary" and not negate and bool(rule[MAP_SAVER_PIXELS[UNKNOWN]] == FREE)
 
 
 def cell_table(mode: Mode, negate: bool, occupied: float, free: float) -> Table:
-    """The cell of each opaque pixel 0…255."""
+    """Return the cell value of each opaque pixel value 0…255."""
     shade = np.arange(256)
     if mode == "raw":
         return np.where(shade <= OCCUPIED, shade, UNKNOWN).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Writing map_server files: which grids, their pictures, and the YAML beside each."""
+"""Writing map_server files: selection of grids, their images and YAML files."""
 
 from __future__ import annotations
 
@@ -36,33 +36,35 @@ from app.syntax import images, yaml
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """Which grid, and how it is written."""
+    """Selection of the grid, and its encoding."""
 
-    grid: str | None = parameter(None, "name of the grid; *: all, drawn masks too; default: map, else the only one")
+    grid: str | None = parameter(
+        None, "name of the grid; *: all, including masks drawn from zones; default: map, else the only one"
+    )
     level: str | None = parameter(None, "level of the grid; *: all; default: the one it is on")
     file_type: Literal["pgm", "png"] | None = parameter(
-        None, "picture format; default: pgm, or png where only transparency can say unknown"
+        None, "image format; default: pgm, or png if unknown can only be transparent"
     )
     mode: Literal["trinary", "scale", "raw"] | None = parameter(
-        None, "how greys encode cells; default: as uploaded, or raw where that cannot say every value"
+        None, "encoding of cells as grey values; default: as uploaded, or raw if that cannot represent every value"
     )
     resolution: float | None = parameter(
         None,
-        "resample to this size of a cell: a coarser cell has the highest value that it covers (unknown counts just "
-        "above free), a finer one that of the cell at its centre",
+        "resample to this cell size: a coarser cell has the highest value that it covers (unknown is just above "
+        "free), a finer one the value of the cell at its centre",
         minimum=1e-3,
         maximum=1e3,
         unit="m",
     )
     normalize: bool = parameter(
         False,
-        "bake the yaw (which Nav2 ignores) into the cells, unknown outside, and move the origin to a whole multiple "
-        "of the resolution; obstacles never get lost",
+        "rotate the cells to yaw 0 (Nav2 ignores the yaw), unknown outside, and move the origin to a multiple of the "
+        "resolution; no obstacle disappears",
     )
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``<grid>.yaml`` and its picture, and ``<grid>_filter_info.yaml`` of a mask.
+    """Write ``<grid>.yaml`` and its image, and ``<grid>_filter_info.yaml`` of a mask.
 
     Raises MissingLayer, NotFound, Ambiguous, or Invalid for impossible options.
     """
@@ -77,7 +79,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
     grid, pixels = _with_grey(grid, pixels)
     if grid.origin[2] != 0.0:
-        reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
+        reason = (
+            f"the origin has a yaw of {grid.origin[2]:g} rad, which Nav2 ignores; request the map with normalize=true"
+        )
         context.warn(reason, file=stem + ".yaml", where="origin")
     picture = f"{stem}.{kind}"
     files = {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
@@ -85,7 +89,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
+    """Choose the named grid, else ``map``, else the only one; on its level, else the ground, else the only one."""
     supply = "upload one (a YAML and its image)"
     return select_part(keys, "occupancy", options.grid, options.level, noun="grid", option="grid", supply=supply)
 
@@ -93,9 +97,9 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
 def _encoding(
     grid: OccupancyGrid, options: WriteOptions, context: WriteContext, file: str
 ) -> tuple[OccupancyGrid, Table, Literal["pgm", "png"]]:
-    """The grid in the mode it is written in, the pixel of each cell value, and the picture's format.
+    """Return the grid in its output mode, the pixel value of each cell value, and the image format.
 
-    In a PNG unknown may have no pixel of its own: it is transparent then.
+    In a PNG, unknown cells without a pixel value are transparent.
     """
     present = np.flatnonzero(_present_file(grid.cells))
     if options.mode is not None:
@@ -117,22 +121,22 @@ def _encoding(
         return grid, pixels, "png"
     if options.mode is not None:
         reason = (
-            f"mode={options.mode} with these thresholds has no grey for unknown: ask for file_type=png or mode=raw"
+            f"mode={options.mode} with these thresholds has no grey for unknown: request file_type=png or mode=raw"
             if pixels is not None
-            else f"mode={options.mode} has no grey for every value of this grid: ask for mode=raw"
+            else f"mode={options.mode} has no grey for every value of this grid: request mode=raw"
         )
         raise Invalid(reason)
     why = "unknown" if pixels is not None else "every value of this grid"
-    context.warn(f"written with mode: raw, since {grid.mode} has no grey for {why}", file=file, where="mode")
+    context.warn(f"{grid.mode} has no grey for {why}; the map is written with mode: raw", file=file, where="mode")
     grid = replace(grid, mode="raw")
     pixels = _pixels(grid, present)
     if pixels is None:
-        raise AssertionError("raw says every value")
+        raise AssertionError("raw represents every value")
     return grid, pixels, options.file_type or "pgm"
 
 
 def _with_mask(grid: OccupancyGrid, change: Callable[[OccupancyGrid], OccupancyGrid]) -> OccupancyGrid:
-    """A grid in other cells, whose free cells have unknown's grey if one of those that they show had it."""
+    """Resample a grid; free cells get the grey of unknown if one of their source cells had it."""
     out = without_unknown_grey(change(grid))
     if unknown_grey(grid) is None:
         return out
@@ -141,7 +145,7 @@ def _with_mask(grid: OccupancyGrid, change: Callable[[OccupancyGrid], OccupancyG
 
 
 def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table]:
-    """Free cells that came with the grey of unknown ones get it back, by a value that no cell has."""
+    """Restore the grey of unknown for free cells that were read from it, with an unused cell value."""
     rule = cell_table(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
     grey = unknown_grey(grid) if reads_unknown_as_free(rule, grid.mode, negate=grid.negate) else None
     if grey is None:
@@ -156,7 +160,7 @@ def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table
 
 
 def _present_file(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Which of the 256 values occur."""
+    """Mark the values that occur, bool [256]."""
     seen = np.zeros(256, bool)
     rows = max(1, images.STRIP // cells.shape[1])
     for y in range(0, len(cells), rows):
@@ -170,9 +174,10 @@ def _present_file(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _pixels(grid: OccupancyGrid, values: NDArray[np.intp]) -> Table | None:
-    """For each cell value a pixel that the consumer's rule turns back into it; None if one of ``values`` has none.
+    """Return for each cell value a pixel that the consumer maps back to it; None if one of ``values`` has none.
 
-    The pixels of map_saver where they fit, else blackest for occupied, whitest for free, the middle of those that fit.
+    Uses map_saver's pixels if they fit, else the blackest for occupied, the whitest for free, and the middle of the
+    fitting ones for other values.
     """
     rule = cell_table(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
     out = np.zeros(256, np.uint8)
@@ -193,18 +198,18 @@ def _pixels(grid: OccupancyGrid, values: NDArray[np.intp]) -> Table | None:
 
 
 def _apply_thresholds(grid: OccupancyGrid, context: WriteContext) -> OccupancyGrid:
-    """Values between free and occupied put to the thresholds, as trinary knows three values only."""
+    """Apply the thresholds to values between free and occupied: trinary has three values only."""
     value = np.arange(256)
     table = np.where(value >= grid.occupied_thresh * OCCUPIED, OCCUPIED, UNKNOWN)
     table[value <= grid.free_thresh * OCCUPIED] = FREE
     table[[FREE, OCCUPIED, UNKNOWN]] = FREE, OCCUPIED, UNKNOWN
     between = int(grid.cells.size) - sum(int(np.count_nonzero(grid.cells == v)) for v in (FREE, OCCUPIED, UNKNOWN))
-    context.drop("cells between free and occupied", between, "mode=trinary knows free, occupied and unknown only")
+    context.drop("cells between free and occupied", between, "mode=trinary has free, occupied and unknown only")
     return replace(grid, cells=images.apply_table(grid.cells, table.astype(np.uint8).tobytes())) if between else grid
 
 
 def _yaml_text(grid: OccupancyGrid, picture: str) -> bytes:
-    """The keys in map_saver's order, numbers as short as they read back exactly, then what else the source said."""
+    """Format the keys in map_saver's order, with shortest exact numbers, then the source's other keys."""
     origin = ", ".join(_float(v) for v in grid.origin)
     lines = [
         f"image: {_text(picture)}",
@@ -222,7 +227,7 @@ def _yaml_text(grid: OccupancyGrid, picture: str) -> bytes:
 
 
 def _float(value: float) -> str:
-    """repr, with the point that YAML 1.1 wants before an exponent; no -0.0."""
+    """Format a number like repr, with the point that YAML 1.1 requires before an exponent, and no -0.0."""
     text = repr(float(value) + 0.0)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
@@ -232,7 +237,7 @@ _ESCAPE = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
 
 
 def _text(value: str) -> str:
-    """A YAML scalar that is read as this text."""
+    """Quote a text as a YAML scalar."""
     if _PLAIN.fullmatch(value) and value not in yaml.CONSTANTS:
         return value
     quoted = json.dumps(value, ensure_ascii=False)
@@ -240,7 +245,7 @@ def _text(value: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """Any JSON-like value as YAML in flow style."""
+    """Format a JSON-like value as YAML in flow style."""
     if isinstance(value, str):
         return _text(value)
     if isinstance(value, bool) or value is None:
@@ -260,9 +265,7 @@ def _picture(grid: OccupancyGrid, pixels: Table, kind: Literal["pgm", "png"]) ->
         header = f"P5\n{grid.width} {grid.height}\n255\n".encode()
         out = io.BytesIO()
         out.seek(len(header) + grid.cells.size - 1)
-        out.write(
-            b"\0"
-        )  # all of it at once: a buffer that grows is copied, and so is what ``join`` or ``+`` make of parts
+        out.write(b"\0")  # one allocation: a growing buffer, ``join`` and ``+`` would copy
         out.seek(0)
         out.write(header)
         rows = max(1, images.STRIP // grid.width)

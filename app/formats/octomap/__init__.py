@@ -1,4 +1,4 @@
-"""OctoMap files: an octree of log-odds (``.ot``) or of free and occupied alone (``.bt``).
+"""OctoMap files: an octree of log-odds (``.ot``) or of free and occupied voxels only (``.bt``).
 
 A text header (``# Octomap OcTree file`` or ``# Octomap OcTree binary file``, comments, ``id``, ``size`` = nodes,
 ``res`` = metres, ``data``), then the tree depth first, children in ascending order, x in the lowest bit of an octant.
@@ -8,8 +8,8 @@ with a bit for each child. Files of 2010 have a binary header: uint32 3, float64
 ``.bt`` stream. Source: octomap's AbstractOcTree::write, AbstractOccupancyOcTree::readBinary,
 OccupancyOcTreeBase::writeBinaryNode.
 
-Inner nodes are not information: they are made from the leaves again (highest log-odds, mean colour), as
-``updateInnerOccupancy`` does. What is written is byte for byte what the C++ library writes for the same tree.
+Inner nodes carry no information: they are computed from the leaves (highest log-odds, mean colour), as by
+``updateInnerOccupancy``. Written files equal those of the C++ library for the same tree byte for byte.
 
 Frame: local; the tree is centred on the origin.
 """
@@ -45,11 +45,11 @@ LEGACY_TYPE = 3
 OCTREE = "OcTree"
 COLOR_OCTREE = "ColorOcTree"
 FULL_TYPES = (OCTREE, COLOR_OCTREE, "OcTreeStamped")
-"""Trees whose ``.ot`` is read: OcTreeStamped keeps its times to itself and is stored like an OcTree."""
+"""Tree types whose ``.ot`` is read: OcTreeStamped does not write its times and is stored like an OcTree."""
 
 HEADER_BYTES = 2**16
 MAX_PENDING_NODES = 7 * DEPTH
-"""Nodes of a tree of this depth that can wait for their turn in a depth-first walk."""
+"""Maximum number of pending nodes in a depth-first walk of a tree of this depth."""
 
 Kind = Literal["bt", "ot"]
 Words = NDArray[np.uint16]
@@ -59,7 +59,7 @@ Rows = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """Which voxels, and how they are written."""
+    """Selection of the voxels, and their encoding."""
 
     name: str | None = parameter(None, "name of the voxel map; *: all; default: map, else the only one")
     level: str | None = parameter(None, "level of the voxel map; *: all; default: the one it is on")
@@ -68,22 +68,24 @@ class WriteOptions:
     )
     depth: int | None = parameter(
         None,
-        f"level of detail: merge what is below this depth ({DEPTH}: smallest voxels, each level above doubles their "
-        "edge) into the most occupied of it",
+        f"level of detail: merge voxels below this depth ({DEPTH}: smallest voxels, each level above doubles their "
+        "edge) into the most occupied of them",
         minimum=1,
         maximum=DEPTH,
     )
     bbox: tuple[float, float, float, float, float, float] | None = parameter(
-        None, "cut to the voxels that meet this box: min x,min y,min z,max x,max y,max z in the local frame", unit="m"
+        None,
+        "keep only voxels that intersect this box: min x,min y,min z,max x,max y,max z in the local frame",
+        unit="m",
     )
     prune: bool | None = parameter(
-        None, "merge eight equal leaves into one; default: as OctoMap does when it writes, bt yes, ot no"
+        None, "merge eight equal leaves into one; default: as in OctoMap, true for bt, false for ot"
     )
 
 
-# --- telling ------------------------------------------------------------------------------------------------------
+# --- detecting ----------------------------------------------------------------------------------------------------
 def detect(name: str, data: bytes) -> bool:
-    """The first line, or the binary header of 2010 with possible numbers."""
+    """Detect the first line, or the binary header of 2010 with plausible numbers."""
     del name
     if data.startswith(TEXT):
         return data.startswith((BINARY_FILE, FULL_FILE))
@@ -96,7 +98,7 @@ def detect(name: str, data: bytes) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """What stands before the tree. body: offset of the tree's first byte."""
+    """Header of a file. body: offset of the tree's first byte."""
 
     kind: Kind
     id: str
@@ -122,7 +124,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
     while True:
         end = data.find(b"\n", position, HEADER_BYTES)
         if position == 0 or end < 0:
-            raise _unreadable_error("the header does not end: the line 'data' is missing", number, "data")
+            raise _unreadable_error("incomplete header: the line 'data' is missing", number, "data")
         number += 1
         line, position = data[position:end].rstrip(b"\r"), end + 1
         tokens = line.split()
@@ -135,7 +137,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
                 break
             key = _decode_text(token)
             if key not in ("id", "res", "size") or not tokens:
-                context.warn(f"unknown word {key[:40]!r} in the header: left out", line=number, where=key[:40])
+                context.warn(f"unknown keyword {key[:40]!r} in the header; it is ignored", line=number, where=key[:40])
                 break
             entries[key] = (_decode_text(tokens.pop(0)), number)
 
@@ -152,33 +154,33 @@ def _header_from_ids(
 ) -> _Header:
     for key in ("id", "size", "res"):
         if key not in entries:
-            raise _unreadable_error(f"the header does not tell the tree's {key}", location=key)
+            raise _unreadable_error(f"the header has no {key}", location=key)
     name, line = entries["id"]
     if name == "1":
-        context.warn("the id 1 is an old one: taken for OcTree", line=line, where="id")
+        context.warn("the id 1 is obsolete; it is read as OcTree", line=line, where="id")
         name = OCTREE
     if kind == "ot" and name not in FULL_TYPES:
-        reason = f"an .ot of the type {name[:80]!r} cannot be read, only {', '.join(FULL_TYPES)}: save it as a .bt"
+        reason = f"unsupported .ot type {name[:80]!r}, must be one of {', '.join(FULL_TYPES)}: save it as .bt"
         raise _unreadable_error(reason, line, "id")
     if not re.fullmatch(r"\w{1,80}", name, re.ASCII):
-        raise _unreadable_error(f"the tree's type must be a word, got {name[:80]!r}", line, "id")
+        raise _unreadable_error(f"the tree's type must be a word, not {name[:80]!r}", line, "id")
     size, line = entries["size"]
     if not re.fullmatch(r"\d{1,12}", size, re.ASCII):
-        raise _unreadable_error(f"size must be the number of nodes, got {size[:40]!r}", line, "size")
+        raise _unreadable_error(f"size must be the number of nodes, not {size[:40]!r}", line, "size")
     resolution, line = entries["res"]
     if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", resolution, re.ASCII):
-        raise _unreadable_error(f"res must be a number of metres, got {resolution[:40]!r}", line, "res")
+        raise _unreadable_error(f"res must be a number of metres, not {resolution[:40]!r}", line, "res")
     _check_resolution(float(resolution), line)
     is_default = comments == COMMENTS
     user_comments = () if is_default else tuple(c for c in comments if is_writable(c.replace("\t", " ")))
     if len(user_comments) < len(comments) and not is_default:
-        context.warn("comments with control characters are left out")
+        context.warn("comments with control characters are dropped")
     return _Header(kind, name, int(size), float(resolution), user_comments, body)
 
 
 def _check_resolution(resolution: float, line: int | None = None) -> None:
     if not 1e-6 <= resolution <= 1e4:
-        raise _unreadable_error(f"the resolution must be between 1e-6 and 1e4 metres, got {resolution!r}", line, "res")
+        raise _unreadable_error(f"the resolution must be between 1e-6 and 1e4 metres, not {resolution!r}", line, "res")
 
 
 def _legacy_header(data: bytes, context: ReadContext) -> _Header:
@@ -186,13 +188,13 @@ def _legacy_header(data: bytes, context: ReadContext) -> _Header:
         raise _unreadable_error(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
     _, resolution, size = LEGACY.unpack_from(data)
     _check_resolution(resolution)
-    context.warn("an OctoMap file of 2010 without a text header: served with today's")
+    context.warn("an OctoMap file of 2010 has no text header; it is written with the current one")
     return _Header("bt", OCTREE, size, resolution, (), LEGACY.size)
 
 
 # --- reading ------------------------------------------------------------------------------------------------------
 def read(files: Files, context: ReadContext) -> Layers:
-    """One voxel map. Raises UnreadableFile (with line and word of the header, or the reason) or TooLarge."""
+    """Read one voxel map. Raises UnreadableFile (with line and keyword of the header, or the reason) or TooLarge."""
     main = context.main or next(iter(files))
     data = files[main]
     header = _header(data, context)
@@ -209,7 +211,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     else:
         depth, code, odds, colour = _read_full(data, header)
     if not len(depth):
-        context.warn("the tree holds no voxels")
+        context.warn("the tree has no voxels; the voxel map is empty")
     source_properties: dict[str, Any] = {}
     if header.id != (COLOR_OCTREE if colour is not None else OCTREE):
         source_properties["id"] = header.id
@@ -222,15 +224,14 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _read_binary(data: bytes, header: _Header) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
-    """Depth, code and log-odds of the leaves of a stream of inner nodes."""
+    """Return depth, code and log-odds of the leaves of a stream of inner nodes."""
     body_size = len(data) - header.body
     if body_size % 2:
-        raise _unreadable_error(
-            f"the tree has {body_size} bytes, which is no whole number of 16 bit words", location="data"
-        )
+        raise _unreadable_error(f"the tree has {body_size} bytes: must be a multiple of 16 bits", location="data")
     if body_size // 2 > header.size:
         raise _unreadable_error(
-            f"the header says {header.size} nodes, the data has {body_size // 2} inner nodes alone", location="size"
+            f"the header declares {header.size} nodes, but the data has {body_size // 2} inner nodes alone",
+            location="size",
         )
     masks: Words = np.frombuffer(data, "<u2", body_size // 2, header.body).astype(np.uint16, copy=False)
     inner = _pack_bits(masks & (masks >> np.uint16(1)))
@@ -257,7 +258,7 @@ def _read_binary(data: bytes, header: _Header) -> tuple[NDArray[np.uint8], NDArr
 
 
 def _pack_bits(pairs: Words) -> Masks:
-    """The even ones of 16 bits, moved together: uint8 [n]."""
+    """Pack the even bits of 16-bit words: uint8 [n]."""
     x = pairs & np.uint16(0x5555)
     x = (x | x >> np.uint16(1)) & np.uint16(0x3333)
     x = (x | x >> np.uint16(2)) & np.uint16(0x0F0F)
@@ -267,13 +268,14 @@ def _pack_bits(pairs: Words) -> Masks:
 def _read_full(
     data: bytes, header: _Header
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32], NDArray[np.uint8] | None]:
-    """Depth, code, log-odds and colour of the leaves of a stream of all nodes."""
+    """Return depth, code, log-odds and colour of the leaves of a stream of all nodes."""
     record = _record(header.id)
     body_size = len(data) - header.body
     if body_size % record.itemsize:
         size = record.itemsize
         raise _unreadable_error(
-            f"the tree has {body_size} bytes; a node of {header.id} takes {size}, which does not go", location="data"
+            f"the tree has {body_size} bytes: must be a multiple of {size}, the bytes of a node of {header.id}",
+            location="data",
         )
     nodes = np.frombuffer(data, record, body_size // record.itemsize, header.body)
     _check_size(len(nodes), header)
@@ -291,7 +293,7 @@ def _read_full(
     infinite = np.flatnonzero(~np.isfinite(nodes["odds"]))
     if len(infinite):
         at = int(infinite[0])
-        raise _unreadable_error(f"the log-odds of node {at} are no finite number", location="data")
+        raise _unreadable_error(f"the log-odds of node {at} must be a finite number", location="data")
     colour = np.ascontiguousarray(nodes["colour"][leaf]) if header.id == COLOR_OCTREE else None
     if len(nodes) == 1:  # the whole tree is one leaf: its eight octants
         colour = None if colour is None else np.repeat(colour, 8, axis=0)
@@ -300,29 +302,29 @@ def _read_full(
 
 
 def _record(tree: str) -> np.dtype[Any]:
-    """A node of an ``.ot``."""
+    """Return the dtype of a node of an ``.ot``."""
     colour = [("colour", "u1", 3)] if tree == COLOR_OCTREE else []
     return np.dtype([("odds", "<f4"), *colour, ("mask", "u1")])
 
 
 def _check_size(counted: int, header: _Header) -> None:
     if counted != header.size:
-        raise _unreadable_error(f"the header says {header.size} nodes, the data has {counted}", location="size")
+        raise _unreadable_error(f"the header declares {header.size} nodes, but the data has {counted}", location="size")
 
 
 def _children(masks: Masks) -> tuple[Rows, NDArray[np.uint64]]:
-    """Row and octant of each set bit, in ascending order."""
+    """Return row and octant of each set bit, in ascending order."""
     bits = np.flatnonzero(np.unpackbits(masks, bitorder="little"))
     return bits >> 3, (bits & 7).astype(np.uint64)
 
 
 def _split_by_depth(masks: Masks, deepest: int) -> list[Rows]:
-    """The nodes of a depth-first stream by depth: indexes, ascending, so the children of one depth in their order.
+    """Group the nodes of a depth-first stream by depth, as ascending indices: children stay in order.
 
-    masks: uint8 [n], a bit for each child that follows in the stream. Before node k, P[k] + 1 nodes wait for their turn
-    (itself included): P[0] = 0, P[k + 1] = P[k] + children - 1. The subtree of k ends where P falls below P[k] for the
-    first time, and since P falls by one at most that is where it is P[k] - 1. The depth of a node is the number of
-    subtrees that have begun before it and not ended. No recursion, whatever the bytes say.
+    masks: uint8 [n], one bit per child that follows in the stream. Before node k, P[k] + 1 nodes are pending (including
+    k): P[0] = 0, P[k + 1] = P[k] + children - 1. The subtree of k ends at the first P below P[k]; since P decreases by
+    at most one, there it is P[k] - 1. The depth of a node is the number of subtrees that have started before it and
+    not ended. No recursion for any input.
     """
     n = len(masks)
     children = np.bitwise_count(masks)
@@ -330,10 +332,10 @@ def _split_by_depth(masks: Masks, deepest: int) -> list[Rows]:
     waiting -= np.arange(1, n + 1)
     short = waiting < 0
     if not bool(short.any()):
-        raise _unreadable_error("the data ends before the tree does", location="data")
+        raise _unreadable_error("the data ends before the end of the tree", location="data")
     end = int(np.argmax(short))
     if end != n - 1:
-        raise _unreadable_error(f"the tree ends after {end + 1} nodes, but the data goes on", location="data")
+        raise _unreadable_error(f"the tree ends after {end + 1} nodes, but more data follows", location="data")
     if n > 1 and int(waiting.max()) > MAX_PENDING_NODES:
         raise _unreadable_error(f"the tree is deeper than {DEPTH} levels", location="data")
     before = np.zeros(n, np.int8)
@@ -358,7 +360,7 @@ def _split_by_depth(masks: Masks, deepest: int) -> list[Rows]:
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.bt`` or ``map.ot`` (``<name>.bt`` where a name is asked for).
+    """Write ``map.bt`` or ``map.ot`` (``<name>.bt`` if a name is requested).
 
     Raises MissingLayer, NotFound, Ambiguous, or Invalid for an impossible box.
     """
@@ -372,7 +374,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         before = len(voxels)
         voxels = cut(voxels, options.bbox)
         if before and not len(voxels):
-            raise NotFound("the bbox lies outside of the voxel map")
+            raise NotFound("the bbox is outside the voxel map: use a box that overlaps it")
     if options.depth is not None:
         merged = coarser(voxels, options.depth)
         context.drop("voxels", len(voxels) - len(merged), f"merged at depth={options.depth}")
@@ -383,7 +385,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if kind == "bt" if options.prune is None else options.prune:
         voxels = _prune(voxels, options.depth or DEPTH, kind, context)
     if kind == "ot" and tree not in FULL_TYPES:
-        context.warn(f"a tree of the type {tree} is served as an {OCTREE}")
+        context.warn(f"the tree has type {tree}; it is written as {OCTREE}")
         tree = OCTREE
     size, body = _binary(voxels) if kind == "bt" else _full(voxels, tree == COLOR_OCTREE)
     stem = file_stem(options.name or MAP)
@@ -391,13 +393,13 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
-    """The named voxel map; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
+    """Choose the named voxel map, else ``map``, else the only one; on its level, else the ground, else the only one."""
     supply = "upload one (an OctoMap file or a point cloud)"
     return select_part(keys, "voxels", options.name, options.level, noun="voxel map", option="name", supply=supply)
 
 
 def options_from_filename(name: str) -> dict[str, str]:
-    """``map.ot`` asks for the full tree; ``lab.bt`` for the voxel map ``lab``, too."""
+    """Select the full tree for ``map.ot``, and the voxel map ``lab`` for ``lab.bt``."""
     stem, _, end = name.rpartition(".")
     if not stem or end not in ("bt", "ot"):
         return {}
@@ -411,14 +413,14 @@ def _tree_type(voxels: VoxelMap) -> str:
 
 
 def _likeliest(voxels: VoxelMap, context: WriteContext) -> VoxelMap:
-    """Free and occupied only, as OctoMap's toMaxLikelihood makes them."""
+    """Reduce voxels to free and occupied, as OctoMap's toMaxLikelihood does."""
     odds = np.array(LOG_ODDS)[voxels.occupied.astype(np.intp)]
     if not voxels.binary:
         finer = int(np.count_nonzero(odds != voxels.log_odds))
-        context.drop("log-odds", finer, "a .bt keeps free and occupied only: ask for kind=ot")
+        context.drop("log-odds", finer, "a .bt stores free and occupied only: request kind=ot")
     if voxels.colour is not None:
         set_ = int(np.count_nonzero((voxels.colour != UNSET).any(axis=1)))
-        context.drop("colours", set_, "a .bt keeps free and occupied only: ask for kind=ot")
+        context.drop("colours", set_, "a .bt stores free and occupied only: request kind=ot")
     return VoxelMap(voxels.resolution, voxels.depth, voxels.code, odds, None, True, voxels.properties)
 
 
@@ -432,7 +434,7 @@ def _prune(voxels: VoxelMap, deepest: int, kind: Kind, context: WriteContext) ->
 
 
 def _head(kind: Kind, tree: str, size: int, voxels: VoxelMap) -> bytes:
-    """The header, as the library prints it: six digits of the resolution, unless it has more."""
+    """Format the header as the library does: six digits of the resolution, unless it has more."""
     source_properties = voxels.properties.get(NAME)
     comments = source_properties.get("comments") if isinstance(source_properties, Mapping) else None
     shown = f"{voxels.resolution:g}"
@@ -448,7 +450,7 @@ def _head(kind: Kind, tree: str, size: int, voxels: VoxelMap) -> bytes:
 
 
 def _binary(voxels: VoxelMap) -> tuple[int, bytes]:
-    """Number of nodes, and the stream of inner nodes."""
+    """Return the number of nodes, and the stream of inner nodes."""
     if not len(voxels):
         return 0, b""
     state = np.where(voxels.occupied, np.uint16(2), np.uint16(1))
@@ -476,7 +478,10 @@ def _binary(voxels: VoxelMap) -> tuple[int, bytes]:
 
 
 def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
-    """Number of nodes, and the stream of all nodes. A tree with colours of a map without has all of them unset."""
+    """Return the number of nodes, and the stream of all nodes.
+
+    In a coloured tree of a map without colours all colours are unset.
+    """
     if not len(voxels):
         return 0, b""
     colours = voxels.colour if coloured else None
@@ -501,12 +506,12 @@ def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
         masks.append(np.bitwise_or.reduceat(bit, start))
         odds_of.append(odds)
         colour_of.append(colour)
-    if voxels.binary:  # the library reads every .bt's root as occupied, and writes it so
+    if voxels.binary:  # the library reads and writes the root of every .bt as occupied
         odds_of[-1] = np.array([LOG_ODDS[1]])
     key = np.concatenate(keys)
     order = np.argsort(key)
     n = len(voxels) + len(key)
-    # An inner node stands right before the first leaf in it, after its own ancestors, which have smaller keys.
+    # An inner node directly precedes its first leaf, after its ancestors, which have smaller keys.
     at = np.searchsorted(_key(voxels.code, voxels.depth), key[order]) + np.arange(len(key))
     inner = np.zeros(n, bool)
     inner[at] = True
@@ -522,7 +527,7 @@ def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
 
 
 def _key(code: NDArray[np.uint64], depth: int | NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """What sorts nodes as a depth-first walk meets them: place, then depth."""
+    """Compute the sort key of a depth-first walk: position, then depth."""
     levels = np.asarray(depth, np.uint64)
     position = code << (np.uint64(3) * (np.uint64(DEPTH) - levels))
     return position << np.uint64(5) | levels

@@ -1,6 +1,6 @@
-"""What the OctoMap library wants of a file.
+"""Rules of the OctoMap library for its files.
 
-Source: OctoMap, AbstractOcTree::read (first line, ``id``, ``size``, ``res``, ``data``; an unknown id is refused),
+Source: OctoMap, AbstractOcTree::read (first line, ``id``, ``size``, ``res``, ``data``; an unknown id is rejected),
 AbstractOccupancyOcTree::readBinary (size and number of nodes are compared), OcTreeKey (16 levels).
 """
 
@@ -26,15 +26,17 @@ _KEYS = re.compile(rb"^(id|size|res)[ \t]+([^\r\n]*?)[ \t]*\r?$", re.MULTILINE)
 _codes = np.arange(65536)
 _CHILDREN = sum(((_codes >> shift) & 3 > 0).astype(np.uint8) for shift in range(0, 16, 2))
 _INNER = sum(((_codes >> shift) & 3 == 3).astype(np.uint8) for shift in range(0, 16, 2))
-"""Of the 16 bits of an inner node: how many children it has, and how many of these are inner nodes."""
+"""Number of children, and of inner nodes among them, by the 16 bits of an inner node."""
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A file's header against what follows it; the tree is counted, not built."""
+    """Check a file's header against its data; the tree's nodes are counted, not built."""
     main = next(iter(files))
     data = files[main]
     if data[:4] == b"\x03\0\0\0":
-        reason = "the headerless form of 2010: newer tools do not read it; ask for .bt or .ot anew"
+        reason = (
+            "obsolete format of 2010 without a text header, which newer tools reject: download it again as .bt or .ot"
+        )
         yield warning_finding(reason, main)
         _, resolution, size = struct.unpack("<IdI", data[:16])
         yield from _binary(data[16:], size, main)
@@ -43,19 +45,19 @@ def check(files: Files) -> Iterator[Problem]:
     kind = next((k for k in (BINARY, FULL) if data.startswith(k)), None)
     start = re.search(rb"^data[ \t]*\r?\n", data[:MAX_HEADER_BYTES], re.MULTILINE)
     if kind is None or start is None:
-        reason = "the first line must be '# Octomap OcTree file' or '… binary file', and a line 'data' end the header"
+        reason = "the first line must be '# Octomap OcTree file' or '… binary file', the last header line 'data'"
         yield error_finding(reason, main, line=1)
         return
     header = {key.decode(): value.decode("latin1") for key, value in _KEYS.findall(data[: start.start()])}
     tree, size, res = header.get("id"), header.get("size"), header.get("res")
     if tree not in NODE_BYTES:
-        yield error_finding(f"octomap itself knows no tree of the type {shown(tree)}", main, where="id")
+        yield error_finding(f"tree type {shown(tree)} is unknown to OctoMap", main, where="id")
     if size is None or not size.isdigit():
-        yield error_finding(f"must be the number of nodes, is {shown(size)}", main, where="size")
+        yield error_finding(f"must be the number of nodes, not {shown(size)}", main, where="size")
     try:
         yield from _resolution(float(res or "nan"), main)
     except ValueError:
-        yield error_finding(f"must be a number, is {shown(res)}", main, where="res")
+        yield error_finding(f"must be a number, not {shown(res)}", main, where="res")
     body = data[start.end() :]
     count = int(size) if size is not None and size.isdigit() else None
     if kind == BINARY:
@@ -63,28 +65,28 @@ def check(files: Files) -> Iterator[Problem]:
     elif tree in NODE_BYTES and count is not None:
         need = count * NODE_BYTES[tree]
         if len(body) < need:
-            yield error_finding(f"{count} nodes are {need} bytes; the file has {len(body)}", main, where="size")
+            yield error_finding(f"{count} nodes need {need} bytes, but the file has {len(body)}", main, where="size")
         elif len(body) > need:
             yield warning_finding(f"{len(body) - need} bytes follow the last node", main, where="size")
 
 
 def _resolution(value: float, main: str) -> Iterator[Problem]:
     if not math.isfinite(value) or value <= 0:
-        yield error_finding(f"must be a length above 0, is {value:g}", main, where="res")
+        yield error_finding(f"must be a length above 0, not {value:g}", main, where="res")
 
 
 def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:
-    """Two bits for each child: the nodes that are told of, and the inner nodes that must follow."""
+    """Check a stream with two bits per child: declared nodes, and inner nodes that must follow."""
     if not count and not body:
         return
     masks = np.frombuffer(body, "<u2", len(body) // 2)
     assert isinstance(_INNER, np.ndarray)
     assert isinstance(_CHILDREN, np.ndarray)
-    # Depth first, the stream ends where no inner node is open any more.
+    # Depth first: the stream ends when no inner node is open.
     open_nodes = 1 + np.cumsum(_INNER[masks].astype(np.int64) - 1)
     ends = np.flatnonzero(open_nodes == 0)
     if not len(ends):
-        yield error_finding("it is cut short: an inner node's children are missing", main)
+        yield error_finding("truncated file: an inner node's children are missing", main)
         return
     used = int(ends[0]) + 1
     if used < len(masks):
@@ -92,5 +94,5 @@ def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:
     nodes = 1 + int(_CHILDREN[masks[:used]].sum(dtype=np.int64))
     if count is not None and nodes != count:
         yield warning_finding(
-            f"the header says {count} nodes, the tree has {nodes}: octomap tells an error", main, where="size"
+            f"the header declares {count} nodes, but the tree has {nodes}: OctoMap reports an error", main, where="size"
         )

@@ -1,4 +1,4 @@
-"""The formats of Open-RMF: buildings of its traffic editor, sites of its site editor, and navigation graphs."""
+"""Open-RMF formats: traffic editor buildings, site editor sites and navigation graphs."""
 
 from app.formats.rmf import building, nav_graph, site
 

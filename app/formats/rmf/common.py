@@ -1,4 +1,4 @@
-"""What the two formats of Open-RMF share: typed parameters, rows of YAML in flow style, lanes as pairs of edges.
+"""Shared by the Open-RMF formats: typed parameters, YAML rows in flow style, lanes as pairs of edges.
 
 Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools (building_map/param_value.py, edge.py, level.py).
 """
@@ -26,27 +26,27 @@ from app.parameters import parameter
 from app.syntax import yaml
 
 BUILDING, NAV_GRAPH = "openrmf", "rmf_nav_graph"
-"""The families: under these names stands what only a building or a navigation graph knows of an item."""
+"""Format families: keys of an item's source properties from buildings and from navigation graphs."""
 
 CABIN_HEIGHT = 2.5
-"""Metres; the height that rmf_building_map_tools gives every lift cabin."""
+"""Height of every lift cabin in rmf_building_map_tools, in metres."""
 
 MAX_GRAPHS = 9
-"""building_map_generator writes graphs 0 … 8 and leaves out lanes of any other."""
+"""Number of graphs: building_map_generator writes graphs 0 … 8 and skips lanes of any other."""
 
 MAX_ID_CHARACTERS = 240
-"""Characters of a node's id, so that an edge's id, made of two of them, is one, too."""
+"""Maximum characters of a node id; an edge id consists of two and must be valid, too."""
 
 Array = NDArray[np.float64]
 
 
 def raise_unreadable(reason: str, location: str) -> NoReturn:
-    """Raise UnreadableFile that names the place."""
+    """Raise UnreadableFile with a reason and its location in the file."""
     raise UnreadableFile(f"{location}: {reason}" if location else reason, [Problem(reason, where=location or None)])
 
 
 def mapping(value: Any, location: str) -> dict[str, Any]:
-    """A mapping; nothing at all is an empty one."""
+    """Check that a value is a mapping; None becomes an empty one."""
     if value is None:
         return {}
     if not isinstance(value, dict):
@@ -55,7 +55,7 @@ def mapping(value: Any, location: str) -> dict[str, Any]:
 
 
 def listing(value: Any, location: str) -> list[Any]:
-    """A list; nothing at all (or ``{}``, as the editor writes it) is an empty one."""
+    """Check that a value is a list; None and ``{}`` (as the editor writes it) become an empty one."""
     if value is None or value == {}:
         return []
     if not isinstance(value, list):
@@ -64,7 +64,7 @@ def listing(value: Any, location: str) -> list[Any]:
 
 
 def number(value: Any, location: str) -> float:
-    """A number of usual size, also one in quotes."""
+    """Convert a value, also a quoted one, to a number within ±MAX_METRES."""
     if isinstance(value, str):
         try:
             value = yaml.scalar(value)
@@ -73,65 +73,65 @@ def number(value: Any, location: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise_unreadable("must be a number", location)
     if abs(value) > MAX_METRES:
-        raise_unreadable(f"is beyond ±{MAX_METRES:g}", location)
+        raise_unreadable(f"must be within ±{MAX_METRES:g}", location)
     return float(value)
 
 
 def places(rows: Sequence[Any], location: str) -> Array:
-    """float64 [n, 2]: the first two numbers of each row."""
+    """Return the first two numbers of each row as float64 [n, 2]."""
     try:
         flat = [v for row in rows for v in (row[0], row[1])]
     except (TypeError, LookupError):
         k = next(k for k, row in enumerate(rows) if not isinstance(row, list) or len(row) < 2)
-        raise_unreadable("must be a list that begins with x and y", f"{location}[{k}]")
+        raise_unreadable("must be a list that starts with x and y", f"{location}[{k}]")
     if not all(map((float, int).__contains__, map(type, flat))):
         flat = [number(v, f"{location}[{k // 2}][{k % 2}]") for k, v in enumerate(flat)]
     return np.array(flat, np.float64).reshape(-1, 2)
 
 
 def index(value: Any, location: str) -> int:
-    """A vertex' place in its level's list."""
+    """Check that a value is a vertex index."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise_unreadable("must be the number of a vertex", location)
+        raise_unreadable("must be a vertex index", location)
     return value
 
 
 def parameter_value(parameters: Any, key: str, default: Any = None) -> Any:
-    """The value of a parameter ``[type, value]``."""
+    """Return the value of a parameter ``[type, value]``."""
     pair = parameters.get(key) if isinstance(parameters, Mapping) else None
     return pair[1] if isinstance(pair, list) and len(pair) == 2 else default
 
 
 def typed_parameter(value: Any) -> Any:
-    """A value as a typed parameter: 1 text, 2 integer, 3 decimal, 4 truth value; nested ones stay as they are."""
+    """Convert a value to a typed parameter (1 text, 2 integer, 3 decimal, 4 boolean); nested values stay."""
     kinds: dict[type, int] = {str: 1, int: 2, float: 3, bool: 4}
     kind = kinds.get(type(value))
     return value if kind is None else [kind, value]
 
 
 def short(text: str, max_length: int = MAX_ID_CHARACTERS) -> str:
-    """The text, or where it is too long for an id its beginning and a hash of all of it."""
+    """Shorten a text that is too long for an id to its start and a hash of the full text."""
     if len(text) <= max_length:
         return text
     return f"{text[: max_length - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"
 
 
 def limit(p: Properties) -> float:
-    """An edge's speed limit in metres per second; 0 where there is none."""
+    """Return an edge's speed limit in m/s, 0 if there is none."""
     speed = p.get("speed_limit")
     valid = isinstance(speed, (int, float)) and not isinstance(speed, bool) and math.isfinite(speed) and speed > 0
     return float(speed) if valid and speed is not None else 0.0
 
 
 def reverse_orientation(orientation: Any) -> Any:
-    """The orientation of a lane that is driven the other way round."""
+    """Return the orientation constraint for the reverse direction of a lane."""
     return {"forward": "backward", "backward": "forward"}.get(orientation, orientation)
 
 
 def object_pose(p: Properties) -> list[float] | None:
-    """An object's pose [x, y, z, roll, pitch, yaw], or None."""
+    """Return an object's pose [x, y, z, roll, pitch, yaw], or None."""
     pose = p.get("pose")
     if not isinstance(pose, (list, tuple)) or len(pose) != 6:
         return None
@@ -141,7 +141,7 @@ def object_pose(p: Properties) -> list[float] | None:
 
 
 def object_size(p: Properties) -> tuple[float, float] | None:
-    """An object's width (along x) and depth (along y), metres, or None."""
+    """Return an object's width (along x) and depth (along y) in metres, or None."""
     size = p.get("size")
     if not isinstance(size, (list, tuple)) or len(size) < 2:
         return None
@@ -151,14 +151,14 @@ def object_size(p: Properties) -> tuple[float, float] | None:
 
 
 def ends(geometry: Any) -> Array:
-    """float64 [2, 2]: first and last point of a line."""
+    """Return the first and last point of a line as float64 [2, 2]."""
     at: Array = shapely.get_coordinates(geometry)
     return at[[0, -1]]
 
 
 @dataclass(slots=True)
 class Storey:
-    """A level to be written: its parts, and what their documents say as a building."""
+    """Level to be written: its parts, and the building data of their documents."""
 
     name: str
     networks: list[Features] = field(default_factory=list)
@@ -167,7 +167,7 @@ class Storey:
 
 
 def storeys(layers: Layers) -> list[Storey]:
-    """The levels in the order of their file; those that came from elsewhere last."""
+    """Return the levels in the order of their file; levels from other sources come last."""
     by_level: dict[str, Storey] = {}
     own_names = {
         (str(p.get("kind")), str(p.get("name")))
@@ -177,7 +177,7 @@ def storeys(layers: Layers) -> list[Storey]:
     }
     for key, objects in layers.vector("objects").items():
         part = objects
-        if key.name == NAV_GRAPH:  # graphs repeat the doors and lifts of the building that they were made from
+        if key.name == NAV_GRAPH:  # graphs repeat doors and lifts of their building
             part = part.select(
                 [k for k, p in enumerate(part.properties) if (str(p.get("kind")), str(p.get("name"))) not in own_names]
             )
@@ -207,19 +207,24 @@ def storeys(layers: Layers) -> list[Storey]:
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions:
-    """What a building or its graphs say where no source does."""
+    """Values of a building or its graphs that no source specifies."""
 
-    building: str | None = parameter(None, "name of a building that no source names; default: the map's")
+    building: str | None = parameter(None, "building name if no source specifies one; default: the name of the map")
     chargers: tuple[str, ...] | None = parameter(
-        None, "nodes (ids or names, separated by commas) that are chargers, parking spots and holding points"
+        None, "nodes that are chargers, parking spots and holding points, as comma-separated ids or names"
     )
     robot_name: str | None = parameter(
-        None, "robots start at chargers that name none, called by this and a number: tractor_1 …; default: none start"
+        None,
+        "name prefix of robots that start at chargers without a robot: tractor_1 …; default: no robots start there",
     )
-    robot_type: str = parameter("TinyRobot", "model of robots whose charger names none")
-    graph: int = parameter(0, "graph of new lanes", minimum=0, maximum=MAX_GRAPHS - 1)
+    robot_type: str = parameter("TinyRobot", "robot model at chargers that specify none")
+    graph: int = parameter(0, "index of the graph for lanes from other formats", minimum=0, maximum=MAX_GRAPHS - 1)
     speed_limit: float = parameter(
-        0.0, "of new lanes whose edge has none; 0: no limit", minimum=0.0, maximum=100.0, unit="m/s"
+        0.0,
+        "speed limit of lanes from other formats whose edge has none; 0: no limit",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m/s",
     )
 
 
@@ -228,10 +233,10 @@ ROBOT, ROBOT_TYPE = "spawn_robot_name", "spawn_robot_type"
 
 
 class Robots:
-    """Chargers and the robots that start at them, as far as the options say and the sources do not."""
+    """Chargers and the robots that start at them, as set by options and not by sources."""
 
     def __init__(self, options: WriteOptions, nodes: Iterable[tuple[str, str, Properties]]) -> None:
-        """nodes: (level, id, properties) of all of them."""
+        """nodes: (level, id, properties) of all nodes."""
         self._options = options
         self._more: dict[tuple[str, str], dict[str, Any]] = {}
         self._unknown: list[str] = []
@@ -261,26 +266,26 @@ class Robots:
         self._unknown = sorted(charger_names - met)
 
     def vertex_properties(self, level: str, i: str) -> dict[str, Any]:
-        """What a vertex' parameters say more, by word."""
+        """Return the additional parameters of a vertex, by key."""
         return self._more.get((level, i), {})
 
     def report(self, context: WriteContext) -> None:
-        """Declare what was filled in, and which nodes there are not."""
+        """Report filled-in values and unknown node names."""
         many = list(self._more.values())
         if charger_count := sum(CHARGER[0] in more for more in many):
-            context.fill("vertices: " + ", ".join(CHARGER), True, f"{charger_count} nodes do not say it", "chargers")
+            context.fill(
+                "vertices: " + ", ".join(CHARGER), True, f"{charger_count} nodes do not specify it", "chargers"
+            )
         if names := sorted((str(more[ROBOT]) for more in many if ROBOT in more), key=natural_sort_key):
             why = f"{len(names)} chargers name no robot"
             context.fill(f"vertices: {ROBOT}", names if len(names) <= 20 else [*names[:20], "…"], why, "robot_name")
             context.fill(f"vertices: {ROBOT_TYPE}", self._options.robot_type, why, "robot_type")
         if self._unknown:
-            context.warn(
-                f"no node is called {', '.join(self._unknown[:5])}: no charger is made of it", where="chargers"
-            )
+            context.warn(f"unknown nodes: {', '.join(self._unknown[:5])}; they become no chargers", where="chargers")
 
 
 def _vertex_parameters(p: Properties) -> dict[str, Any]:
-    """A vertex' parameters without their types."""
+    """Return a vertex's parameters without their types."""
     graph, building = p.get(NAV_GRAPH), p.get(BUILDING)
     plain = graph.get("parameters") if isinstance(graph, Mapping) else None
     typed_ = building.get("parameters") if isinstance(building, Mapping) else None
@@ -289,20 +294,20 @@ def _vertex_parameters(p: Properties) -> dict[str, Any]:
 
 
 class Flow:
-    """Writes values in flow style, on one line. Equal mappings are written once."""
+    """Formatter of values in YAML flow style, on one line. Equal mappings are formatted once."""
 
     MAX_CACHED = 4096
-    """Mappings whose text is kept for the next one: those with a name of their own never come again."""
+    """Maximum number of cached mappings: mappings with unique names never repeat."""
 
     def __init__(self) -> None:
         self._cache: dict[str, str] = {}
 
     def __call__(self, value: Any) -> str:
-        """The value as YAML that PyYAML and yaml-cpp read alike; mappings by sorted keys."""
+        """Format a value as YAML that PyYAML and yaml-cpp read alike, mappings with sorted keys."""
         if isinstance(value, dict):
             if not value:
                 return "{}"
-            key = orjson.dumps(value).decode()  # the bytes take 4 kB, however few they are
+            key = orjson.dumps(value).decode()  # orjson's bytes occupy 4 kB each, even if short
             text = self._cache.get(key)
             if text is None:
                 if len(self._cache) >= self.MAX_CACHED:
@@ -316,7 +321,7 @@ class Flow:
 
 
 def choose_building(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
-    """The networks, the objects that came from Open-RMF's formats, and the images of the building."""
+    """Choose the networks, the objects that came from Open-RMF formats, and the building's images."""
     return [
         key
         for key in keys

@@ -1,4 +1,4 @@
-"""The networks of topological_navigation: ``tmap2``, and the older list, ``tmap``."""
+"""Networks of topological_navigation: ``tmap2``, and the older list, ``tmap``."""
 
 from app.formats.tmap import tmap, tmap2
 

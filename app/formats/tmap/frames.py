@@ -1,4 +1,4 @@
-"""The frame of a network's nodes: its ``transformation``, and what is told in its child frame."""
+"""Frame of a network's nodes: its ``transformation``, and nodes in its child frame."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from app.formats.tmap.network import Array, parse_number
 
 @dataclass(frozen=True, slots=True)
 class MapTransform:
-    """A file's ``transformation``: a pose in the child frame, turned and shifted, is one in the local frame."""
+    """A file's ``transformation``: rotation and translation from the child frame to the local frame."""
 
     child: str
     quaternion: tuple[float, float, float, float]
     shift: Array
 
     def matrix(self) -> Array:
-        """Rotation matrix [3, 3] of the quaternion (x, y, z, w)."""
+        """Return the rotation matrix [3, 3] of the quaternion (x, y, z, w)."""
         x, y, z, w = self.quaternion
         return np.array(
             [
@@ -35,7 +35,7 @@ class MapTransform:
 
 
 def map_transform(document: Mapping[str, Any]) -> MapTransform | None:
-    """The file's transformation, where there is one that changes anything."""
+    """Parse the file's transformation, or return None if it is missing or the identity."""
     transformation = document.get("transformation")
     if (
         not isinstance(transformation, dict)
@@ -53,7 +53,8 @@ def map_transform(document: Mapping[str, Any]) -> MapTransform | None:
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not math.isfinite(length) or length < 1e-9:
         raise UnreadableFile(
-            "transformation.rotation is no rotation", [Problem("no rotation", where=f"{location}.rotation")]
+            "transformation.rotation is invalid: the quaternion has length 0",
+            [Problem("invalid rotation", where=f"{location}.rotation")],
         )
     if x == y == z == 0.0 and not shift.any():
         return None
@@ -61,7 +62,7 @@ def map_transform(document: Mapping[str, Any]) -> MapTransform | None:
 
 
 def multiply(a: Sequence[float], b: Sequence[float]) -> list[float]:
-    """The product of two quaternions (x, y, z, w): first b, then a."""
+    """Multiply two quaternions (x, y, z, w): rotate by b, then by a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return [
@@ -79,7 +80,7 @@ def to_local(
     document: Mapping[str, Any],
     context: ReadContext,
 ) -> None:
-    """Bring the poses of nodes whose parent_frame is the transformation's child to the local frame, in place."""
+    """Transform poses of nodes in the transformation's child frame to the local frame, in place."""
     turn = map_transform(document)
     if turn is None:
         return
@@ -90,6 +91,6 @@ def to_local(
     for k in inside:
         orientations[k] = multiply(turn.quaternion, orientations[k] or [0.0, 0.0, 0.0, 1.0])
     context.warn(
-        f"{len(inside)} nodes stand in the frame {turn.child!r} and were brought to the local one by the file's "
-        "transformation"
+        f"{len(inside)} nodes are in the frame {turn.child!r}; the file's transformation was applied to move them to "
+        "the local frame"
     )

@@ -1,4 +1,4 @@
-"""Reading networks of topological_navigation, of either form."""
+"""Reading networks of topological_navigation in both layouts."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from app.syntax import yaml
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """The network as topology, or, where no node has an edge, its nodes as objects of kind ``poi``.
+    """Read the network as topology or, if no node has an edge, its nodes as objects of kind ``poi``.
 
-    Coordinates are local metres; 2-D where z is 0. Raises UnreadableFile naming the node.
+    Coordinates are local metres, 2-D if z is 0. Raises UnreadableFile with the node.
     """
     if not (context.wants("topology") or context.wants("objects")):
         return Layers()
@@ -71,7 +71,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     geometry = node_points(xyz)
     collection_document = {**_credit(document), NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
     if kind == "poi":
-        context.warn(f"no node has an edge: the {len(nodes)} nodes are taken as points of interest")
+        context.warn(f"no node has an edge; the {len(nodes)} nodes are read as points of interest")
         key = PartKey("objects", context.level, NAME)
         return Layers({key: from_columns(ids, geometry, properties, "local", collection_document)})
 
@@ -86,7 +86,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _credit(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The licences and credits that ``meta`` says, as a part's document holds them."""
+    """Return the licences and credits in ``meta`` as members of a part's document."""
     meta = document.get("meta")
     texts = [meta.get(key) for key in ("attribution", "license", "copyright")] if isinstance(meta, dict) else []
     credit = [text for text in texts if isinstance(text, str) and text]
@@ -96,7 +96,7 @@ def _credit(document: Mapping[str, Any]) -> dict[str, Any]:
 def _edge_properties(
     rows: Sequence[Row], edge_ids: Sequence[str], ids: Sequence[str], context: ReadContext
 ) -> list[Properties]:
-    """The properties of edges between nodes of these ids; warns of ids that stand for several things."""
+    """Build the properties of edges between nodes of these ids; warn about duplicate ids."""
     out: list[Properties] = []
     repeated = []
     for (source, target, source_id, edge), edge_id in zip(rows, edge_ids, strict=True):
@@ -114,12 +114,12 @@ def _edge_properties(
             _lift(line, extra_members)
         out.append(line)
     if repeated:
-        context.warn(f"{len(repeated)} edge ids stand for several things: {shorten_list(repeated)}; all are kept")
+        context.warn(f"{len(repeated)} duplicate edge ids: {shorten_list(repeated)}; all these edges are stored")
     return out
 
 
 def _top(top: Any, context: ReadContext) -> tuple[list[Any], dict[str, Any]]:
-    """(entries of the nodes, everything else of the top level)."""
+    """Split the file into (entries of the nodes, rest of the top level)."""
     if isinstance(top, list):
         document: dict[str, Any] = {}
         for key, meta_key in (("metric_map", "map"), ("pointset", "pointset"), ("name", "pointset")):
@@ -129,20 +129,24 @@ def _top(top: Any, context: ReadContext) -> tuple[list[Any], dict[str, Any]]:
                 document[key] = most_common[0][0]
         return top, document
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
-        raise UnreadableFile("there is no list of nodes: not a topological map", [Problem("no list", where="nodes")])
+        raise UnreadableFile(
+            "not a topological map: the list of nodes is missing", [Problem("must be a list", where="nodes")]
+        )
     document = {key: value for key, value in top.items() if key != "nodes"}
     for key in ("name", "metric_map", "pointset"):
         if key not in document:
-            context.warn("is missing; tmap2 readers ask for it", where=key)
+            context.warn("is missing; tmap2 readers require it", where=key)
         elif not isinstance(document[key], str):
-            context.warn(f"is {document[key]!r}, not a text; it is served as a text", where=key)
+            context.warn(f"is {document[key]!r}, not text; it is written as text", where=key)
     return top["nodes"], document
 
 
 def _entry(entry: Any, k: int) -> dict[str, Any]:
     node = entry.get("node") if isinstance(entry, dict) else None
     if not isinstance(node, dict):
-        raise UnreadableFile(f"nodes[{k}] has no mapping 'node'", [Problem("no mapping 'node'", where=f"nodes[{k}]")])
+        raise UnreadableFile(
+            f"nodes[{k}] has no mapping 'node'", [Problem("missing mapping 'node'", where=f"nodes[{k}]")]
+        )
     edges = node.get("edges")
     if edges is not None and not (isinstance(edges, list) and all(isinstance(e, dict) for e in edges)):
         location = f"nodes[{k}].node.edges"
@@ -150,7 +154,9 @@ def _entry(entry: Any, k: int) -> dict[str, Any]:
             f"{location} must be a list of mappings", [Problem("must be a list of mappings", where=location)]
         )
     if not isinstance(entry.get("meta", {}), (dict, type(None))):
-        raise UnreadableFile(f"nodes[{k}].meta must be a mapping", [Problem("not a mapping", where=f"nodes[{k}].meta")])
+        raise UnreadableFile(
+            f"nodes[{k}].meta must be a mapping", [Problem("must be a mapping", where=f"nodes[{k}].meta")]
+        )
     return node
 
 
@@ -162,18 +168,18 @@ def _name(raw_name: Any, k: int, context: ReadContext) -> str:
             raise UnreadableFile(
                 f"{location}: a node must have a name", [Problem("a node must have a name", where=location)]
             )
-        context.warn(f"the name {raw_name!r} is no text; it is served as one", where=location)
+        context.warn(f"the name {raw_name!r} is not text; it is written as text", where=location)
         name = yaml.text(raw_name)
     if not 0 < len(name) <= MAX_NAME or (
         not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
     ):
         reason = f"a name must have 1 to {MAX_NAME} characters and no control characters"
-        raise UnreadableFile(f"{location}: {reason}", [Problem(f"{reason}, got {name[:60]!r}", where=location)])
+        raise UnreadableFile(f"{location}: {reason}", [Problem(f"{reason}, not {name[:60]!r}", where=location)])
     return name
 
 
 def _identifier(name: str) -> str:
-    """A usable id: the name itself but for invisible characters, other Unicode forms of it, and its length."""
+    """Convert a name to a valid id: normalise Unicode, escape invisible characters, limit the length."""
     if name.isascii() and name.isprintable() and len(name) <= MAX_ID_CHARACTERS:
         return name
     plain = unicodedata.normalize("NFC", name)
@@ -187,11 +193,11 @@ def _warn_names(names: Sequence[str], context: ReadContext) -> None:
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         context.warn(
-            f"{len(repeated)} node names stand twice or more: {shorten_list(repeated)}; edges to them go to the first"
+            f"{len(repeated)} duplicate node names: {shorten_list(repeated)}; edges connect to the first of that name"
         )
     for name in names:
         if not name.isascii() and not name.isprintable():
-            context.warn(f"the name {name!r} has invisible characters", where=name)
+            context.warn(f"the name {name!r} has invisible characters; they are escaped in its id", where=name)
 
 
 Row = tuple[int, int, str, dict[str, Any]]
@@ -200,7 +206,7 @@ Row = tuple[int, int, str, dict[str, Any]]
 def _edges(
     nodes: Sequence[dict[str, Any]], names: Sequence[str], index_by_name: Mapping[str, int], context: ReadContext
 ) -> tuple[list[Row], dict[int, list[Any]]]:
-    """((source, target, edge id, mapping) of each edge between nodes; the edges to nowhere by node)."""
+    """Return ((source, target, edge id, mapping) of each edge between nodes, dangling edges by node)."""
     rows: list[Row] = []
     dangling: dict[int, list[Any]] = {}
     loops = []
@@ -218,7 +224,8 @@ def _edges(
             if target is None:
                 dangling.setdefault(k, []).append(edge)
                 context.warn(
-                    f"the edge {edge_id!r} leads to {to!r}, which is no node; it is kept with its node", where=names[k]
+                    f"the edge {edge_id!r} leads to the unknown node {to!r}; it is stored with its source node",
+                    where=names[k],
                 )
                 continue
             if target == k:
@@ -244,7 +251,7 @@ def _warn_isolated(
 
 
 def _poses(nodes: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[Array, list[list[float] | None]]:
-    """(float64 [n, 3] positions in metres, a quaternion [x, y, z, w] or None for each)."""
+    """Return (positions float64 [n, 3] in metres, a quaternion [x, y, z, w] or None for each node)."""
     positions: list[tuple[Any, ...]] = []
     orientations: list[list[float] | None] = []
     for node, name in zip(nodes, names, strict=True):
@@ -254,7 +261,9 @@ def _poses(nodes: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[Array
             positions.append((at["x"], at["y"], at.get("z", 0.0)))
             orientations.append(None if turned is None else [turned["x"], turned["y"], turned["z"], turned["w"]])
         except (KeyError, TypeError, AttributeError, IndexError) as error:
-            reason = f"the node {name!r} needs pose.position with x and y, and x, y, z, w in its orientation, if any"
+            reason = (
+                f"invalid pose of node {name!r}: it needs position.x and position.y, and x, y, z, w in an orientation"
+            )
             raise UnreadableFile(reason, [Problem(reason, where=f"{name}.pose")]) from error
     xyz = _numbers(positions, 3, names, "position")
     indices = [k for k, o in enumerate(orientations) if o is not None]
@@ -265,7 +274,7 @@ def _poses(nodes: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[Array
 
 
 def _numbers(rows: Sequence[tuple[Any, ...]], width: int, names: Sequence[str], member: str) -> Array:
-    """float64 [n, width]; a number that stands in quotes is one too."""
+    """Parse rows of numbers, also quoted ones, to float64 [n, width]."""
     flat = [v for row in rows for v in row]
     if not all(map((float, int).__contains__, map(type, flat))):
         for k, value in enumerate(flat):
@@ -276,7 +285,7 @@ def _numbers(rows: Sequence[tuple[Any, ...]], width: int, names: Sequence[str], 
 def _extra_node_members(
     entry: Mapping[str, Any], node: Mapping[str, Any], name: str, common: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What of a node's entry is neither canonical nor said by the document."""
+    """Return the members of a node's entry that are neither canonical nor in the document."""
     extra_members = {key: value for key, value in node.items() if key not in NODE_WORDS}
     pose = node["pose"]
     if len(pose) > 2 or len(pose["position"]) > 3 or len(pose.get("orientation") or ()) not in (0, 4):
@@ -300,7 +309,7 @@ def _extra_node_members(
 
 
 def _lift(properties: dict[str, Any], extra_members: dict[str, Any]) -> None:
-    """Bring canonical words and other formats' knowledge from an item's ``properties`` to where they belong."""
+    """Move canonical and other formats' source properties out of an item's ``properties`` member."""
     inner_properties = extra_members.get("properties")
     if not isinstance(inner_properties, dict):
         return
@@ -320,5 +329,5 @@ def _lift(properties: dict[str, Any], extra_members: dict[str, Any]) -> None:
 
 @cache
 def _families() -> frozenset[str]:
-    """Names under which formats keep what only they know of an item."""
+    """Return the keys of source properties of all formats."""
     return frozenset(all_formats())

@@ -1,10 +1,10 @@
-"""What topological_navigation wants of a tmap2.
+"""Rules of topological_navigation for tmap2.
 
-Sources: its JSON schema (config/tmap-schema.yaml); manager2.py, which addresses edges by their ``edge_id`` and gives
-them new ones of the form ``<from>_<to>`` when a node is renamed; localisation.py, which reads each node's pose.
+Sources: its JSON schema (config/tmap-schema.yaml); manager2.py, which addresses edges by ``edge_id`` and assigns new
+ones of the form ``<from>_<to>`` when a node is renamed; localisation.py, which reads each node's pose.
 
-A network of a city has megabytes of YAML. Where its lines are regular, as PyYAML writes them, it is enough to count
-them; only a file in which something is missing, or that is laid out otherwise, is parsed.
+A network of a city has megabytes of YAML. If its lines are regular, as PyYAML writes them, it is enough to count them;
+only files with missing members or another layout are parsed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ Edges = list[tuple[str, str, str]]
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A map as the schema and the map manager want it."""
+    """Check a map with the rules of the schema and the map manager."""
     main = next(iter(files))
     data = files[main]
     if is_brief(data):
@@ -66,7 +66,7 @@ def check(files: Files) -> Iterator[Problem]:
 
 
 def _regular(data: bytes) -> tuple[list[str], Edges] | None:
-    """Nodes and edges (source, id, target) of a regular file in which all is there that must be; else None."""
+    """Return nodes and edges (source, id, target) of a regular, complete file, else None."""
     count = data.count(b"\n- meta:\n")
     if not count or not _is_dated(data[:HEAD_BYTES]) or b"&" in data:
         return None
@@ -103,23 +103,23 @@ def _is_dated(head: bytes) -> bool:
 
 
 def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iterator[Problem]:
-    """The schema's rules, one by one; fills in nodes and edges."""
+    """Check the schema's rules one by one; adds to ``nodes`` and ``edges``."""
     if not isinstance(top, dict):
-        yield error_finding("a topological map is a mapping; a list is the older tmap", main)
+        yield error_finding("a topological map must be a mapping: upload a list as the older format tmap", main)
         return
     for key in missing(top, TOP):
         yield error_finding("the schema requires this key", main, where=key)
     for key in ("metric_map", "name", "pointset"):
         if top.get(key) is not None and not isinstance(top[key], str):
-            yield error_finding(f"must be a text, is {shown(top[key])}", main, where=key)
+            yield error_finding(f"must be a text, not {shown(top[key])}", main, where=key)
     time = top["meta"].get("last_updated") if isinstance(top.get("meta"), dict) else None
     if not isinstance(time, str) or not LAST_UPDATED.fullmatch(time):
-        reason = f"must be a text like 2024-05-01_10-00-00, is {shown(time)}"
+        reason = f"must be a text like 2024-05-01_10-00-00, not {shown(time)}"
         yield error_finding(reason, main, where="meta.last_updated")
     rows = top.get("nodes")
     if not isinstance(rows, list):
         if rows is not None:
-            yield error_finding(f"must be a list, is {shown(rows)}", main, where="nodes")
+            yield error_finding(f"must be a list, not {shown(rows)}", main, where="nodes")
         return
     for k, row in enumerate(rows):
         location = f"nodes[{k}]"
@@ -131,19 +131,19 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
         if not isinstance(node, dict):
             continue
         if missing(node.get("pose"), ("orientation", "position")):
-            yield error_finding("localisation reads the pose of each node", main, where=f"{location}.node.pose")
+            yield error_finding("a node needs a pose, which localisation reads", main, where=f"{location}.node.pose")
         for key in ("name", "parent_frame"):
             if node.get(key) is not None and not isinstance(node[key], str):
-                yield error_finding(f"must be a text, is {shown(node[key])}", main, where=f"{location}.node.{key}")
+                yield error_finding(f"must be a text, not {shown(node[key])}", main, where=f"{location}.node.{key}")
         name = str(node.get("name"))
         if isinstance(meta, dict) and meta.get("node") not in (None, node.get("name")):
             yield warning_finding(
-                f"is {shown(meta['node'])}, and the node is called {name!r}", main, where=f"{location}.meta.node"
+                f"is {shown(meta['node'])}, but the node is named {name!r}", main, where=f"{location}.meta.node"
             )
         nodes.append(name)
         listed = node.get("edges")
         if listed is not None and not isinstance(listed, list):
-            yield error_finding(f"must be a list, is {shown(listed)}", main, where=f"{location}.node.edges")
+            yield error_finding(f"must be a list, not {shown(listed)}", main, where=f"{location}.node.edges")
             continue
         for j, edge in enumerate(listed or ()):
             if absent := missing(edge, EDGE):
@@ -158,14 +158,14 @@ def _network(nodes: list[str], edges: Edges, main: str) -> Iterator[Problem]:
     node_names = set(nodes)
     if repeats := duplicates(nodes):
         yield warning_finding(
-            f"{len(repeats)} nodes share a name, and edges lead to names: {names(repeats)}", main, where="nodes"
+            f"{len(repeats)} duplicate node names, to which edges refer: {names(repeats)}", main, where="nodes"
         )
     if dangling := [i for _, i, target in edges if target not in node_names]:
-        reason = f"{len(dangling)} edges lead to a node that is not there: {names(dangling)}"
+        reason = f"{len(dangling)} edges lead to unknown nodes: {names(dangling)}"
         yield error_finding(reason, main, where="nodes")
     if repeats := duplicates(i for _, i, _ in edges):
-        reason = f"{len(repeats)} edges share an edge_id, by which the map manager finds them: {names(repeats)}"
+        reason = f"{len(repeats)} duplicate edge_ids, by which the map manager finds edges: {names(repeats)}"
         yield warning_finding(reason, main, where="nodes")
     if other := [i for source, i, target in edges if i != f"{source}_{target}"]:
-        reason = f"{len(other)} edges are not called <from>_<to>, as the map manager calls them: {names(other)}"
+        reason = f"{len(other)} edges are not named <from>_<to> as by the map manager: {names(other)}"
         yield warning_finding(reason, main, where="nodes")

@@ -1,9 +1,9 @@
-"""tmap: the older networks of topological_navigation (strands_navigation), a YAML list of nodes: ``*.tmap``.
+"""tmap: older networks of topological_navigation (strands_navigation), a YAML list of nodes: ``*.tmap``.
 
-See ``tmap.network``. What its reader (topological_navigation, manager.py) takes of a node: ``name``, ``map``,
+See ``tmap.network``. Its reader (topological_navigation, manager.py) uses these keys of a node: ``name``, ``map``,
 ``pointset``, ``pose``, ``verts``, ``edges``, ``localise_by_topic``, ``xy_goal_tolerance`` and ``yaw_goal_tolerance``;
 of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflation_radius`` and
-``recovery_behaviours_config``. All of these are written; further keys, at which it does not look, are kept.
+``recovery_behaviours_config``. All of these are written; further keys, which it ignores, are preserved.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ ENDS = (".tmap", ".yaml", ".yml", ".tmap2")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.tmap``; see ``tmap.writing``. The map's name and transformation have no place in it."""
+    """Write ``map.tmap``, which cannot store the map's name and transformation; see ``tmap.writing``."""
     return {FILE: writing.write(layers, context, listed=True)}
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A YAML list whose first entry is that of a node."""
+    """Detect a YAML list whose first entry is a node."""
     return name.lower().endswith(ENDS) and network.is_list(data)
 
 
 register(
     Format(
         name="tmap",
-        title="Topological map, the older list (strands_navigation)",
+        title="Topological map, older list (strands_navigation)",
         files={FILE: "application/yaml"},
         layers=frozenset({"topology", "objects"}),
         detect=detect,

@@ -1,6 +1,6 @@
-"""tmap2: the networks of topological_navigation, as YAML: ``*.tmap2.yaml`` or ``*.tmap2``.
+"""tmap2: networks of topological_navigation, as YAML: ``*.tmap2.yaml`` or ``*.tmap2``.
 
-See ``tmap.network``. The older list (``tmap``) is read too where a sender calls it tmap2, and served completed.
+See ``tmap.network``. The older list (``tmap``) is also read if a client names it tmap2; missing members are filled in.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ NAMES = (".tmap2.yaml", ".tmap2.yml", ".tmap2")
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``network.tmap2.yaml``; see ``tmap.writing``."""
+    """Write ``network.tmap2.yaml``; see ``tmap.writing``."""
     return {FILE: writing.write(layers, context)}
 
 
 def detect(name: str, data: bytes) -> bool:
-    """A topological map by its name, or YAML with its top-level keys; never the older list."""
+    """Detect a topological map by its name, or YAML with its top-level keys; never the older list."""
     lower = name.lower()
     if b"node" not in data or network.is_list(data):
         return False

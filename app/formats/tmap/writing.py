@@ -1,4 +1,4 @@
-"""Writing networks of topological_navigation, in either form."""
+"""Writing networks of topological_navigation in both layouts."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ from app.syntax.decimals import METRES, encode_pieces, numbers
 
 
 def write(layers: Layers, context: WriteContext, *, listed: bool = False) -> bytes:
-    """The text of a file: all networks of the environment in one, nodes and edges sorted by length and text of id.
+    """Write all networks of the environment as one file, nodes and edges sorted by length and text of id.
 
-    listed: as the older list. Wgs84 items are brought to local metres (MissingDatum without a datum). What the source
-    did not say is filled in.
+    listed: write the older list. WGS 84 items are converted to local metres (MissingDatum without a datum). Members
+    that the source does not have are filled in.
     """
     return _Writer(layers, context, listed=listed).file()
 
 
 Lines = list[tuple[int, str, str]]
-"""(length, name or id, text) of nodes or edges: sorted so, WayPoint9 stands before WayPoint10."""
+"""(length, name or id, text) of nodes or edges; sorting puts WayPoint9 before WayPoint10."""
 
 
 class _Writer:
-    """One file being written: its head, the templates of items met so far, counts for the report."""
+    """Writer of one file: top level, templates of items so far, counts for the report."""
 
     def __init__(self, layers: Layers, context: WriteContext, *, listed: bool) -> None:
         self.layers, self.context, self.listed = layers, context, listed
@@ -61,16 +61,16 @@ class _Writer:
         self.document = self._document()
         self.turn = map_transform(self.document)
         self.ring = ring(self.options.verts_radius)
-        self.legacy = False  # whether the network at hand came as the older list, which lacks much that tmap2 asks for
+        self.legacy = False  # whether the current network came as the older list, which lacks members of tmap2
         self.unwritten = CROSS_PART_PROPERTIES if self.options.osm else CROSS_PART_PROPERTIES | WRITTEN_ON_DEMAND
-        # Properties without anything for an item's own ``properties``.
+        # Sets of properties that add nothing to an item's own ``properties``.
         self.plain_node, self.plain_edge = CANONICAL_NODE | self.unwritten, CANONICAL_EDGE | self.unwritten
         self.templates: dict[Any, list[str]] = {}
         self.filled: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
 
     def _document(self) -> dict[str, Any]:
-        """The top level without the nodes: as the source says, completed."""
+        """Return the top level without the nodes: from the source, with defaults filled in."""
         parts = list(self.layers.vector("topology").values())
         parts += [part for key, part in self.layers.vector("objects").items() if key.name == NAME]
         source_document: Any = next((p.document[NAME] for p in parts if isinstance(p.document.get(NAME), Mapping)), {})
@@ -81,18 +81,16 @@ class _Writer:
             more = [key for key in document if key not in ("metric_map", "pointset")]
             if document.get("name") == document.get("pointset"):
                 more = [key for key in more if key != "name"]
-            self.context.drop(
-                "top level keys of a tmap2 file", len(more), "a list has no place for " + shorten_list(more)
-            )
+            self.context.drop("top level keys of a tmap2 file", len(more), "a list cannot store " + shorten_list(more))
             document = {key: document[key] for key in ("metric_map", "pointset") if key in document}
         for key in ("metric_map", "pointset") if self.listed else ("metric_map", "name", "pointset"):
             value = document.get(key)
             if value is None or isinstance(value, (dict, list)):
                 document[key] = title
-                self.context.fill(key, title, "no source names it")
+                self.context.fill(key, title, "no source specifies it")
             elif not isinstance(value, str):
                 document[key] = yaml.text(value)
-                self.context.warn(f"the source's {key} is no text; {document[key]!r} is written", where=key)
+                self.context.warn(f"the source's {key} is not text; {document[key]!r} is written", where=key)
         if self.options.pointset is not None:
             document["name"] = document["pointset"] = self.options.pointset
         if self.listed:
@@ -101,19 +99,21 @@ class _Writer:
         updated = meta.get("last_updated")
         if not (isinstance(updated, str) and LAST_UPDATED.match(updated)):
             meta["last_updated"] = EPOCH
-            self.context.fill("meta.last_updated", EPOCH, "no source tells it in the form that the schema wants")
+            self.context.fill("meta.last_updated", EPOCH, "no source has it in the form that the schema requires")
             if updated is not None:
-                self.context.warn(f"last_updated {updated!r} is no time; {EPOCH} is written", where="meta.last_updated")
+                self.context.warn(
+                    f"last_updated {updated!r} is not a time; {EPOCH} is written", where="meta.last_updated"
+                )
         if self.context.attribution and not meta.keys() & {"attribution", "license", "copyright"}:
             meta["attribution"] = "; ".join(self.context.attribution)
         document["meta"] = meta
         if "transformation" not in document:
             document["transformation"] = TRANSFORMATION
-            self.context.fill("transformation", "identity, from map to topo_map", "no source names it")
+            self.context.fill("transformation", "identity, from map to topo_map", "no source specifies it")
         return document
 
     def file(self) -> bytes:
-        """The whole file."""
+        """Return the file."""
         nodes: Lines = []
         taken: set[str] = set()
         networks = self.layers.vector("topology")
@@ -121,7 +121,7 @@ class _Writer:
             nodes += self._network(part, key.level, taken)
         if len({key.level for key in networks}) > 1:
             count = sum(len(part) for key, part in networks.items() if key.level != GROUND)
-            why = "the format knows no levels: all networks are joined, 2-D points at their level's elevation"
+            why = "the format has no levels: all networks are merged, 2-D points at their level's elevation"
             self.context.drop("levels of nodes and edges", count, why)
         self._report()
         items = [text for _, _, text in sorted(nodes)]
@@ -134,7 +134,7 @@ class _Writer:
         return encode_pieces(pieces)
 
     def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
-        """The nodes of a network, each with its edges."""
+        """Write the nodes of a network, each with its edges."""
         self.legacy = "tmap" in part.document
         is_point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
         kinds = [p.get("kind") for p in part.properties]
@@ -159,11 +159,11 @@ class _Writer:
         return out
 
     def _is_plain(self, p: Properties, keys: frozenset[str]) -> bool:
-        """Whether an item comes from another format and has nothing for its own ``properties``."""
+        """Check that an item comes from another format and adds nothing to its own ``properties``."""
         return NAME not in p and not self.legacy and p.keys() <= keys
 
     def _plain_node(self) -> Callable[[str, str, tuple[str, str, str]], str]:
-        """The quick way for nodes that have only a name and a place: (name, edges, position) as texts -> entry."""
+        """Create a fast formatter of nodes with only a name and position: (name, edges, position) as texts -> entry."""
         a, b, c, d, e = self._node_template({}, {}, None, has_yaw=False, fill=True)
         d += self._pose(None, ("\0", "\0", "\0"), [0.0, 0.0, 0.0, 1.0], turned=False)
         d, y, z, end = d.split("\0")
@@ -175,7 +175,7 @@ class _Writer:
         return plain
 
     def _names(self, part: Features, places: Sequence[int], taken: set[str]) -> dict[str, str]:
-        """What each node is called in the file, by id. Names repeat where they did so in their source."""
+        """Return the nodes' names in the file by id. Names that repeat in their source repeat here."""
         names = []
         for k in places:
             source_properties = part.properties[k].get(NAME)
@@ -187,13 +187,13 @@ class _Writer:
             renamed = dict(zip(clashing, unique_ids(clashing, taken | set(names)), strict=True))
             names = [renamed.get(name, name) for name in names]
             self.context.warn(
-                f"{len(clashing)} names stand in several networks and got a number: {shorten_list(clashing)}"
+                f"{len(clashing)} names occur in several networks; a number makes them unique: {shorten_list(clashing)}"
             )
         taken.update(names)
         return {part.ids[k]: name for k, name in zip(places, names, strict=True)}
 
     def _edges(self, part: Features, kinds: Sequence[Any], name_texts: Mapping[str, str]) -> dict[str, Lines]:
-        """The edges by the id of the node that they start at. name_texts: each node's name as YAML, by id."""
+        """Group the edges by the id of their source node. name_texts: each node's name as YAML, by id."""
         edges: dict[str, Lines] = {i: [] for i in name_texts}
         a, b, c = self._edge_template({}, None, None, fill=True)
         plain = dropped_count = 0
@@ -207,15 +207,15 @@ class _Writer:
                 plain += 1
                 text = f"{a} {yaml.text(i)}\n{b} {to}\n{c}"
             else:
-                i, text = self._edge(p, i, to)  # noqa: PLW2901  by the id that is written: read again, the order stays
+                i, text = self._edge(p, i, to)  # noqa: PLW2901  sort by the written id: the order is the same when read again
             edges[source].append((len(i), i, text))
         self.filled["edges"] += plain
-        self.dropped["items that are neither a node nor an edge from a node"] += dropped_count
+        self.dropped["items that are neither nodes nor edges from a node"] += dropped_count
         self.dropped["nodes without a point"] += kinds.count("node") - len(name_texts)
         return edges
 
     def _positions(self, part: Features, places: Sequence[int], elevation: float) -> list[tuple[str, str, str]]:
-        """x, y, z as texts: metres in the frame that each node's parent_frame names."""
+        """Return x, y, z as texts: metres in each node's parent_frame."""
         nodes = part.select(places)
         xyz: Array = shapely.get_coordinates(nodes.in_local(self.layers.frame), include_z=True).reshape(-1, 3)
         xyz[np.isnan(xyz[:, 2]), 2] = elevation
@@ -226,13 +226,13 @@ class _Writer:
         return list(zip(texts[::3], texts[1::3], texts[2::3], strict=True))
 
     def _is_in_child_frame(self, p: Properties) -> bool:
-        """Whether a node's pose stands in the child frame of the transformation."""
+        """Check that a node's pose is in the child frame of the transformation."""
         source_properties = p.get(NAME)
         node = source_properties.get("node") if isinstance(source_properties, dict) else None
         return self.turn is not None and isinstance(node, dict) and node.get("parent_frame") == self.turn.child
 
     def _edge(self, p: Properties, i: str, target: str) -> tuple[str, str]:
-        """The id as it is written, and the text of an edge. target: its target's name as YAML."""
+        """Return the written id and the text of an edge. target: its target's name as YAML."""
         source_properties, action = p.get(NAME), p.get("action")
         extra_members: dict[str, Any] = source_properties if isinstance(source_properties, dict) else {}
         if "edge_id" in extra_members:
@@ -241,7 +241,7 @@ class _Writer:
         more = None if p.keys() <= self.plain_edge else self._more(p, CANONICAL_EDGE)
         fill = source_properties is None or self.legacy
         self.filled["edges"] += source_properties is None if self.listed else fill
-        # Edges alike but for their id and target share their text.
+        # Edges that differ only in id and target share their text.
         key = orjson.dumps((action, extra_members, more, fill)).decode() if extra_members or more or action else fill
         pieces = self.templates.get(key)
         if pieces is None:
@@ -251,12 +251,12 @@ class _Writer:
     def _edge_template(
         self, extra_members: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool
     ) -> list[str]:
-        """The text of an edge in three pieces, around its id and its target."""
+        """Return the text of an edge in three pieces, around its id and its target."""
         if isinstance(self.options, ListOptions):
             limit = (more or {}).get("speed_limit")
             speed = limit if isinstance(limit, (int, float)) and not isinstance(limit, bool) else self.options.top_vel
             fixed = {"map_2d": self.document["metric_map"], "top_vel": float(speed)}
-            # What the list's reader takes of an edge; it looks at no other key.
+            # Keys that the list's reader uses; it ignores others.
             fixed |= {
                 "inflation_radius": self.options.inflation_radius,
                 "recovery_behaviours_config": self.options.recovery,
@@ -278,7 +278,7 @@ class _Writer:
 
     @staticmethod
     def _default_edge(options: WriteOptions) -> dict[str, Any]:
-        """What the options say of a new edge of a tmap2 file."""
+        """Return the members that the options set for a new edge of a tmap2 file."""
         return {
             "action_type": options.action_type,
             "fail_policy": options.fail_policy,
@@ -289,7 +289,7 @@ class _Writer:
         }
 
     def _default_node(self) -> dict[str, Any]:
-        """What the options say of a new node of a tmap2 file."""
+        """Return the members that the options set for a new node of a tmap2 file."""
         assert isinstance(self.options, WriteOptions)
         return {
             "localise_by_topic": self.options.localise_by_topic,
@@ -299,7 +299,7 @@ class _Writer:
         }
 
     def _node(self, p: Properties, name: str, name_text: str, at: tuple[str, str, str], edges: Lines) -> str:
-        """The text of a node's entry. name_text: its name as YAML. at: its position as texts."""
+        """Return the text of a node's entry. name_text: its name as YAML; at: its position as texts."""
         source_properties = p.get(NAME)
         extra_members: dict[str, Any] = source_properties if isinstance(source_properties, dict) else {}
         node = _mapping_text(extra_members.get("node"))
@@ -339,7 +339,7 @@ class _Writer:
         )
 
     def _pose(self, extra: Any, at: tuple[str, str, str], quaternion: list[float], *, turned: bool) -> str:
-        """What stands behind ``pose:``."""
+        """Return the text after ``pose:``."""
         if turned and self.turn is not None:
             x, y, z, w = self.turn.quaternion
             quaternion = multiply((-x, -y, -z, w), quaternion)
@@ -354,7 +354,7 @@ class _Writer:
         )
 
     def _tolerances(self, has_yaw: bool) -> dict[str, float]:
-        """Of a node that has none. has_yaw: whether it has an orientation."""
+        """Return the default tolerances of a node. has_yaw: whether it has an orientation."""
         yaw = self.options.yaw_goal_tolerance if has_yaw else ANY_YAW
         return {"xy_goal_tolerance": self.options.xy_goal_tolerance, "yaw_goal_tolerance": yaw}
 
@@ -367,7 +367,7 @@ class _Writer:
         has_yaw: bool,
         fill: bool,
     ) -> list[str]:
-        """The text of a node's entry in five pieces, around meta.node, edges, name and pose."""
+        """Return the text of a node's entry in five pieces, around meta.node, edges, name and pose."""
         inner = dict(node)
         if self.listed:
             inner_properties = _mapping_text(inner.get("properties"))
@@ -394,17 +394,17 @@ class _Writer:
         return [f"- {opening[2:]}", f"{middle}{between}\n{pieces[0]}", pieces[1], pieces[2], pieces[3] + after]
 
     def _more(self, p: Properties, canonical: frozenset[str]) -> dict[str, Any]:
-        """Canonical words and other formats' knowledge, for an item's own ``properties``."""
+        """Return the canonical and other formats' properties for an item's own ``properties``."""
         return {key: value for key, value in p.items() if key not in canonical and key not in self.unwritten}
 
     def _report(self) -> None:
         fill, filled, options = self.context.fill, self.filled, self.options
         if filled["edges"]:
-            why = f"{filled['edges']} edges come from a format that does not say it"
-            reason = f"{why}, where they name none"
+            why = f"{filled['edges']} edges come from a format without it"
+            reason = f"{why}, if they have none"
             fill("edges: action", options.action, reason, "action")
             if isinstance(options, ListOptions):
-                fill("edges: top_vel", options.top_vel, f"{why}, where they have no speed limit", "top_vel")
+                fill("edges: top_vel", options.top_vel, f"{why}, if they have no speed limit", "top_vel")
                 fill("edges: inflation_radius", options.inflation_radius, why, "inflation_radius")
                 fill("edges: map_2d", self.document["metric_map"], why)
             else:
@@ -412,11 +412,11 @@ class _Writer:
                 fill("edges: fail_policy", options.fail_policy, why, "fail_policy")
                 fill("edges: fluid_navigation", options.fluid_navigation, why, "fluid_navigation")
                 fill("edges: restrictions", options.restrictions, why, "restrictions")
-                fill("edges: config, goal", "the usual ones", why)
+                fill("edges: config, goal", "the default ones", why)
             fill("edges: recovery_behaviours_config", options.recovery, why, "recovery")
         if filled["nodes"]:
-            why = f"{filled['nodes']} nodes come from a format that does not say it"
-            reason = f"{why}, where they have none"
+            why = f"{filled['nodes']} nodes come from a format without it"
+            reason = f"{why}, if they have none"
             fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", reason, "verts_radius")
             fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, reason, "xy_goal_tolerance")
             fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")
@@ -429,19 +429,21 @@ class _Writer:
             why = f"{filled['yaw']} nodes with an orientation have none; in radians"
             fill("nodes: yaw_goal_tolerance", options.yaw_goal_tolerance, why, "yaw_goal_tolerance")
         if filled["any yaw"]:
-            why = f"{filled['any yaw']} nodes have none and no orientation, so that any will do; in radians"
+            why = f"{filled['any yaw']} nodes have none and no orientation: any yaw is accepted; in radians"
             fill("nodes without an orientation: yaw_goal_tolerance", ANY_YAW, why)
         if filled["orientations"]:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
         for noun, count in sorted(self.dropped.items()):
-            self.context.drop(noun, count, "the format has no place for it")
+            self.context.drop(noun, count, "the format cannot store it")
         for family in sorted(WRITTEN_ON_DEMAND & self.unwritten):
             items = [p for part in self.layers.vector("topology").values() for p in part.properties if family in p]
-            self.context.drop(f"{family} tags and attributes", len(items), f"left out for size; ask with {family}=true")
+            self.context.drop(
+                f"{family} tags and attributes", len(items), f"omitted to save space; request them with {family}=true"
+            )
 
 
 def _list_text(items: Lines) -> str:
-    """What stands behind ``edges:`` or ``nodes:``."""
+    """Return the text after ``edges:`` or ``nodes:``."""
     return "\n" + "".join([text for _, _, text in sorted(items)]) if items else " []\n"
 
 
@@ -450,7 +452,7 @@ def _mapping_text(value: Any) -> dict[str, Any]:
 
 
 def _quaternion(value: Any) -> list[float] | None:
-    """Four finite numbers, else None."""
+    """Return four finite numbers, else None."""
     if not isinstance(value, (list, tuple)) or len(value) != 4:
         return None
     if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value):
@@ -459,7 +461,7 @@ def _quaternion(value: Any) -> list[float] | None:
 
 
 def _dangling(edge: Mapping[str, Any], name: str) -> tuple[int, str, str]:
-    """An edge to nowhere as it was, with the id that the schema asks for."""
+    """Return a dangling edge unchanged, with the id that the schema requires."""
     edge_id = edge.get("edge_id")
     i = (
         edge_id
@@ -472,9 +474,9 @@ def _dangling(edge: Mapping[str, Any], name: str) -> tuple[int, str, str]:
 
 
 def _split(values: Mapping[str, Any], column: int, *holes: str) -> list[str]:
-    """A mapping's text in pieces around the values of these keys, which are named in alphabetical order.
+    """Split a mapping's text around the values of these keys, given in alphabetical order.
 
-    A piece before a hole ends with the key's colon, so that what is put there brings its space and its line break.
+    A piece before a hole ends with the key's colon: the inserted text needs its own space and line break.
     """
     pieces = []
     part: dict[str, Any] = {}

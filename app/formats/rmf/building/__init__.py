@@ -1,26 +1,26 @@
-"""building.yaml: the buildings of Open-RMF's traffic editor, with the floor plan images that they name.
+"""building.yaml: buildings of the Open-RMF traffic editor, with their floor plan images.
 
 A level has vertices ``[x, y, z, name, {parameters}]``; lanes, walls, doors, measurements and human lanes are
 ``[i, j, {parameters}]`` between vertices, floors and holes rings of them; a parameter is ``[type, value]`` with 1 text,
-2 integer, 3 decimal, 4 truth value. What the numbers mean, ``coordinate_system`` says:
+2 integer, 3 decimal, 4 boolean. ``coordinate_system`` sets the meaning of the coordinates:
 
-* ``reference_image`` (also where the key is absent): pixels, y down. y is negated; the scale is the mean of metres per
+* ``reference_image`` (the default): pixels, y down. y is negated; the scale is the mean of metres per
   pixel over the measurements of the reference level (``reference_level_name``, else the first); every other level takes
-  scale, turn and shift from the fiducials that it shares by name with the reference level, never from its own
-  measurements. Without two of them (without measurements) a pixel counts as a metre.
-* ``cartesian_meters``: metres, y up; ``offset_x`` and ``offset_y`` are told and not applied.
+  scale, rotation and translation from the fiducials that it shares by name with the reference level, never from its
+  own measurements. With fewer than two common fiducials (or no measurement) one pixel is one metre.
+* ``cartesian_meters``: metres, y up; ``offset_x`` and ``offset_y`` are stored but not applied.
 * ``wgs84``: x is the longitude, y the latitude, degrees.
 * ``web_mercator``: the world is 256 wide; x from 0 eastward, y from 0 downward to -256.
 
 Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, transform.py, lift.py).
 
-Canonical: one part of topology and one of objects for each level. A vertex is a node, called by its name, else
-``<level>/<index>``; a lane is an edge, a two-way one two edges that come back as one lane. Walls, doors, floors, holes,
-models, lifts, fiducials, measurements and human lanes are objects of these kinds. ``properties.openrmf`` keeps an
-item's place in its list (``index``), its ``parameters``, and the ``vertices`` that it stood on. The document's
-``openrmf`` is ``{building, level, order, transform}``: the file's top level without levels and lifts, the level without
-its lists, its place in the file, and [scale, rotation, x, y] from pixels (y up) to metres. Geometry decides: an item
-that was moved by an edit gets vertices where it stands.
+Canonical: one topology part and one objects part per level. A vertex is a node, its id is its name, else
+``<level>/<index>``; a lane is an edge, a two-way lane two edges that are written as one lane. Walls, doors, floors,
+holes, models, lifts, fiducials, measurements and human lanes are objects of these kinds. ``properties.openrmf`` holds
+an item's position in its list (``index``), its ``parameters`` and its ``vertices``. The document's ``openrmf`` is
+``{building, level, order, transform}``: the file's top level without levels and lifts, the level without its lists,
+its position in the file, and [scale, rotation, x, y] from pixels (y up) to metres. Geometry takes precedence: an item
+moved by an edit gets vertices at its new position.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _NAMED = re.compile(rb"(?m)^name[ \t]*:")
 
 
 def detect(name: str, data: bytes) -> bool:
-    """YAML with levels that have what only a building has, or a name and vertices."""
+    """Detect YAML whose levels have keys that only a building has, or a name and vertices."""
     if not name.lower().endswith((".yaml", ".yml")) or not _LEVELS.search(data):
         return False
     if _OF_BUILDING.search(data):

@@ -1,4 +1,4 @@
-"""The coordinates of buildings: from a file's numbers to metres or degrees, and back."""
+"""Building coordinates: conversion from file values to metres or degrees, and back."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ SYSTEMS = (IMAGE, METRIC, ON_EARTH, MERCATOR)
 DEGREE_SYSTEMS = frozenset({ON_EARTH, MERCATOR})
 
 MIN_SCALE = 1e-9
-"""Metres per pixel, and pixels per metre: beyond it is a mistake."""
+"""Minimum scale in metres per pixel; its reciprocal is the maximum."""
 
 MAX_FIDUCIALS = 200
-"""In common between two levels; each is compared with each."""
+"""Maximum number of fiducials that two levels share; all pairs are compared."""
 
 _EARTH_TURN = 180.0 / 128.0
 
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """From a drawing's pixels (y up) to local metres: turned, scaled, then shifted."""
+    """Transform from drawing pixels (y up) to local metres: rotate, scale, then translate."""
 
     scale: float = 1.0
     rotation: float = 0.0
     shift: tuple[float, float] = (0.0, 0.0)
 
     def apply(self, xy: Array) -> Array:
-        """Metres [n, 2] of pixels [n, 2]."""
-        with np.errstate(all="ignore"):  # what is not finite is refused with the item's name
+        """Convert pixels [n, 2] to metres [n, 2]."""
+        with np.errstate(all="ignore"):  # non-finite results are rejected later, with the item's name
             return np.asarray((xy @ self._matrix().T) * self.scale + np.array(self.shift), np.float64)
 
     def invert(self, xy: Array) -> Array:
-        """Pixels [n, 2] of metres [n, 2]."""
+        """Convert metres [n, 2] to pixels [n, 2]."""
         return np.asarray(((xy - np.array(self.shift)) / self.scale) @ self._matrix(), np.float64)
 
     def _matrix(self) -> Array:
@@ -46,11 +46,11 @@ class Transform:
         return np.array([[c, -s], [s, c]])
 
     def as_list(self) -> list[float]:
-        """The transform as a document keeps it."""
+        """Return the transform as stored in a document: [scale, rotation, x, y]."""
         return [self.scale, self.rotation, *self.shift]
 
     def is_close(self, other: Transform) -> bool:
-        """Whether both bring a pixel to the same place, to a micrometre or so."""
+        """Check that both transforms map pixels to the same positions, within about a micrometre."""
         moved = max(abs(a - b) for a, b in zip(self.shift, other.shift, strict=True))
         turn = abs(math.remainder(self.rotation - other.rotation, 2 * math.pi))
         return abs(self.scale - other.scale) <= 1e-8 * abs(self.scale) and turn <= 1e-8 and moved <= 1e-6
@@ -58,31 +58,34 @@ class Transform:
 
 @dataclass(frozen=True, slots=True)
 class Scaling:
-    """What of a level decides on transforms: measurements (pixels, metres) and fiducials (name, x, y; y up)."""
+    """Inputs of a level's transform: measurements (pixels, metres) and fiducials (name, x, y; y up)."""
 
     measurements: list[tuple[float, float]]
     fiducials: list[tuple[str, float, float]]
 
 
 def transforms(levels: Mapping[str, Scaling], reference: str, warn: Callable[[str, str], None]) -> dict[str, Transform]:
-    """The transform of each level of a building in pixels, as rmf_building_map_tools computes it.
+    """Compute each level's transform for a building in pixels, as rmf_building_map_tools does.
 
-    warn: called with (problem, place) where the scale cannot be told.
+    warn: called with (problem, location) if the scale cannot be determined.
     """
     scales = [metres / pixels for pixels, metres in levels[reference].measurements if pixels > 0 and metres > 0]
     if len(scales) < len(levels[reference].measurements):
-        warn("a measurement without length is not used", f"levels.{reference}.measurements")
+        warn("a measurement has no length; it is ignored", f"levels.{reference}.measurements")
     if not scales:
-        warn("no measurement tells the scale: a pixel is taken as a metre", f"levels.{reference}.measurements")
+        warn("no measurement sets the scale; one pixel is read as one metre", f"levels.{reference}.measurements")
     scale = sum(scales) / len(scales) if scales else 1.0
     if not MIN_SCALE <= scale <= 1 / MIN_SCALE:
-        raise_unreadable(f"gives {scale:g} metres per pixel, which is no scale", f"levels.{reference}.measurements")
+        raise_unreadable(
+            f"invalid scale of {scale:g} metres per pixel: check the distances of the measurements",
+            f"levels.{reference}.measurements",
+        )
     out = {reference: Transform(scale)}
     for name, level in levels.items():
         if name != reference:
             transform = _fit_fiducials(levels[reference].fiducials, level.fiducials, scale)
             if transform is None:
-                problem = "shares fewer than two fiducials with the reference level: a pixel is taken as a metre"
+                problem = "shares fewer than two fiducials with the reference level; one pixel is read as one metre"
                 warn(problem, f"levels.{name}.fiducials")
             out[name] = transform or Transform()
     return out
@@ -91,7 +94,10 @@ def transforms(levels: Mapping[str, Scaling], reference: str, warn: Callable[[st
 def _fit_fiducials(
     reference: Sequence[tuple[str, float, float]], other: Sequence[tuple[str, float, float]], scale: float
 ) -> Transform | None:
-    """Circular mean of the turns, mean of the relative scales and of the shifts, over pairs of common fiducials."""
+    """Fit a transform to the pairs of common fiducials.
+
+    The rotation is a circular mean; the relative scale and the translation are means.
+    """
     by_name: dict[str, list[tuple[float, float]]] = {}
     for name, x, y in other:
         by_name.setdefault(name, []).append((x, y))
@@ -110,14 +116,14 @@ def _fit_fiducials(
         turn = np.arctan2(step[:, 3], step[:, 2]) - np.arctan2(step[:, 1], step[:, 0])
         rotation = -math.atan2(float(np.sin(turn).sum()), float(np.cos(turn).sum()))
     if not MIN_SCALE <= scale / relative <= 1 / MIN_SCALE:
-        raise_unreadable("two levels whose fiducials lie at no common scale", "fiducials")
+        raise_unreadable("the fiducials of two levels have no common scale: check their positions", "fiducials")
     turned = Transform(1.0 / relative, rotation).apply(common[:, 2:])
     shift = (common[:, :2] - turned).mean(axis=0) * scale
     return Transform(scale / relative, rotation, (float(shift[0]), float(shift[1])))
 
 
 def to_canonical(system: str, raw: Array, transform: Transform) -> Array:
-    """Local metres, or longitude and latitude in degrees, of the file's x and y."""
+    """Convert the file's x and y to local metres, or to longitude and latitude in degrees."""
     if system == IMAGE:
         return transform.apply(raw * np.array([1.0, -1.0]))
     if system == MERCATOR:
@@ -128,7 +134,7 @@ def to_canonical(system: str, raw: Array, transform: Transform) -> Array:
 
 
 def to_file(system: str, at: Array, transform: Transform) -> Array:
-    """The reverse of ``to_canonical``."""
+    """Reverse ``to_canonical``."""
     if system == IMAGE:
         return np.asarray(transform.invert(at) * np.array([1.0, -1.0]), np.float64)
     if system == MERCATOR:

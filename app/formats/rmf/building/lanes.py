@@ -1,4 +1,4 @@
-"""The lanes of a building: edges as they are written, those of both directions as one."""
+"""Writing edges as lanes of a building; opposite edges become one two-way lane."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LANE_TEMPLATE: Mapping[str, Any] = {"graph_idx": [2, 0], "orientation": [1, ""],
 
 
 def sort_by_lane(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
-    """(id, properties) of what is no node: by the lane it was and its direction, then the others by id."""
+    """Iterate over (id, properties) of all items but nodes: by source lane and direction, then by id."""
 
     def each() -> Iterator[tuple[str, Properties]]:
         for part in parts:
@@ -32,12 +32,12 @@ def sort_by_lane(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
         has_index = isinstance(was, int)
         return (not has_index, was if isinstance(was, int) else 0, source_members.get("reverse") is True, len(i), i)
 
-    # As they were read they are in order: then none is held.
+    # Items in the order of their file need no sorting in memory.
     return each() if all(a <= b for a, b in pairwise(map(key, each()))) else sorted(each(), key=key)
 
 
 def lane_parameters(p: Properties, options: common.WriteOptions) -> dict[str, Any]:
-    """The parameters of a lane that comes from another format."""
+    """Build the parameters of a lane that comes from another format."""
     out = {key: list(value) for key, value in LANE_TEMPLATE.items()}
     if NAV_GRAPH not in p:
         out["graph_idx"] = [2, options.graph]
@@ -55,7 +55,10 @@ def lane_parameters(p: Properties, options: common.WriteOptions) -> dict[str, An
 
 @dataclass(slots=True)
 class Lane:
-    """A directed edge on its way to a lane. was: its lane's place in the file; reverse: it is that lane backwards."""
+    """Directed edge to be written as a lane.
+
+    was: index of its source lane in the file; reverse: the edge is that lane's reverse direction.
+    """
 
     source: int
     target: int
@@ -69,7 +72,7 @@ class Lane:
 
     @classmethod
     def from_edge(cls, limit: float, source_members: Mapping[str, Any], source: int, target: int, flow: Flow) -> Lane:
-        """The edge with this speed limit (0: none); rest: what is known of its lane."""
+        """Create a lane from an edge with this speed limit in m/s (0: none)."""
         was = source_members.get("index") if isinstance(source_members.get("index"), int) else None
         reverse = source_members.get("reverse") is True
         parameters = mapping(source_members.get("parameters"), "parameters")
@@ -86,17 +89,17 @@ class Lane:
         return str(parameter_value(self.parameters, "orientation", ""))
 
     def parameters_key(self) -> Any:
-        """Equal for edges that could be one."""
+        """Return a key that is equal for edges that can form one lane."""
         direction = self._orientation() if self.was is None else self.reverse
         return (self.source, self.target, self.limit, self.signature, direction)
 
     def partner(self) -> Any:
-        """What the edge back says, if both are one two-way lane."""
+        """Return the ``parameters_key`` of the opposite edge that would form a two-way lane with this one."""
         direction = common.reverse_orientation(self._orientation()) if self.was is None else not self.reverse
         return (self.target, self.source, self.limit, self.signature, direction)
 
     def row(self, flow: Flow) -> str:
-        """The lane's row."""
+        """Format the lane as a row of the file."""
         parameters = self.parameters
         if self.both or parameter_value(parameters, "bidirectional") is True or self.was is None:
             parameters = {**parameters, "bidirectional": [4, self.both]}

@@ -45,7 +45,10 @@ from app.syntax import yaml
 
 @dataclass(slots=True)
 class _Level:
-    """A level as its file says it. raw: float64 [n, 2] as in the file; at: metres or degrees; ids: of the vertices."""
+    """Level as read from the file.
+
+    raw: float64 [n, 2] as in the file; at: the same in metres or degrees; ids: node ids of the vertices.
+    """
 
     name: str
     order: int
@@ -63,9 +66,9 @@ class _Level:
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """Topology and objects for each level, and the images that the file names as resources.
+    """Read topology and objects of each level, and the named images as resources.
 
-    Coordinates are local metres, or degrees where the building's are. Raises UnreadableFile naming the place.
+    Coordinates are local metres, or degrees if the building's are. Raises UnreadableFile with the location.
     """
     main = context.main or next(iter(files))
     top = yaml.load(files[main], context.limits)
@@ -78,10 +81,10 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise_unreadable("a building needs at least one level", "levels")
     system = top.get("coordinate_system", IMAGE)
     if system not in SYSTEMS:
-        raise_unreadable(f"must be one of {', '.join(SYSTEMS)}, got {str(system)[:80]!r}", "coordinate_system")
+        raise_unreadable(f"must be one of {', '.join(SYSTEMS)}, not {str(system)[:80]!r}", "coordinate_system")
     levels = {name: _level(name, k, one) for k, (name, one) in enumerate(raw_value.items())}
     if context.level != GROUND:
-        context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
+        context.warn(f"the file names its own levels; level={context.level} is ignored", where="levels")
     reference = _reference(top, levels)
     if system == IMAGE:
         scaling = {name: _scaling(level) for name, level in levels.items()}
@@ -99,14 +102,14 @@ def read(files: Files, context: ReadContext) -> Layers:
     reader = _Reader(system, context, levels, reference)
     parts: dict[PartKey, Part] = {}
     lifts = reader.lifts(mapping(top.get("lifts"), "lifts"))
-    del top, raw_value  # each level lets go of what has been read of it
+    del top, raw_value  # so that each level can free what has been read
     for level in levels.values():
         network = reader.topology(level, taken)
         objects = reader.objects(level, lifts.get(level.name, []))
         document = {NAME: reader.document(level, building)}
         parts[PartKey("topology", level.name, NETWORK)] = network.with_document(document)
         parts[PartKey("objects", level.name, NAME)] = objects.with_document(document)
-    if not taken:  # nothing of the network is there: a map of this format alone, and of no other
+    if not taken:  # without a network the map is a map of this format only
         for level in levels.values():
             parts[PartKey("topology", level.name, NAME)] = parts[PartKey("topology", level.name, NETWORK)]
     named = [
@@ -122,7 +125,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _check_crs(parameters: Any) -> None:
-    """Refuse a building whose coordinates are said to be of a CRS that does not exist."""
+    """Reject a building that names an unknown CRS."""
     crs = parameter_value(parameters, "generate_crs") if isinstance(parameters, dict) else None
     if crs not in (None, ""):
         try:
@@ -146,7 +149,7 @@ def _reference(top: Mapping[str, Any], levels: Mapping[str, _Level]) -> str:
         return next(iter(levels))
     name = raw_value if isinstance(raw_value, str) else yaml.text(raw_value)
     if name not in levels:
-        raise_unreadable(f"names the level {name[:80]!r}, which is not there", "reference_level_name")
+        raise_unreadable(f"unknown level {name[:80]!r}", "reference_level_name")
     return name
 
 
@@ -164,7 +167,7 @@ def _scaling(level: _Level) -> Scaling:
 
 
 def _edge(row: Any, location: str) -> tuple[int, int, dict[str, Any], list[Any]]:
-    """(start, end, parameters, what stands behind them) of a row ``[i, j, {…}]``."""
+    """Parse a row ``[i, j, {…}, …]`` into (start, end, parameters, further values)."""
     if not isinstance(row, list) or len(row) < 2:
         raise_unreadable("must be a list [vertex, vertex, {parameters}]", location)
     parameters = mapping(row[2] if len(row) > 2 else None, f"{location}[2]")
@@ -172,7 +175,7 @@ def _edge(row: Any, location: str) -> tuple[int, int, dict[str, Any], list[Any]]
 
 
 def plain_text(value: Any) -> str:
-    """A scalar of a file as a text; nothing as an empty one."""
+    """Convert a scalar to text; None becomes an empty text."""
     return value if isinstance(value, str) else "" if value is None else yaml.text(value)
 
 
@@ -187,14 +190,14 @@ def _node_ids(level: _Level, taken: set[str]) -> list[str]:
 
 
 class _Reader:
-    """A building being read: what its levels share."""
+    """Reader of a building; holds what its levels share."""
 
     def __init__(self, system: str, context: ReadContext, levels: Mapping[str, _Level], reference: str) -> None:
         self.system, self.context, self.levels, self.reference = system, context, levels, reference
         self.degrees = system in DEGREE_SYSTEMS
 
     def document(self, level: _Level, building: dict[str, Any]) -> dict[str, Any]:
-        """What stands in the documents of a level's parts."""
+        """Build the collection document of a level's parts."""
         extra_members = {key: value for key, value in level.members.items() if key not in LISTS}
         out: dict[str, Any] = {"building": building, "level": extra_members, "order": level.order}
         if self.system == IMAGE:
@@ -204,7 +207,7 @@ class _Reader:
         return out
 
     def topology(self, level: _Level, taken: set[str]) -> Features:
-        """The vertices as nodes, the lanes as directed edges."""
+        """Convert vertices to nodes and lanes to directed edges."""
         sources, targets, lanes = self._lanes(level)
         properties: list[Properties] = []
         heights = np.zeros(len(level.rows))
@@ -235,7 +238,7 @@ class _Reader:
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
             self.context.warn(
-                f"{len(twice)} names stand for several vertices: {', '.join(twice[:5])}; robots cannot tell them apart",
+                f"{len(twice)} duplicate vertex names: {', '.join(twice[:5])}; robots cannot tell them apart",
                 where=f"levels.{level.name}.vertices",
             )
         geometry = points(level.at)
@@ -255,7 +258,7 @@ class _Reader:
         return from_columns(ids, both, properties, "wgs84" if self.degrees else "local")
 
     def _lanes(self, level: _Level) -> tuple[list[int], list[int], list[Properties]]:
-        """(sources, targets, properties) of the edges, two-way lanes as two."""
+        """Return (sources, targets, properties) of the edges; a two-way lane gives two."""
         sources: list[int] = []
         targets: list[int] = []
         out: list[Properties] = []
@@ -298,12 +301,12 @@ class _Reader:
         if loops:
             self.context.warn(f"{loops} lanes lead from a vertex to itself", where=location)
         if graphless:
-            problem = f"{graphless} lanes have no graph_idx: they are taken as lanes of graph 0"
+            problem = f"{graphless} lanes have no graph_idx; they are read as lanes of graph 0"
             self.context.warn(problem, where=location)
         return sources, targets, out
 
     def _between(self, level: _Level, section: str) -> Iterable[tuple[int, int, int, dict[str, Any], list[Any]]]:
-        """(place in the list, start, end, parameters, more) of the rows whose vertices exist. Each row is let go."""
+        """Iterate over (index, start, end, parameters, more) of the rows whose vertices exist; frees each row."""
         n = len(level.raw)
         rows = list(listing(level.members.pop(section, None), f"levels.{level.name}.{section}"))
         for k in range(len(rows)):
@@ -313,11 +316,13 @@ class _Reader:
                 yield k, i, j, parameters, more
             else:
                 level.dangling.setdefault(section, []).append(row)
-                problem = f"joins the vertices {i} and {j}, but the level has {n}: it is kept in the level's document"
+                problem = (
+                    f"joins the vertices {i} and {j}, but the level has {n}; it is stored in the level's document only"
+                )
                 self.context.warn(problem, where=level.location_of(section, k))
 
     def objects(self, level: _Level, lifts: list[tuple[str, Any, Properties]]) -> Features:
-        """Everything but vertices and lanes."""
+        """Convert everything but vertices and lanes to objects."""
         rows: list[tuple[str, Any, Properties]] = []
         prefix = common.short(level.name, 200)
         template = shared_key_dict("index", "parameters", "vertices")
@@ -345,7 +350,9 @@ class _Reader:
                 valid = [v for v in ring if 0 <= v < len(level.raw)]
                 if len(valid) < len(ring):
                     level.dangling.setdefault(section, []).append(one)
-                    self.context.warn("has vertices that do not exist: kept in the level's document", where=location)
+                    self.context.warn(
+                        "has vertices that do not exist; it is stored in the level's document only", where=location
+                    )
                     continue
                 source_properties = {"index": k, "vertices": ring, **properties}
                 rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: source_properties}))
@@ -384,14 +391,14 @@ class _Reader:
         return out
 
     def lifts(self, listed: Mapping[str, Any]) -> dict[str, list[tuple[str, Any, Properties]]]:
-        """The lifts by the level whose floor plan they are drawn on."""
+        """Group the lifts by the level of the floor plan that they are drawn on."""
         out: dict[str, list[tuple[str, Any, Properties]]] = {}
         for k, (name, one) in enumerate(listed.items()):
             location = f"lifts.{name}"
             members = dict(mapping(one, location))
             floor = plain_text(members.get("reference_floor_name")) or self.reference
             if floor not in self.levels:
-                problem = f"names the level {floor[:80]!r}, which is not there: {self.reference} is taken"
+                problem = f"unknown level {floor[:80]!r}; {self.reference} is used"
                 self.context.warn(problem, where=f"{location}.reference_floor_name")
                 floor = self.reference
             x, y = (number(members.pop(axis, None), f"{location}.{axis}") for axis in "xy")
@@ -400,7 +407,7 @@ class _Reader:
             at = self._level_position(np.array([[x, y]]), self.levels[floor])[0].tolist()
             properties: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, common.CABIN_HEIGHT]}
             if not self.degrees:
-                # The tools take a lift's yaw as it stands, on whatever floor plan it was drawn.
+                # The tools do not rotate a lift's yaw with its floor plan.
                 properties["pose"] = [*at, self.levels[floor].elevation, 0.0, 0.0, yaw]
                 members.pop("yaw", None)
             properties[NAME] = {"index": k, "says": members}
@@ -410,7 +417,7 @@ class _Reader:
 
 
 def _ring(at: Array) -> Any:
-    """A polygon; where there are too few corners for one, its points."""
+    """Build a polygon, or points if there are too few corners."""
     if not len(at):
         return None
     closed = (at[0] == at[-1]).all()
@@ -420,7 +427,7 @@ def _ring(at: Array) -> Any:
 
 
 def named_images(members: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
-    """(place, file name) of the images that a level's document names."""
+    """Iterate over (location, file name) of the images that a level's document names."""
     drawing = members.get("drawing")
     if isinstance(drawing, dict) and isinstance(drawing.get("filename"), str):
         yield "drawing", drawing["filename"]

@@ -1,7 +1,7 @@
-"""What Open-RMF's building_map_generator and traffic editor want of a building.yaml.
+"""Rules of Open-RMF's building_map_generator and traffic editor for building.yaml.
 
 Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, edge.py, vertex.py,
-param_value.py, lift.py, transform.py); the traffic editor (C++) converts parameters to the type that they say.
+param_value.py, lift.py, transform.py); the traffic editor (C++) converts parameters to their declared type.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ DOOR = ("door_type", "x", "y", "motion_axis_orientation", "width")
 LIFT = ("depth", "width", "yaw", "x", "y")
 GRAPHS = 9
 EASTING_FIRST = re.compile(r"\s*EPSG:\s*(32[67]\d\d|258\d\d|27700|2154|3857)\s*", re.IGNORECASE)
-"""UTM on WGS 84 and ETRS 89, and others in use, of which PROJ gives the easting first."""
+"""CRSs with easting first in PROJ: UTM on WGS 84 and ETRS 89, and other common ones."""
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A building as its generator and its editor load it."""
+    """Check a building with the rules of its generator and its editor."""
     main = next(iter(files))
     if is_brief(files[main]):
         return
@@ -50,21 +50,23 @@ def check(files: Files) -> Iterator[Problem]:
         return
     top = yaml.load(files[main], LIMITS)
     if not isinstance(top, dict):
-        yield error_finding("a building is a mapping", main)
+        yield error_finding("a building must be a mapping", main)
         return
     if top.get("name") is None and top.get("building_name") is None:
         yield error_finding("a building needs a name", main, where="name")
     system = top.get("coordinate_system", SYSTEMS[0])
     if system not in SYSTEMS:
-        yield error_finding(f"must be one of {', '.join(SYSTEMS)}, is {shown(system)}", main, where="coordinate_system")
+        yield error_finding(
+            f"must be one of {', '.join(SYSTEMS)}, not {shown(system)}", main, where="coordinate_system"
+        )
     yield from _parameters(top.get("parameters"), main, "parameters")
     levels = top.get("levels")
     if not isinstance(levels, dict) or not levels:
-        yield error_finding("a building needs one level at least", main, where="levels")
+        yield error_finding("a building needs at least one level", main, where="levels")
         return
     reference = top.get("reference_level_name", next(iter(levels)))
     if reference not in levels:
-        yield error_finding(f"there is no level {shown(reference)}", main, where="reference_level_name")
+        yield error_finding(f"unknown level {shown(reference)}", main, where="reference_level_name")
     for name, level in levels.items():
         if isinstance(level, dict):
             yield from _level(level, main, f"levels.{name}", files, measured=system == SYSTEMS[0] and name == reference)
@@ -79,19 +81,21 @@ def check(files: Files) -> Iterator[Problem]:
 
 
 def _parameters(parameters: Any, main: str, location: str) -> Iterator[Problem]:
-    """Typed parameters: [type, value]."""
+    """Check typed parameters: [type, value]."""
     if not parameters:
         return
     if not isinstance(parameters, dict):
-        yield error_finding(f"must be a mapping, is {shown(parameters)}", main, where=location)
+        yield error_finding(f"must be a mapping, not {shown(parameters)}", main, where=location)
         return
     for key, value in parameters.items():
         item_location = f"{location}.{key}"
         if not isinstance(value, list) or len(value) != 2 or value[0] not in KINDS or isinstance(value[0], bool):
-            reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 truth value), is {shown(value)}"
+            reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 boolean), not {shown(value)}"
             yield error_finding(reason, main, where=item_location)
         elif not isinstance(value[1], KINDS[value[0]]) or (value[0] in (2, 3) and isinstance(value[1], bool)):
-            yield error_finding(f"the value {shown(value[1])} is not of its type {value[0]}", main, where=item_location)
+            yield error_finding(
+                f"the value {shown(value[1])} does not match its type {value[0]}", main, where=item_location
+            )
 
 
 def _level(level: dict[str, Any], main: str, location: str, files: Files, *, measured: bool) -> Iterator[Problem]:
@@ -101,41 +105,37 @@ def _level(level: dict[str, Any], main: str, location: str, files: Files, *, mea
         if not isinstance(image, str):
             yield error_finding("a drawing needs a filename", main, where=f"{location}.drawing")
         elif image and posixpath.normpath(posixpath.join(posixpath.dirname(main), image)) not in files:
-            yield warning_finding(
-                f"the drawing {shown(image)} is not there", main, where=f"{location}.drawing.filename"
-            )
+            yield warning_finding(f"drawing file {shown(image)} not found", main, where=f"{location}.drawing.filename")
     if "elevation" in level and not is_number(level["elevation"]):
-        yield error_finding(f"must be a number, is {shown(level['elevation'])}", main, where=f"{location}.elevation")
+        yield error_finding(f"must be a number, not {shown(level['elevation'])}", main, where=f"{location}.elevation")
     vertices = level.get("vertices") or []
     if not isinstance(vertices, list):
         yield error_finding("must be a list", main, where=f"{location}.vertices")
         return
     for k, row in enumerate(vertices):
         if not isinstance(row, list) or len(row) < 4 or not numbers(row[:3], 3):
-            yield error_finding("a vertex is [x, y, z, name, {…}]", main, where=f"{location}.vertices[{k}]")
+            yield error_finding("a vertex must be [x, y, z, name, {…}]", main, where=f"{location}.vertices[{k}]")
         elif len(row) > 4:
             yield from _parameters(row[4], main, f"{location}.vertices[{k}]")
     called = [
         row[3] for row in vertices if isinstance(row, list) and len(row) > 3 and isinstance(row[3], str) and row[3]
     ]
     if repeats := duplicates(called):
-        reason = f"{len(repeats)} names are given to several vertices; fleet adapters refuse that: {names(repeats)}"
+        reason = f"{len(repeats)} duplicate vertex names: {names(repeats)}; fleet adapters reject them"
         yield warning_finding(reason, main, where=f"{location}.vertices")
     for section in EDGES:
         yield from _edges(level.get(section), section, vertices, main, f"{location}.{section}")
     if measured and not level.get("measurements"):
-        reason = "the reference level has no measurement: a pixel counts as a metre"
+        reason = "the reference level has no measurement; one pixel is one metre"
         yield warning_finding(reason, main, where=f"{location}.measurements")
     for section in ("floors", "holes"):
         for k, area in mappings(level.get(section)):
             ring = area.get("vertices")
             if not isinstance(ring, list) or len(ring) < 3 or not all(_is_index(i, vertices) for i in ring):
-                yield error_finding(
-                    "needs three vertices or more that are there", main, where=f"{location}.{section}[{k}]"
-                )
+                yield error_finding("needs at least three existing vertices", main, where=f"{location}.{section}[{k}]")
     for k, row in enumerate(level.get("fiducials") or ()):
         if not isinstance(row, list) or len(row) < 3 or not numbers(row[:2], 2):
-            yield error_finding("a fiducial is [x, y, name]", main, where=f"{location}.fiducials[{k}]")
+            yield error_finding("a fiducial must be [x, y, name]", main, where=f"{location}.fiducials[{k}]")
 
 
 def _is_index(value: Any, vertices: list[Any]) -> bool:
@@ -162,22 +162,20 @@ def _edges(rows: Any, section: str, vertices: list[Any], main: str, location: st
             a, b = vertices[row[0]], vertices[row[1]]
             if isinstance(a, list) and isinstance(b, list) and a[:2] == b[:2]:
                 yield error_finding(
-                    "a measurement of length 0: the scale is a division by it", main, where=item_location
+                    "a measurement has length 0: the scale is computed by dividing by it", main, where=item_location
                 )
         elif section == "doors":
             if absent := [key for key in ("name", "type") if value.get(key) is None]:
                 yield error_finding(f"a door needs {' and '.join(absent)}", main, where=item_location)
             elif value["type"] not in DOORS:
-                yield warning_finding(
-                    f"the generator has no door of the type {shown(value['type'])}", main, where=item_location
-                )
+                yield warning_finding(f"unsupported door type {shown(value['type'])}", main, where=item_location)
         elif section == "lanes" and value.get("graph_idx", 0) not in range(GRAPHS):
-            reason = f"only graphs 0 to {GRAPHS - 1} are generated; this lane is of {shown(value['graph_idx'])}"
+            reason = f"only graphs 0 to {GRAPHS - 1} are generated, not graph {shown(value['graph_idx'])}"
             yield warning_finding(reason, main, where=item_location)
 
 
 def _check_alignment(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[Problem]:
-    """Levels of drawings come to the reference level's place by two fiducials of the same names."""
+    """Check that each level with a drawing shares two fiducials with the reference level."""
 
     def marks(level: Any) -> set[str]:
         rows = level.get("fiducials") if isinstance(level, dict) else None
@@ -186,7 +184,7 @@ def _check_alignment(levels: Mapping[str, Any], reference: str, main: str) -> It
     for name, level in levels.items():
         common = marks(level) & marks(levels[reference])
         if name != reference and len(common) < 2:
-            reason = f"it shares {len(common)} fiducials with {reference}; two bring its drawing to the right place"
+            reason = f"it shares {len(common)} fiducials with {reference}; two are needed to align its drawing"
             yield warning_finding(reason, main, where=f"levels.{name}.fiducials")
 
 
@@ -202,15 +200,13 @@ def _check_coordinates(top: Mapping[str, Any], system: str, levels: Mapping[str,
             if value.get(key) is None:
                 yield error_finding(f"wgs84 needs the parameter {key}", main, where=f"parameters.{key}")
         if isinstance(crs, str) and EASTING_FIRST.fullmatch(crs):
-            reason = (
-                f"{crs} gives the easting first and the generator takes the northing first: x and y come out swapped"
-            )
+            reason = f"{crs} has easting first but the generator expects northing first; x and y are swapped"
             yield warning_finding(reason, main, where="parameters.generate_crs")
     if system == "web_mercator":
         origin = value.get("generate_origin_vertex", "origin")
         rows = [row for lv in levels.values() if isinstance(lv, dict) for row in lv.get("vertices") or ()]
         if not any(isinstance(row, list) and len(row) > 3 and row[3] == origin for row in rows):
-            reason = f"no vertex is called {shown(origin)}: the map keeps its origin at 0° N 0° E"
+            reason = f"no vertex is named {shown(origin)}; the map's origin stays at 0° N 0° E"
             yield warning_finding(reason, main, where="parameters.generate_origin_vertex")
 
 
@@ -223,7 +219,7 @@ def _lift(lift: Any, levels: Mapping[str, Any], main: str, location: str) -> Ite
     for key in ("reference_floor_name", "highest_floor", "lowest_floor"):
         floor = lift.get(key)
         if (floor or (key == "reference_floor_name" and floor is not None)) and floor not in levels:
-            yield error_finding(f"there is no level {shown(floor)}", main, where=f"{location}.{key}")
+            yield error_finding(f"unknown level {shown(floor)}", main, where=f"{location}.{key}")
     doors = lift.get("doors")
     for name, door in doors.items() if isinstance(doors, dict) else ():
         if absent := missing(door, DOOR):
@@ -231,7 +227,7 @@ def _lift(lift: Any, levels: Mapping[str, Any], main: str, location: str) -> Ite
     stops = lift.get("level_doors")
     for floor, listed in stops.items() if isinstance(stops, dict) else ():
         if floor not in levels:
-            yield error_finding(f"there is no level {shown(floor)}", main, where=f"{location}.level_doors")
+            yield error_finding(f"unknown level {shown(floor)}", main, where=f"{location}.level_doors")
         absent = [d for d in listed if d not in (doors or {})] if isinstance(listed, list) else []
         if absent:
             yield warning_finding(

@@ -1,4 +1,4 @@
-"""The words of buildings: what a file holds, and which of its lists are which objects."""
+"""Keys of building files, and the object kind of each of their lists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LINES: Mapping[str, str] = {
 }
 RINGS: Mapping[str, str] = {"floors": "floor", "holes": "hole"}
 LISTS = frozenset({*LINES, *RINGS, "lanes", "vertices", "models", "fiducials"})
-"""What a level says in lists of items; all else of it stays in the document."""
+"""Item lists of a level; its other keys stay in the document."""
 
 IN_PIXELS = frozenset(
     {
@@ -28,7 +28,7 @@ IN_PIXELS = frozenset(
         *("flattened_x_offset", "flattened_y_offset", "x_meters", "y_meters"),
     }
 )
-"""What a level's document says in pixels of its drawing."""
+"""Level keys with values in drawing pixels."""
 
 LIFT_WORDS = frozenset({"x", "y", "yaw", "width", "depth"})
 DOOR_TEMPLATE: Mapping[str, Any] = {
@@ -123,4 +123,4 @@ SHAPE = record(
     levels=record(each=_LEVEL),
     lifts=record(each=_LIFT),
 )
-"""What a building holds. Source: rmf_traffic_editor's files, and rmf_building_map_tools that reads them."""
+"""Schema of a building. Source: rmf_traffic_editor's files and their reader, rmf_building_map_tools."""

@@ -1,4 +1,4 @@
-"""Writing a building: its coordinates, levels and lifts."""
+"""Writing a building: coordinates, levels and lifts."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from app.syntax.decimals import DEGREES, METRES, encode_pieces, numbers
 
 
 class _RewriteError(Exception):
-    """The levels no longer agree on their coordinates: metres must be written. The text says why."""
+    """Signal that the levels' coordinates are inconsistent and metres must be written. The text is the reason."""
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``building.yaml`` and the images it names, in the coordinates it came in; networks of other formats in metres.
+    """Write ``building.yaml`` and its images, in its source coordinates; networks of other formats in metres.
 
-    Raises MissingLayer where there is neither a network nor anything that came from a building.
+    Raises MissingLayer if there is neither a network nor anything that came from a building.
     """
     storeys = common.storeys(layers)
     if not storeys:
@@ -63,18 +63,18 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 Sections = dict[str, list[str]]
-"""By name: a level's lists as they are written, in pieces of whole lines."""
+"""A level's lists by name, as pieces of complete output lines."""
 
 
 def _section_lines(rows: Iterable[str]) -> list[str]:
-    """Rows as lines of a section, thousands together: far fewer texts are held than there are rows."""
+    """Join rows to pieces of thousands of lines: far fewer strings in memory than rows."""
     left = iter(rows)
     pieces = iter(lambda: "".join(f"      - {row}\n" for row in islice(left, 4096)), "")
     return list(pieces)
 
 
 class _Vertices:
-    """The vertex list of a level being written: nodes first, then whatever corners the objects need."""
+    """Vertex list of a level being written: nodes first, then the corners of objects."""
 
     def __init__(self, rows: list[str], old: Mapping[int, int]) -> None:
         self.rows = rows
@@ -85,12 +85,12 @@ class _Vertices:
         return len(self.rows)
 
     def find_or_add(self, position: tuple[str, str], hint: Any) -> int:
-        """The vertex at this place (x and y as texts): the one it stood on, else any, else a new one."""
+        """Return the vertex at this position (x and y as texts): the hinted one, else any, else a new one."""
         start = f"[{position[0]}, {position[1]}, "
         old_row = self._old.get(hint) if isinstance(hint, int) else None
         if old_row is not None and self.rows[old_row].startswith(start):
             return old_row
-        if not self._by_place:  # most maps need it nowhere
+        if not self._by_place:  # built on first use: most maps never need it
             for k, row in enumerate(self.rows):
                 self._by_place.setdefault(", ".join(row.split(", ", 2)[:2]) + ", ", k)
         new_row = self._by_place.get(start)
@@ -101,7 +101,7 @@ class _Vertices:
 
 
 class _Writer:
-    """One building being written in one coordinate system."""
+    """Writer of one building in one coordinate system."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class _Writer:
         return Transform(values[0], values[1], (values[2], values[3]))
 
     def files(self) -> dict[str, bytes]:
-        """``building.yaml``, then the images."""
+        """Return ``building.yaml``, then the images."""
         levels = [piece for storey in self.storeys for piece in self._level(storey)]
         lifts = self._lifts()
         if self.system == IMAGE:
@@ -167,7 +167,7 @@ class _Writer:
         return top
 
     def _graph_name(self) -> Any:
-        """What navigation graphs call the building."""
+        """Return the building's name from its navigation graphs."""
         for storey in self.storeys:
             for part in storey.networks:
                 graphs = mapping(mapping(part.document.get(NAV_GRAPH), NAV_GRAPH).get("graphs"), "graphs")
@@ -177,7 +177,7 @@ class _Writer:
         return None
 
     def _served_levels(self, lift: str) -> dict[str, list[str]]:
-        """The levels with a node that a navigation graph puts into this lift, without doors."""
+        """Return the levels with a node in this lift according to navigation graphs, each without doors."""
         return {
             storey.name: []
             for storey in self.storeys
@@ -189,16 +189,15 @@ class _Writer:
         }
 
     def _check(self) -> None:
-        """Whether a reader of this file places the levels where they are."""
+        """Check that the file's measurements and fiducials reproduce the levels' transforms."""
         level_transforms = transforms(self.scaling, self.reference, lambda problem, location: None)
         for name, transform in self.transforms.items():
             if not transform.is_close(level_transforms[name]):
-                raise _RewriteError(f"measurements and fiducials no longer place level {name} where it is")
+                raise _RewriteError(f"measurements and fiducials no longer match the position of level {name}")
 
-    # places
-
+    # coordinates
     def _coordinates(self, part: Features, indices: NDArray[np.intp], storey: str) -> tuple[Array, NDArray[np.intp]]:
-        """The file's x and y of all coordinates of these items, and the item each belongs to."""
+        """Return the file's x and y of all coordinates of these items, and the item index of each."""
         geometry = part.geometry[indices]
         if (part.local[indices] == self.degrees).any():
             subset, frame = part.select(indices), self.layers.frame
@@ -213,17 +212,17 @@ class _Writer:
     # levels
 
     def _elevation(self, storey: Storey) -> Any:
-        """As the level says it, unless the environment knows better."""
+        """Return the elevation as in the source, unless the environment's differs."""
         source_elevation = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
         elevation = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
         return source_elevation if elevation is None or source_elevation == elevation else elevation
 
     def _level(self, storey: Storey) -> list[str]:
-        """The level's lines, in pieces."""
+        """Return the level's lines, in pieces."""
         members = dict(mapping(storey.document.get("level"), "level"))
         if self.converted:
             dropped_keys = sorted(key for key in members if key in IN_PIXELS and members[key])
-            self.dropped["what levels say in pixels of their drawing"] += len(dropped_keys)
+            self.dropped["level settings in pixels of their drawing"] += len(dropped_keys)
             members = {key: value for key, value in members.items() if key not in IN_PIXELS}
         members["elevation"] = self._elevation(storey)
         self._drawings(members, storey.name)
@@ -242,12 +241,12 @@ class _Writer:
         return out
 
     def _drawings(self, members: dict[str, Any], level: str) -> None:
-        """Take along the images that the level names, under names that stay below the building's folder."""
+        """Add the images that the level names, under paths below the building's directory."""
         for key, image in list(named_images(members)):
             name = find_stored_image(image, self.resources)
             if name is None:
                 if image:
-                    problem = f"the image {image[:200]!r} was not in the upload: it is named and not served"
+                    problem = f"the image {image[:200]!r} was not uploaded; the map names it but does not contain it"
                     self.context.warn(problem, where=f"levels.{level}.{key}.filename")
                 continue
             self.used[name] = self.resources[name]
@@ -259,7 +258,7 @@ class _Writer:
                     members[outer] = {**members[outer], "filename": name}
 
     def _nodes(self, storey: Storey) -> tuple[_Vertices, dict[str, int]]:
-        """The nodes as vertices in their old order, and each id's place among them."""
+        """Convert the nodes to vertices in source order, with each node id's vertex index."""
         elevation = float(self._elevation(storey))
         nodes: list[tuple[tuple[bool, int, int, str], str]] = []
         for part in storey.networks:
@@ -321,7 +320,7 @@ class _Writer:
     # lanes
 
     def _lanes(self, storey: Storey, ids: Mapping[str, int]) -> Iterator[str]:
-        """The edges as lanes: those of one lane, or opposite ones that say the same, as one two-way lane."""
+        """Write edges as lanes; the edges of one source lane, or matching opposite edges, form a two-way lane."""
         for _, lanes in groupby(self._edges(storey, ids), key=lambda lane: lane.was):
             waiting: dict[Any, list[Lane]] = {}
             out: list[Lane] = []
@@ -337,7 +336,7 @@ class _Writer:
                 yield lane.row(self.flow)
 
     def _edges(self, storey: Storey, ids: Mapping[str, int]) -> Iterator[Lane]:
-        """The level's edges, in the order of the lanes that they were."""
+        """Iterate over the level's edges in the order of their source lanes."""
         for _, p in sort_by_lane(storey.networks):
             source, target = ids.get(str(p.get("source"))), ids.get(str(p.get("target")))
             if p.get("kind") != "edge" or source is None or target is None:
@@ -356,13 +355,13 @@ class _Writer:
             yield Lane.from_edge(limit, source_members, source, target, self.flow)
 
     def _dangling(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
-        """Rows to vertices that did not exist come back where they still do not."""
+        """Write back rows to vertices that did not exist, if these still do not exist."""
         for section, rows in mapping(storey.document.get("dangling"), "dangling").items():
             for row in rows:
                 ends = row["vertices"] if isinstance(row, dict) else row[:2]
                 if section in RINGS or not all(0 <= v < len(vertices) for v in ends):
                     sections.setdefault(section, []).extend(_section_lines([self.flow(row)]))
-                    problem = f"{section} with vertices that do not exist: rmf_building_map_tools will refuse the file"
+                    problem = f"{section} with vertices that do not exist; rmf_building_map_tools will reject the file"
                     self.context.warn(problem, where=f"levels.{storey.name}.{section}")
                 else:
                     self.dropped[f"{section} to vertices that did not exist"] += 1
@@ -407,7 +406,7 @@ class _Writer:
                     rows_by_section.setdefault("fiducials", []).append((key, row))
                     scaling.fiducials.append((name, float(at[0][0]), -float(at[0][1])))
                 else:
-                    self.dropped["objects that are no part of a building"] += 1
+                    self.dropped["objects that a building cannot contain"] += 1
         for section, rows_of in rows_by_section.items():
             sections[section] = _section_lines(row for _, row in sorted(rows_of, key=lambda item: item[0]))
         self.scaling[storey.name] = scaling
@@ -464,7 +463,7 @@ class _Writer:
         return self.flow(members)
 
     def _lifts(self) -> str:
-        """The lifts of all levels, in the order of their file."""
+        """Write the lifts of all levels, in the order of their file."""
         lifts: list[tuple[tuple[bool, int, str], str, dict[str, Any]]] = []
         for storey in self.storeys:
             for part in storey.objects:
@@ -495,7 +494,7 @@ class _Writer:
         names = unique_ids(name for _, name, _ in lifts)
         if not lifts:
             return "lifts: {}\n"
-        # The first lift whose shaft holds a vertex is the vertex' lift, so their order is kept.
+        # Order matters: a vertex belongs to the first lift whose shaft contains it.
         rows = zip(names, lifts, strict=True)
         return "lifts:\n" + "".join(yaml.mapping({name: members}, 2) for name, (_, _, members) in rows)
 
@@ -504,11 +503,11 @@ class _Writer:
             text = "cartesian_meters is written instead of the source's coordinates"
             self.context.warn(f"{self.why}: {text}", file=FILE, where="coordinate_system")
         for text, count in sorted(self.dropped.items()):
-            self.context.drop(text, count, "a building in these coordinates has no place for it")
+            self.context.drop(text, count, "a building in these coordinates cannot store it")
         if self.created_ids["lanes"]:
             why = f"{self.created_ids['lanes']} edges come from another format"
             self.context.fill("lanes: graph_idx", self.options.graph, why, "graph")
-            limited = f"{why}, where they have none"
+            limited = f"{why}, if they have none"
             self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
             self.context.fill("lanes: orientation", LANE_TEMPLATE["orientation"][1], why)
         self.robots.report(self.context)
@@ -527,7 +526,7 @@ class _Writer:
 
 
 def _place(i: str, p: Properties) -> tuple[bool, int, str]:
-    """The order of items in their list: as in the file, then by id."""
+    """Return the sort key of items in their list: order of the file, then id."""
     at = get_source_properties(p, NAME).get("index", get_source_properties(p, NAV_GRAPH).get("index"))
     has_index = isinstance(at, int)
     return (not has_index, at if isinstance(at, int) else 0, i)

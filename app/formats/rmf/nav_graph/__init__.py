@@ -1,17 +1,17 @@
-"""0.yaml, 1.yaml …: the navigation graphs of Open-RMF's fleet adapters, one for each kind of robot.
+"""0.yaml, 1.yaml …: navigation graphs of Open-RMF's fleet adapters, one per kind of robot.
 
 ``{building_name, levels: {level: {vertices: [[x, y, {name, …}]], lanes: [[i, j, {…}]]}}, doors: {name: {endpoints,
-map}}, lifts: {name: {position: [x, y, yaw], dims: [width, depth]}}}`` in metres; lanes are directed. They are made from
-a building as ``building_map_generator nav`` does it: the vertices that lanes of the graph use, in order of first use; a
-two-way lane as two; ``door_name`` where a lane crosses a door, ``lift`` where a vertex lies in a lift's shaft,
+map}}, lifts: {name: {position: [x, y, yaw], dims: [width, depth]}}}`` in metres; lanes are directed. They are generated
+from a building as by ``building_map_generator nav``: the vertices that lanes of the graph use, in order of first use; a
+two-way lane as two; ``door_name`` if a lane crosses a door, ``lift`` if a vertex is inside a lift's shaft,
 ``orientation_constraint``, ``speed_limit``, ``mutex``, ``dock_name`` and ``undock_name``.
 
 Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, lift.py).
 
-Canonical: the graphs of a folder are one network for each level. A vertex that several graphs list alike is one node;
-``properties.rmf_nav_graph`` keeps its place in each graph (``graphs``) and its ``parameters``, an edge's ``graph``,
-``index`` and ``parameters``. Doors and lifts are objects. The document's ``rmf_nav_graph`` holds what each graph says
-at its top level.
+Canonical: the graphs of a directory are one network per level. A vertex that several graphs list identically is one
+node; ``properties.rmf_nav_graph`` holds its index in each graph (``graphs``) and its ``parameters``, an edge's
+``graph``, ``index`` and ``parameters``. Doors and lifts are objects. The document's ``rmf_nav_graph`` holds the top
+level of each graph.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ _OF_BUILDING = re.compile(
 
 
 def lacks(layers: Layers) -> str | None:
-    """A graph needs a lane."""
+    """Return the reason why there is no lane to write, or None."""
     some_edge = any(p.get("kind") == "edge" for part in layers.vector("topology").values() for p in part.properties)
     return None if some_edge else "the network has no edge: supply one with edges (building.yaml, tmap2, OSM …)"
 
 
 def detect(name: str, data: bytes) -> bool:
-    """YAML with a building's name and levels, and nothing that only a building.yaml has."""
+    """Detect YAML with a building's name and levels, without keys that only a building.yaml has."""
     if not name.lower().endswith((".yaml", ".yml")) or not _TOP.search(data):
         return False
     return bool(_LEVELS.search(data) and not _OF_BUILDING.search(data))
 
 
 def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
-    """The networks, and the doors and lifts that came from a building or from graphs."""
+    """Choose the networks, and the doors and lifts that came from a building or from graphs."""
     return [k for k in keys if k.layer == "topology" or (k.layer == "objects" and k.name in (NAME, BUILDING))]
 
 

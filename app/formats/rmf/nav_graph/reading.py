@@ -1,4 +1,4 @@
-"""Reading navigation graphs: the graphs of one folder as one network for each level."""
+"""Reading navigation graphs: the graphs of one directory as one network per level."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.syntax import yaml
 
 MAX_CACHED_PARAMETERS = 4096
-"""Different parameters of lanes, of which equal ones are kept once."""
+"""Maximum number of distinct lane parameters that are shared in memory."""
 
 
 @dataclass(slots=True)
 class _Level:
-    """A level as all graphs together tell it."""
+    """Level merged from all graphs."""
 
     nodes: dict[str, int] = field(default_factory=dict)
     at: list[tuple[float, float]] = field(default_factory=list)
@@ -46,7 +46,10 @@ class _Level:
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """All graphs as topology and objects by level; local metres. Raises UnreadableFile naming the place."""
+    """Read all graphs as topology and objects by level, in local metres.
+
+    Raises UnreadableFile with the location.
+    """
     graphs = _graphs(files, context)
     levels: dict[str, _Level] = {}
     tops: dict[str, Any] = {}
@@ -54,7 +57,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     lifts: dict[str, tuple[Any, list[int], int]] = {}
     for graph in graphs:
         _fields.check(graphs[graph], SHAPE, context)
-        top, graphs[graph] = graphs[graph], {}  # what was parsed is let go before the features are made
+        top, graphs[graph] = graphs[graph], {}  # free the parsed graph before features are built
         tops[str(graph)] = {key: value for key, value in top.items() if key not in ("levels", "doors", "lifts")}
         for name, members in mapping(top.get("levels"), "levels").items():
             _level(
@@ -66,7 +69,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not levels:
         raise_unreadable("a navigation graph needs at least one level", "levels")
     if context.level != GROUND:
-        context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
+        context.warn(f"the file names its own levels; level={context.level} is ignored", where="levels")
     for name, (members, inside, k) in doors.items():
         _door(levels, name, members, {"index": k, **_partly(inside, graphs)})
     for name, (members, inside, k) in lifts.items():
@@ -81,7 +84,7 @@ def read(files: Files, context: ReadContext) -> Layers:
             document["dangling"] = level.dangling
         network = _network(name, level, taken).with_document({NAME: document})
         parts[PartKey("topology", name, NETWORK)] = network
-        if not len(network):  # a level without a node is one of this format alone, and of no other
+        if not len(network):  # a level without nodes is of use to this format only
             parts[PartKey("topology", name, NAME)] = network
         if level.objects:
             parts[PartKey("objects", name, NAME)] = features(level.objects, "local", {NAME: document})
@@ -89,7 +92,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 
 def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
-    """The files by graph number: that of their name, else the next free one."""
+    """Return the files by graph number: the number in the file name, else the next free one."""
     out: dict[int, dict[str, Any]] = {}
     named = sorted(files, key=lambda name: (not _stem(name).isdigit(), len(_stem(name)), name))
     for name in named:
@@ -105,7 +108,7 @@ def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
             else next(k for k in range(10**6) if k not in out)
         )
         if graph_number is None:
-            context.warn(f"its name is no number: it is taken as graph {graph}")
+            context.warn(f"the file name is not a number; it is read as graph {graph}")
         out[graph] = top
     return out
 
@@ -119,7 +122,7 @@ def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str,
     places: list[int] = []
     for k, (row, (x, y)) in enumerate(zip(rows, common.places(rows, f"{location}.vertices").tolist(), strict=True)):
         parameters = mapping(row[2] if len(row) > 2 else None, f"{location}.vertices[{k}][2]")
-        # A graph may list twins; of other graphs each vertex is found again by what it says.
+        # A graph may list equal vertices; vertices of other graphs are matched by content.
         key = orjson.dumps((x, y, parameters, row[3:]), option=orjson.OPT_SORT_KEYS).decode()
         node_index = level.nodes.get(key)
         if node_index is None or str(graph) in level.nodes_say[node_index]["graphs"]:
@@ -140,7 +143,9 @@ def _level(level: _Level, graph: int, members: Mapping[str, Any], location: str,
         parameters = mapping(row[2] if len(row) > 2 else None, f"{at}[2]")
         if not (0 <= i < len(rows) and 0 <= j < len(rows)):
             level.dangling.setdefault(str(graph), []).append(row)
-            problem = f"joins the vertices {i} and {j}, but the level has {len(rows)}: it is kept in the document"
+            problem = (
+                f"joins the vertices {i} and {j}, but the level has {len(rows)}; it is stored in the document only"
+            )
             context.warn(problem, where=at)
             continue
         more = {"more": row[3:]} if len(row) > 3 else {}
@@ -162,14 +167,16 @@ def _collect(
     context: ReadContext,
     section: str,
 ) -> None:
-    """Doors or lifts of one graph, beside those of the graphs before it."""
+    """Add the doors or lifts of one graph to those of earlier graphs."""
     for name, one in members.items():
         if name not in entries:
             entries[name] = (one, [graph], len(entries))
             continue
         entries[name][1].append(graph)
         if entries[name][0] != one:
-            context.warn("differs from what an earlier graph says, which is kept", where=f"{section}.{name}")
+            context.warn(
+                "differs between graphs; the definition of the earlier graph is used", where=f"{section}.{name}"
+            )
 
 
 def _partly(inside: list[int], graphs: Mapping[int, Any]) -> dict[str, Any]:
@@ -243,7 +250,7 @@ def _network(name: str, level: _Level, taken: set[str]) -> Features:
 
 
 def lane_speed_limit(parameters: Mapping[str, Any]) -> float:
-    """Metres per second; 0 where there is no limit."""
+    """Return a lane's speed limit in m/s, 0 if there is none."""
     speed = parameters.get("speed_limit")
     valid = isinstance(speed, (int, float)) and not isinstance(speed, bool) and speed > 0
     return float(speed) if valid and speed is not None else 0.0

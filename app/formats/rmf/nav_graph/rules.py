@@ -1,7 +1,7 @@
-"""What Open-RMF's fleet adapters want of a navigation graph.
+"""Rules of Open-RMF's fleet adapters for navigation graphs.
 
-Source: open-rmf/rmf_ros2, rmf_fleet_adapter, agv/parse_graph.cpp (yaml-cpp: what is missing or of another type throws;
-a waypoint name that is taken throws).
+Source: open-rmf/rmf_ros2, rmf_fleet_adapter, agv/parse_graph.cpp (yaml-cpp throws if a member is missing or has another
+type, and if a waypoint name is a duplicate).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CONSTRAINTS = ("forward", "backward")
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """Each graph as a fleet adapter loads it."""
+    """Check each graph with the rules of a fleet adapter."""
     for name, data in files.items():
         if not name.lower().endswith((".yaml", ".yml")):
             continue
@@ -48,7 +48,7 @@ def _graph(top: Any, main: str) -> Iterator[Problem]:
         yield error_finding("a graph needs a mapping of levels", main, where="levels")
         return
     if top.get("building_name") is None:
-        yield warning_finding("a graph says its building", main, where="building_name")
+        yield warning_finding("a graph should name its building", main, where="building_name")
     called: list[str] = []
     lifts = top.get("lifts")
     for level, members in levels.items():
@@ -66,13 +66,11 @@ def _graph(top: Any, main: str) -> Iterator[Problem]:
                 called.append(row[2]["name"])
             lift = row[2].get("lift")
             if lift and isinstance(lifts, dict) and lift not in lifts:
-                yield warning_finding(f"the graph tells of no lift {shown(lift)}", main, where=location)
+                yield warning_finding(f"unknown lift {shown(lift)}", main, where=location)
         for k, row in enumerate(lanes):
             yield from _lane(row, len(vertices), main, f"levels.{level}.lanes[{k}]")
     if repeats := duplicates(called):
-        yield error_finding(
-            f"{len(repeats)} names are given to several waypoints: {names(repeats)}", main, where="levels"
-        )
+        yield error_finding(f"{len(repeats)} duplicate waypoint names: {names(repeats)}", main, where="levels")
     yield from _things(top, main)
 
 
@@ -83,14 +81,14 @@ def _lane(row: Any, count: int, main: str, location: str) -> Iterator[Problem]:
         return
     options = row[2] if len(row) > 2 else None
     if not isinstance(options, dict):
-        yield error_finding("a lane has a mapping of its options, {} where there are none", main, where=location)
+        yield error_finding("a lane needs a mapping of options: write {} if there are none", main, where=location)
         return
     if options.get("orientation_constraint", CONSTRAINTS[0]) not in CONSTRAINTS:
-        reason = f"must be forward or backward, is {shown(options['orientation_constraint'])}"
+        reason = f"must be forward or backward, not {shown(options['orientation_constraint'])}"
         yield error_finding(reason, main, where=f"{location}.orientation_constraint")
     if not is_number(options.get("speed_limit", 0.0)):
         yield error_finding(
-            f"must be a number, is {shown(options['speed_limit'])}", main, where=f"{location}.speed_limit"
+            f"must be a number, not {shown(options['speed_limit'])}", main, where=f"{location}.speed_limit"
         )
 
 
@@ -98,7 +96,7 @@ def _things(top: dict[str, Any], main: str) -> Iterator[Problem]:
     for section, keys in (("doors", ("endpoints", "map")), ("lifts", ("position", "dims"))):
         items = top.get(section)
         if items is not None and not isinstance(items, dict):
-            yield error_finding(f"must be a mapping, is {shown(items)}", main, where=section)
+            yield error_finding(f"must be a mapping, not {shown(items)}", main, where=section)
             continue
         for name, one in (items or {}).items():
             if absent := missing(one, keys):

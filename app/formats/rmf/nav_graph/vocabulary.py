@@ -1,4 +1,4 @@
-"""The words of navigation graphs: what a file holds."""
+"""Keys of navigation graph files."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ SHAPE = record(
     doors=record(each=record("map", endpoints=[[COORDINATE]])),
     lifts=record(each=record(position=(COORDINATE, COORDINATE, ANGLE), dims=[WIDTH])),
 )
-"""What a graph holds. Source: rmf_building_map_tools (building_map/generate_nav), rmf_fleet_adapter's parse_graph."""
+"""Schema of a graph. Source: rmf_building_map_tools (building_map/generate_nav), rmf_fleet_adapter's parse_graph."""

@@ -1,4 +1,4 @@
-"""Writing navigation graphs, as rmf_building_map_tools makes them of a building."""
+"""Writing navigation graphs, as rmf_building_map_tools generates them from a building."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from app.syntax import yaml
 from app.syntax.decimals import METRES, numbers
 
 SHAFT_GAP = 0.05
-"""Metres between a lift's cabin and its shaft on each side; a vertex in the shaft belongs to the lift."""
+"""Metres between a lift's cabin and its shaft on each side; a vertex inside the shaft belongs to the lift."""
 
 PARALLEL = 0.01
-"""rmf_building_map_tools takes a lane and a door for parallel where the determinant of their directions is smaller, in
-the units of the building's file."""
+"""Determinant of directions below which rmf_building_map_tools regards a lane and a door as parallel, in units of the
+building's file."""
 
 LINES_PER_WRITE = 10_000
-"""Lines that are turned into bytes at once."""
+"""Number of lines encoded at once."""
 
 LANE_WORDS = ("mutex", "demo_mock_floor_name", "demo_mock_lift_name")
-"""A building's lane parameters that a graph takes over as they are, where they are not empty."""
+"""Lane parameters of a building that a graph copies unless they are empty."""
 
 
 @dataclass(slots=True)
@@ -51,7 +51,7 @@ class _Door:
 
 @dataclass(slots=True)
 class _Lift:
-    """corners: float64 [4, 2] of the shaft; levels: those that it serves."""
+    """Lift of a graph. corners: float64 [4, 2] of the shaft; levels: the levels that it serves."""
 
     name: str
     position: tuple[float, float, float]
@@ -72,7 +72,7 @@ class _Edge:
 
     @property
     def order(self) -> tuple[bool, int, bool, int, str]:
-        """Its place among the lanes of its file; edges that come from none follow by id."""
+        """Return the sort key: order of the lanes in their file; other edges follow by id."""
         source_members = get_source_properties(self.p, NAME) or get_source_properties(self.p, BUILDING)
         was = source_members.get("index")
         has_index = isinstance(was, int)
@@ -87,7 +87,7 @@ class _Edge:
 
 @dataclass(slots=True)
 class _LevelWriter:
-    """A level being written. at: float64 [n, 2] metres of its nodes; edges by graph."""
+    """Level being written. at: float64 [n, 2], positions of its nodes in metres; edges by graph."""
 
     name: str
     ids: list[str]
@@ -100,12 +100,12 @@ class _LevelWriter:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """One file for each graph that has lanes, ``0.yaml`` first. Raises MissingLayer where none has."""
+    """Write one file per graph that has lanes, ``0.yaml`` first. Raises MissingLayer if none has."""
     return _Writer(layers, context).files()
 
 
 class _Writer:
-    """All graphs of an environment."""
+    """Writer of all graphs of an environment."""
 
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.layers, self.context = layers, context
@@ -120,7 +120,7 @@ class _Writer:
         self.new_lanes = 0
 
     def _documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What a building says at its top level, and what each graph does."""
+        """Return the top-level members of the building, and those of each graph."""
         building: dict[str, Any] = {}
         tops: dict[str, Any] = {}
         for part in [*self.layers.vector("topology").values(), *self.layers.vector("objects").values()]:
@@ -133,11 +133,11 @@ class _Writer:
         return building, tops
 
     def files(self) -> dict[str, bytes]:
-        """The graphs by file name."""
+        """Return the graphs by file name."""
         graphs = sorted({g for s in self.storeys for g in s.edges} | {int(g) for g in self.tops if g.isdecimal()})
         if not graphs:
             raise MissingLayer(
-                "rmf_nav_graph needs lanes, and no node has an edge: supply a network (building.yaml, tmap2, OSM …)"
+                "rmf_nav_graph needs lanes, but no network has edges: supply one (building.yaml, tmap2, OSM …)"
             )
         out = {f"{graph}.yaml": self._graph(graph) for graph in graphs}
         self._count_dropped()
@@ -145,15 +145,15 @@ class _Writer:
             why = f"{self.new_lanes} edges come from another format"
             self.context.fill("lanes: graph", self.options.graph, why, "graph")
             if self.options.speed_limit:
-                limited = f"{why}, where they have none"
+                limited = f"{why}, if they have none"
                 self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
         self.robots.report(self.context)
         for item, count in sorted(self.lost.items()):
-            self.context.drop(item, count, "a navigation graph has no place for it")
+            self.context.drop(item, count, "a navigation graph cannot store it")
         if self.building.get("coordinate_system") in ("wgs84", "web_mercator"):
             self.context.warn(
-                "the building is drawn on earth: its graphs are in metres of the environment's local frame, not in the "
-                "coordinates of generate_crs",
+                "the building has geographic coordinates; its graphs are in metres of the environment's local frame, "
+                "not in the coordinates of generate_crs",
                 where="coordinate_system",
             )
         return out
@@ -168,12 +168,12 @@ class _Writer:
         for key, part in self.layers.vector("objects").items():
             if key.name in (BUILDING, NAME):
                 count = sum(p.get("kind") not in ("door", "lift") for p in part.properties)
-                self.lost["objects that are neither door nor lift"] += count
+                self.lost["objects that are neither doors nor lifts"] += count
 
-    # what is there
+    # inputs
 
     def _items(self, kind: str) -> Iterable[tuple[str, str, Properties, Any, Mapping[str, Any]]]:
-        """(level, id, properties, geometry in metres, document) of the doors or lifts, in their files' order."""
+        """Iterate over (level, id, properties, geometry in metres, document) of doors or lifts, in file order."""
         for key, part in self.layers.vector("objects").items():
             if key.name not in (BUILDING, NAME):
                 continue
@@ -190,7 +190,7 @@ class _Writer:
         for level, i, p, g, _ in self._items("door"):
             name = str(p.get("name") or i)
             if int(shapely.get_type_id(g)) != 1 or g.is_empty or name in names:
-                self.lost["doors without two ends, or of a name that another one has"] += 1
+                self.lost["doors without two ends or with a duplicate name"] += 1
                 continue
             names.add(name)
             source_members = get_source_properties(p, NAME)
@@ -204,7 +204,7 @@ class _Writer:
         for _, i, p, g, _ in self._items("lift"):
             name = str(p.get("name") or i)
             if int(shapely.get_type_id(g)) != 0 or g.is_empty or name in names:
-                self.lost["lifts without a point, or of a name that another one has"] += 1
+                self.lost["lifts without a point or with a duplicate name"] += 1
                 continue
             names.add(name)
             lift_members = mapping(get_source_properties(p, BUILDING).get("says"), "says")
@@ -222,7 +222,7 @@ class _Writer:
         return [lift for _, _, lift in lifts]
 
     def _served_levels(self, lift_members: Mapping[str, Any]) -> frozenset[str]:
-        """The levels between a lift's lowest and highest floor; none where it has no door on any."""
+        """Return the levels between a lift's lowest and highest floor; none if it has no door on any."""
         if not lift_members.get("level_doors"):
             return frozenset()
         elevations = {level.name: level.elevation for level in self.layers.levels}
@@ -261,7 +261,7 @@ class _Writer:
         return out
 
     def _inside(self, storey: _LevelWriter) -> list[str | None]:
-        """The first lift whose shaft each node lies in."""
+        """Return for each node the first lift whose shaft contains it."""
         out: list[str | None] = [None] * len(storey.ids)
         for lift in reversed(self.lifts):
             if storey.name in lift.levels:
@@ -274,7 +274,7 @@ class _Writer:
         return out
 
     def _edges(self, networks: Sequence[Features], places: Mapping[str, int]) -> dict[int, list[_Edge]]:
-        """The edges of a level by graph, in the order of their lanes."""
+        """Group the edges of a level by graph, in the order of their lanes."""
         out: dict[int, list[_Edge]] = {}
         for part in networks:
             for i, p in zip(part.ids, part.properties, strict=True):
@@ -285,7 +285,7 @@ class _Writer:
                 if p.get("kind") != "edge" or source is None or target is None:
                     self.lost["edges without two nodes on their level"] += 1
                 elif graph is None:
-                    self.lost[f"lanes of graphs that are not 0 to {MAX_GRAPHS - 1}"] += 1
+                    self.lost[f"lanes of graphs outside 0 to {MAX_GRAPHS - 1}"] += 1
                 else:
                     self.lost["edges' actions"] += p.get("action") is not None
                     self.lost["edges' widths"] += p.get("width") is not None
@@ -325,7 +325,7 @@ class _Writer:
         }
         before = {**{k: v for k, v in top.items() if k < "levels"}, "doors": doors}
         after = {**{k: v for k, v in top.items() if k > "levels"}, "lifts": lifts}
-        out = BytesIO()  # as bytes the rows take a third of their memory
+        out = BytesIO()  # rows as bytes use a third of the memory
         out.write(f"{yaml.mapping(before, 0)}levels:\n".encode())
         names: Counter[str] = Counter()
         for storey in self.storeys:
@@ -336,12 +336,12 @@ class _Writer:
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
             listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
-            problem = f"{len(twice)} names stand for several vertices, which fleet adapters refuse: {listed}"
+            problem = f"{len(twice)} duplicate vertex names: {listed}; fleet adapters reject them"
             self.context.warn(problem, file=f"{graph}.yaml", where="levels")
         return out.getvalue()
 
     def _level(self, storey: _LevelWriter, graph: int, names: Counter[str]) -> Iterator[str]:
-        """The lines of a level in a graph; names: how often vertices have each."""
+        """Iterate over the lines of a level in a graph. names: number of vertices per name."""
         edges = storey.edges.get(graph, [])
         graphs = [get_source_properties(p, NAME).get("graphs") for p in storey.nodes]
         listed = [members.get(str(graph)) if isinstance(members, dict) else None for members in graphs]
@@ -370,20 +370,20 @@ class _Writer:
         blocked = {(e.source, e.target) for e in edges if e.p.get("blocked") is True}
         for n, e in enumerate(edges):
             if get_source_properties(e.p, NAME).get("reverse") is True and e.paired:
-                continue  # it is told by the lane that says is_bidirectional
+                continue  # covered by the lane with is_bidirectional
             more = "".join(f", {self.flow(v)}" for v in get_source_properties(e.p, NAME).get("more") or ())
             options = self._lane(storey, e, crossed[n])
             if e.p.get("blocked") is True or (
                 options.get("is_bidirectional") is True and (e.target, e.source) in blocked
             ):
-                options["blocked"] = True  # a lane counts as one, whichever direction is closed
+                options["blocked"] = True  # a two-way lane is one lane: a closed direction blocks it
             yield f"      - [{new_index[e.source]}, {new_index[e.target]}, {self.flow(options)}{more}]\n"
         for row in mapping(storey.document.get("dangling"), "dangling").get(str(graph), ()):
             if all(0 <= v < len(new_index) for v in row[:2]):
                 self.lost["lanes to vertices that did not exist"] += 1
             else:
                 yield f"      - {self.flow(row)}\n"
-                problem = "a lane joins vertices that do not exist: fleet adapters will refuse the graph"
+                problem = "a lane joins vertices that do not exist; fleet adapters will reject the graph"
                 self.context.warn(problem, file=f"{graph}.yaml", where=f"levels.{storey.name}.lanes")
 
     def _vertex(self, storey: _LevelWriter, k: int) -> dict[str, Any]:
@@ -441,7 +441,7 @@ class _Writer:
         return options
 
     def _crossed_doors(self, storey: _LevelWriter, edges: Sequence[_Edge]) -> list[str | None]:
-        """The door that each edge leads through; of several the last."""
+        """Return for each edge the door that it crosses, the last one if there are several."""
         out: list[str | None] = [None] * len(edges)
         doors = [d for d in self.doors if d.level == storey.name]
         if not edges or not doors:
@@ -457,7 +457,7 @@ class _Writer:
 
 
 def _section(key: str, rows: Iterator[str]) -> Iterator[str]:
-    """A list of rows under a level's key."""
+    """Format a list of rows under a level's key."""
     first = next(rows, None)
     if first is None:
         yield f"    {key}: []\n"
@@ -467,7 +467,10 @@ def _section(key: str, rows: Iterator[str]) -> Iterator[str]:
 
 
 def _find_pairs(edges: Sequence[_Edge], nodes: int) -> list[bool]:
-    """Whether each edge's lane has an edge the other way round. nodes: no number of a node is as high."""
+    """Check for each edge whether its lane has the opposite edge, too.
+
+    nodes: number of nodes, above every node index.
+    """
     ends = np.array([(e.source, e.target) for e in edges], np.int64).reshape(-1, 2)
     lanes: dict[int | None, int] = {}
     lane = np.array([lanes.setdefault(_lane_number(e.p), len(lanes)) for e in edges], np.int64)
@@ -479,7 +482,7 @@ def _find_pairs(edges: Sequence[_Edge], nodes: int) -> list[bool]:
 
 
 def _meet(a: Array, b: Array, door: Array, parallel: float) -> NDArray[np.bool_]:
-    """Which of the segments a-b [n, 2] meet the door [2, 2], ends included; parallel ones do not."""
+    """Mark the segments a-b [n, 2] that intersect the door [2, 2], ends included; parallel ones do not."""
     c, d = door
     u, v = a - b, c - d
     det = u[:, 0] * v[1] - u[:, 1] * v[0]
@@ -492,7 +495,7 @@ def _meet(a: Array, b: Array, door: Array, parallel: float) -> NDArray[np.bool_]
 
 
 def _shaft(position: tuple[float, float, float], dims: tuple[float, float]) -> Array:
-    """The corners of a lift's shaft, float64 [4, 2]."""
+    """Compute the corners of a lift's shaft as float64 [4, 2]."""
     x, y, yaw = position
     w, d = dims[0] / 2 + SHAFT_GAP, dims[1] / 2 + SHAFT_GAP
     across = np.array([math.cos(yaw), math.sin(yaw)]) * w
@@ -507,7 +510,7 @@ def _place(p: Properties) -> int:
 
 
 def _edge_graph(p: Properties) -> int | None:
-    """The graph of an edge; None for a lane of a building that is in none."""
+    """Return the graph of an edge, or None for a building's lane outside all graphs."""
     if NAME in p:
         graph = get_source_properties(p, NAME).get("graph")
         return graph if isinstance(graph, int) and graph >= 0 else 0
@@ -518,7 +521,7 @@ def _edge_graph(p: Properties) -> int | None:
 
 
 def _lane_number(p: Properties) -> int | None:
-    """The number of the lane in its file: what two edges of one two-way lane have in common."""
+    """Return the lane's index in its file, which both edges of a two-way lane share."""
     source_members = get_source_properties(p, NAME) if NAME in p else get_source_properties(p, BUILDING)
     if NAME in p:
         parameters = source_members.get("parameters")

@@ -1,15 +1,15 @@
-"""map.site.json, map.site.ron: the sites of Open-RMF's site editor, which takes the place of traffic editor's building.
+"""map.site.json, map.site.ron: sites of the Open-RMF site editor, the successor of the traffic editor's buildings.
 
-A site has levels with anchors (places in metres), and walls, doors, floors and drawings on them; lifts, whose cabins
-have anchors of their own; models; and, for all levels together, the navigation graphs with lanes and locations.
-Releases of the editor up to 2024 wrote RON, later ones write JSON; both are read, and members that only the older
-ones have. ``geographic_offset`` is the latitude and longitude of (0, 0), whose +y axis the editor takes as UTM's north.
+A site has levels with anchors (positions in metres), and walls, doors, floors and drawings on them; lifts, whose cabins
+have their own anchors; models; and, shared by all levels, the navigation graphs with lanes and locations. Releases of
+the editor up to 2024 wrote RON, later ones write JSON; both are read, including members that only the older ones have.
+``geographic_offset`` is the latitude and longitude of (0, 0); the editor treats the +y axis as UTM north.
 
-Canonical: as a building (``openrmf``), in its words, so that either format is written from the other, and
-navigation graphs from both. An anchor is a node unless only walls, doors or floors stand on it, called by its location,
-else ``<level>/<id>``; an anchor in a lift's cabin is a node on each level from which a lane leads to it. A lane is an
-edge there and, unless its reverse is disabled, one back. What only a site says of an item stands in its
-``properties.rmf_site``, of a level and of the site in the documents' ``rmf_site``: ``{site, level, order}``.
+Canonical: as a building (``openrmf``), with its keys, so that either format can be written from the other, and
+navigation graphs from both. An anchor is a node unless only walls, doors or floors use it; its id is the name of its
+location, else ``<level>/<id>``. An anchor in a lift's cabin is a node on each level from which a lane leads to it. A
+lane is an edge there and, unless its reverse is disabled, an edge back. Data of an item that only a site has is in its
+``properties.rmf_site``, such data of a level and of the site in the documents' ``rmf_site``: ``{site, level, order}``.
 
 Source: open-rmf/rmf_site, crates/rmf_site_format; crates/rmf_site_editor/src/site (lift.rs, georeference.rs, save.rs).
 """
@@ -33,7 +33,7 @@ _OF_SITE = re.compile(rb'[\s,{("](?:levels|navigation|geographic_offset|model_in
 
 
 def detect(name: str, data: bytes) -> bool:
-    """JSON or RON with a format's version and what only a site has."""
+    """Detect JSON or RON with a format version and members that only a site has."""
     low = name.lower()
     if low.endswith(".json"):
         return bool(_JSON_SITE.search(data) and _OF_SITE.search(data))
@@ -41,7 +41,7 @@ def detect(name: str, data: bytes) -> bool:
 
 
 def options_from_filename(name: str) -> dict[str, str]:
-    """``map.site.ron`` asks for RON."""
+    """Select RON for ``map.site.ron``."""
     return {"encoding": "ron" if name.endswith(".ron") else "json"} if name.endswith((".ron", ".json")) else {}
 
 

@@ -1,4 +1,4 @@
-"""A site being written: its elements by id, which ids are taken, and the levels and lifts so far."""
+"""Site being written: elements by id, ids in use, and the levels and lifts so far."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ from app.parameters import parameter
 
 @dataclass(frozen=True, slots=True)
 class WriteOptions(common.WriteOptions):
-    """What a site says where no source does, and how it is written."""
+    """Values of a site that no source specifies, and its encoding."""
 
-    encoding: Literal["json", "ron"] = parameter("json", "json, or ron as older releases of the editor read it")
+    encoding: Literal["json", "ron"] = parameter(
+        "json", "encoding of the file: json, or ron for older releases of the editor"
+    )
 
 
 @dataclass(slots=True)
 class Floor:
-    """A level being written. element: what is written of it; by_place: anchors of nodes and corners by place."""
+    """Level being written. element: its output so far; by_place: anchors of nodes and corners by position."""
 
     storey: Storey
     id: str
@@ -42,14 +44,17 @@ class Floor:
 
     @property
     def anchors(self) -> dict[str, Any]:
-        """The level's anchors by id, as they are written."""
+        """Return the level's anchors by id, as written."""
         anchors: dict[str, Any] = self.element["anchors"]
         return anchors
 
 
 @dataclass(slots=True)
 class Lift:
-    """A lift being written. anchors: of its cabin by id; by_place: those that are nodes, by their place and name."""
+    """Lift being written.
+
+    anchors: anchors of its cabin by id; by_place: those that are nodes, by position and name.
+    """
 
     cabin: Cabin
     element: dict[str, Any]
@@ -58,12 +63,12 @@ class Lift:
 
 
 def sorted_json(value: Any) -> bytes:
-    """A text that equal values share."""
+    """Serialise a value as JSON with sorted keys: equal values give equal bytes."""
     return orjson.dumps(value, option=orjson.OPT_SORT_KEYS)
 
 
 class Draft:
-    """The site being written: what is written of it so far, and the ids that are taken."""
+    """Site being written: its output so far, and the ids in use."""
 
     def __init__(self, layers: Layers, context: WriteContext, storeys: Sequence[Storey]) -> None:
         self.layers, self.context = layers, context
@@ -79,7 +84,7 @@ class Draft:
         first = next((d for d in documents if isinstance(d.get("site"), dict)), {})
         self.site: dict[str, Any] = first.get("site", {})
         if any(d.get("of") != first.get("of") for d in documents if d):
-            context.warn("the levels come from different sites: what belongs to all of a site is the first one's")
+            context.warn("the levels come from different sites; members of the whole site are taken from the first one")
         documents = [d if first and d.get("of") == first.get("of") else {} for d in documents]
         self.same = {s.name for s, d in zip(storeys, documents, strict=True) if d}
         self.mentioned = _ids(documents, storeys, self.same)
@@ -109,7 +114,7 @@ class Draft:
         self.docks: dict[tuple[str, str], str] = {}
 
     def claim(self, hint: Any = None) -> str:
-        """The wanted id where no other element has it, else a new one."""
+        """Reserve the wanted id if it is free, else a new one."""
         key = str(hint)
         if isinstance(hint, int) and not isinstance(hint, bool) and 0 <= hint < 2**32 and key not in self.claimed:
             self.claimed.add(key)
@@ -120,7 +125,7 @@ class Draft:
         return key
 
     def source_members(self, floor: Floor, p: Properties) -> dict[str, Any]:
-        """What the site says of an item; nothing where it is of another site."""
+        """Return the site's source members of an item; none if it comes from another site."""
         return get_source_properties(p, NAME) if floor.storey.name in self.same else {}
 
     def _floor(self, storey: Storey, document: dict[str, Any]) -> Floor:
@@ -141,22 +146,22 @@ class Draft:
         return floor
 
     def coordinates(self, part: Features) -> np.ndarray[Any, np.dtype[np.object_]]:
-        """The part's geometry in metres of the local frame."""
+        """Return the part's geometry in metres of the local frame."""
         return part.in_local(self.layers.frame)
 
     def mutex(self, name: str) -> str:
-        """The id of the mutex group of this name; a new one where there is none."""
+        """Return the id of the mutex group with this name, creating it if missing."""
         return self.group_named(self.mutexes, self.mutex_ids, name)
 
     def group_named(self, groups: dict[str, Any], ids: dict[str, str], name: str) -> str:
-        """The group of this name; a new one where there is none."""
+        """Return the id of the group with this name, creating it if missing."""
         if name not in ids:
             ids[name] = self.claim()
             groups[ids[name]] = {"name": name}
         return ids[name]
 
     def items(self, floor: Floor) -> Iterator[tuple[str, Properties, Any, str]]:
-        """(kind, properties, geometry in metres, id) of the level's objects in the order of their source."""
+        """Iterate over (kind, properties, geometry in metres, id) of the level's objects in source order."""
         for part in floor.storey.objects:
             geometry = self.coordinates(part)
 
@@ -177,17 +182,17 @@ class Draft:
 
 
 def _ids_by_name(groups: Mapping[str, Any]) -> dict[str, str]:
-    """The id of the first group of each name."""
+    """Map each name to the id of the first group with this name."""
     return {str(group.get("name")): i for i, group in reversed(list(groups.items()))}
 
 
 def spot_of(at: Sequence[float]) -> tuple[float, float]:
-    """[x, y] in metres as a key: positions that are written alike share it."""
+    """Convert [x, y] in metres to a key: positions that are written alike share it."""
     return metres(at[0]), metres(at[1])
 
 
 def _document(storey: Storey) -> dict[str, Any]:
-    """What the level's parts say as parts of a site."""
+    """Return the site data of the level's collection documents."""
     documents = (part.document.get(NAME) for part in (*storey.objects, *storey.networks))
     return next((document for document in documents if isinstance(document, dict)), {})
 
@@ -201,7 +206,7 @@ def _iterate_nodes(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Proper
 
 
 def element_ids(value: Any) -> set[str]:
-    """The ids of the elements in mappings, wherever they stand; a scenario's are those of models elsewhere."""
+    """Collect the element ids in all nested mappings, except instances of scenarios, whose keys are model ids."""
     if not isinstance(value, dict):
         return set()
     ids = {k for k in value if k.isascii() and k.isdigit()}
@@ -209,7 +214,7 @@ def element_ids(value: Any) -> set[str]:
 
 
 def _ids(documents: Iterable[Mapping[str, Any]], storeys: Iterable[Storey], same: set[str]) -> set[str]:
-    """All ids that the site's items and documents had, so that no new element takes one of them."""
+    """Collect all source ids of the site's items and documents, so that no new element gets one of them."""
     out: set[str] = set()
     for document in documents:
         out |= element_ids(document)

@@ -17,13 +17,13 @@ from app.model.features import Properties
 
 
 class LiftWriter:
-    """Lifts, and the doors of their cabins."""
+    """Writer of lifts and the doors of their cabins."""
 
     def __init__(self, draft: Draft) -> None:
         self.draft = draft
 
     def write(self) -> None:
-        """The lifts of all levels, in the order of their file."""
+        """Write the lifts of all levels, in the order of their file."""
         lifts = []
         for floor in self.draft.floors:
             for kind, p, geometry, i in self.draft.items(floor):
@@ -78,7 +78,7 @@ class LiftWriter:
     def _cabin_doors(
         self, rect: dict[str, Any], anchors: dict[str, Any], building: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """A building's lift doors; each becomes a placement in ``rect`` with two anchors in the cabin."""
+        """Write a building's lift doors; each becomes a placement in ``rect`` with two anchors in the cabin."""
         out: dict[str, Any] = {}
         served = mapping(building.get("level_doors"), "level_doors")
         for name, door in mapping(building.get("doors"), "doors").items():

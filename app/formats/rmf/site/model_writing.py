@@ -17,13 +17,13 @@ from app.model.features import Properties
 
 
 class ModelWriter:
-    """Models, robots and the scenarios that they are in."""
+    """Writer of models, robots and the scenarios that contain them."""
 
     def __init__(self, draft: Draft) -> None:
         self.draft = draft
 
     def write_model(self, floor: Floor, kind: str, p: Properties, geometry: Any, members: Mapping[str, Any]) -> None:
-        """A model or robot that is an object."""
+        """Write an object that is a model or robot."""
         element = mapping(members.get("says"), "model")
         building = mapping(get_source_properties(p, BUILDING).get("says"), "model")
         pose = common.object_pose(p) or [0.0, 0.0, floor.elevation, 0.0, 0.0, float(building.get("yaw") or 0.0)]
@@ -45,7 +45,7 @@ class ModelWriter:
         static: bool,
         kind: str,
     ) -> None:
-        """A model in its place, and its description where the site has none."""
+        """Write a model instance, and its description if the site has none."""
         description = str(element.get("description"))
         if description not in self.draft.descriptions:
             source = element.get("source", {"Search": model})
@@ -58,7 +58,7 @@ class ModelWriter:
             **{k: v for k, v in element.items() if k not in older},
             **{"parent": int(floor.id), "name": name, "pose": pose, "description": int(description)},
         }
-        if not element or "source" in element:  # older releases have no scenarios, later ones hide what none includes
+        if not element or "source" in element:  # old releases have no scenarios, new ones hide models in none
             self.draft.fresh.append(i)
         elif pose != element.get("pose"):
             self.draft.moved[i] = (element.get("pose"), pose)
@@ -78,7 +78,7 @@ class ModelWriter:
     def write_robot(
         self, floor: Floor, parameters: Mapping[str, Any], members: Mapping[str, Any], xyz: Sequence[float]
     ) -> None:
-        """The robot that starts at a node."""
+        """Write the robot that starts at a node."""
         name, model = parameters.get(common.ROBOT), parameters.get(common.ROBOT_TYPE)
         if not name or not model:
             self.draft.dropped["robots without a name or a type"] += bool(name or model)
@@ -93,7 +93,7 @@ class ModelWriter:
         self._instance(floor, str(name), now, element, robot.get("id") if element else None, str(model), False, "robot")
 
     def scenarios(self, instances: Mapping[str, Any]) -> dict[str, Any]:
-        """The scenarios without the models that are gone, with those that are new in each that starts anew."""
+        """Return the scenarios without deleted models; new models are added to each root scenario."""
         out: dict[str, Any] = dict(mapping(self.draft.site.get("scenarios"), "scenarios"))
         removed_ids = {str(i) for i in self.draft.site.get("models") or ()} - instances.keys()
         if self.draft.fresh and not out:

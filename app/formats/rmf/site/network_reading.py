@@ -26,17 +26,17 @@ _TAGS: Mapping[str, str] = {
 _ORIENTATIONS: Mapping[str, str] = {"Forwards": "forward", "Backwards": "backward"}
 
 SAME_PLACE = 1e-3
-"""Metres between a robot and the location that it starts at."""
+"""Maximum distance between a robot and its start location, in metres."""
 
 
 class NetworkReader:
-    """The networks of a site's levels: anchors, locations and lanes."""
+    """Reader of the networks of a site's levels: anchors, locations and lanes."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
 
     def read(self, taken: set[str]) -> dict[str, Features]:
-        """The network of each level by the level's id; ids of its items are added to those taken."""
+        """Return the network of each level by level id; adds the ids of its items to ``taken``."""
         locations = self._locations()
         self._name_nodes(locations, taken)
         rows: dict[str, list[tuple[str, Any, Properties]]] = {i: [] for i in self.source.levels}
@@ -64,7 +64,7 @@ class NetworkReader:
         return out
 
     def _node_place(self, level: SourceLevel, anchor: str) -> list[float]:
-        """[x, y, height above the level] of a node."""
+        """Return [x, y, height above the level] of a node."""
         if anchor in level.anchors:
             return level.anchors[anchor]
         lift = self.source.cabins[anchor]
@@ -72,7 +72,7 @@ class NetworkReader:
         return [*lift.cabin.outward(place(raw, "General", f"lifts.{lift.id}.cabin_anchors.{anchor}")), 0.0]
 
     def _locations(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
-        """The locations by anchor."""
+        """Group the locations by anchor."""
         out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
         for i, element in self.source.locations:
             self.source.count_unknown_members(element, "locations")
@@ -81,7 +81,7 @@ class NetworkReader:
         return out
 
     def _name_nodes(self, locations: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]], taken: set[str]) -> None:
-        """Which anchors of which levels are nodes, and their ids."""
+        """Determine the anchors of each level that are nodes, and assign their ids."""
         owners = {anchor: level for level in self.source.levels.values() for anchor in level.anchors}
         moved: set[str] = set(locations)
         for i, element in self.source.lanes:
@@ -165,7 +165,7 @@ class NetworkReader:
         return None if group is None else self.source.mutexes.get(reference(group, f"{location}.mutex"))
 
     def _edges(self, rows: dict[str, list[tuple[str, Any, Properties]]], taken: set[str]) -> dict[tuple[str, str], str]:
-        """The lanes as edges in the rows of their levels; gives the docks by level and anchor."""
+        """Add the lanes as edges to the rows of their levels; return the docks by level and anchor."""
         docks: dict[tuple[str, str], str] = {}
         dangling: dict[str, Any] = {}
         counts: Counter[str] = Counter()
@@ -218,16 +218,18 @@ class NetworkReader:
         if dangling:
             self.source.keep_document("lanes", dangling)
         if several:
-            problem = f"{several} lanes are of several graphs; a building and navigation graphs have them in the first"
+            problem = (
+                f"{several} lanes belong to several graphs; buildings and navigation graphs have them in the first only"
+            )
             self.source.context.warn(problem, where="navigation.guided.lanes")
         return docks
 
     def _motions(self, element: Mapping[str, Any], location: str) -> Iterable[tuple[bool, Mapping[str, Any], bool]]:
-        """(whether a building's two-way lane says it, motion, backward) of a lane's one or two directions."""
+        """Iterate over (is part of a building's two-way lane, motion, backward) of a lane's directions."""
         forward = mapping(element.get("forward"), f"{location}.forward")
         name, content = variant(element.get("reverse", "Same"), f"{location}.reverse")
         if name not in ("Same", "Disable", "Different"):
-            raise_unreadable(f"must be Same, Disable or Different, is {name[:40]!r}", f"{location}.reverse")
+            raise_unreadable(f"must be Same, Disable or Different, not {name[:40]!r}", f"{location}.reverse")
         back = forward if name == "Same" else mapping(content, f"{location}.reverse")
         forth_words, back_words = (motion_properties(motion, location) for motion in (forward, back))
         both = name != "Disable" and back_words == (common.reverse_orientation(forth_words[0]), forth_words[1])
@@ -236,7 +238,7 @@ class NetworkReader:
             yield both, back, True
 
     def _levels_of_ends(self, ends: Sequence[str]) -> tuple[SourceLevel, SourceLevel] | None:
-        """The levels of a lane's start and end."""
+        """Return the levels of a lane's start and end."""
         first, second = (self.source.homes.get(end, []) for end in ends)
         both = next((level for level in first if ends[1] in level.nodes), None)
         if both is not None:
@@ -244,7 +246,7 @@ class NetworkReader:
         return (first[0], second[0]) if first and second else None
 
     def _robots_by_anchor(self) -> dict[tuple[str, str], dict[str, Any]]:
-        """The robots that start at a location, by level and anchor."""
+        """Find the robots that start at a location, by level and anchor."""
         out: dict[tuple[str, str], dict[str, Any]] = {}
         for level in self.source.levels.values():
             listed = [a for a in level.nodes if a in level.anchors]
@@ -268,7 +270,7 @@ class NetworkReader:
 
 
 def motion_properties(motion: Mapping[str, Any], location: str) -> tuple[str, float]:
-    """(orientation in a building's words, speed limit or 0) of a motion along a lane."""
+    """Return (orientation as in a building, speed limit or 0) of a motion along a lane."""
     name, content = variant(motion.get("orientation_constraint") or "None", f"{location}.orientation_constraint")
     if name in ("RelativeYaw", "AbsoluteYaw"):
         vocabulary.angle(content, f"{location}.orientation_constraint")

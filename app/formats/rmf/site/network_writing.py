@@ -26,10 +26,10 @@ ORIENTATIONS: Mapping[Any, str] = {"forward": "Forwards", "backward": "Backwards
 WRITTEN_ELSEWHERE = frozenset(
     {"name", "lift", "lift_cabin", "mutex", "dock_name", common.ROBOT, common.ROBOT_TYPE, *TAGS}
 )
-"""What vertices say that a site says of its locations, lanes, lifts and models."""
+"""Vertex parameters that a site stores with its locations, lanes, lifts and models."""
 
 COLOURS = ([1.0, 0.5, 0.3], [0.6, 1.0, 0.5], [0.6, 0.8, 1.0], [0.6, 0.2, 0.3])
-"""Of new navigation graphs, in turn: those of the editor."""
+"""Colours of new navigation graphs, in turn, as in the editor."""
 
 
 @dataclass(slots=True)
@@ -44,13 +44,13 @@ class _Way:
 
 
 class NetworkWriter:
-    """Nodes as anchors and locations, edges as lanes."""
+    """Writer of nodes as anchors and locations, and of edges as lanes."""
 
     def __init__(self, draft: Draft, models: ModelWriter) -> None:
         self.draft, self.models = draft, models
 
     def write_nodes(self, floor: Floor) -> None:
-        """The nodes as anchors and locations, in the order of their source."""
+        """Write the nodes as anchors and locations, in source order."""
         nodes: list[tuple[tuple[bool, int, int, str], str, Properties, list[float]]] = []
         for part in floor.storey.networks:
             geometry = self.draft.coordinates(part)
@@ -106,7 +106,7 @@ class NetworkWriter:
         return vocabulary.anchor_or_source(xyz if source_anchor is not None else [*xyz[:2], 0.0], source_anchor)
 
     def _location(self, anchor: str, name: str, parameters: Mapping[str, Any], locations: Mapping[str, Any]) -> None:
-        """A node's locations; a new one where it has a name, a tag or a mutex group."""
+        """Write a node's locations; creates one if the node has a name, a tag or a mutex group."""
         tags = [tag for key, tag in TAGS.items() if parameters.get(key) is True]
         mutex = parameters.get("mutex")
         if not locations:
@@ -120,7 +120,7 @@ class NetworkWriter:
         source_tags = {tag for one in locations.values() for tag in one.get("tags") or [] if isinstance(tag, str)}
         for k, (i, one) in enumerate(locations.items()):
             if self.draft.locations.get(i, {}).get("anchor") == int(anchor):
-                continue  # of a lift's cabin, whose anchor is a node of several levels
+                continue  # an anchor in a lift's cabin is a node of several levels
             now = {**one, "anchor": int(anchor)}
             if not k and not same_name:
                 now["name"] = name
@@ -129,7 +129,7 @@ class NetworkWriter:
             self.draft.locations[self.draft.claim(int(i))] = now
 
     def write_lanes(self, everywhere: Mapping[str, str]) -> None:
-        """The edges as lanes. everywhere: the anchors of the nodes of all levels by id."""
+        """Write the edges as lanes. everywhere: anchors of the nodes of all levels, by node id."""
         groups: dict[Any, list[_Way]] = {}
         waiting: dict[Any, list[Any]] = {}
         for floor in self.draft.floors:
@@ -145,7 +145,7 @@ class NetworkWriter:
                 direction = self._find_way(floor, p, (anchors[0], anchors[1]), ends)
                 lane = self.draft.source_members(floor, p).get("lane")
                 group: Any = lane if isinstance(lane, int) else (floor.id, i if order is None else order)
-                if order is None and not isinstance(lane, int):  # with the edge back that says the same
+                if order is None and not isinstance(lane, int):  # pair it with the matching opposite edge
                     signature = sorted_json([direction.motion, direction.rest])
                     partners = waiting.get((floor.id, direction.target, direction.source, signature))
                     if partners and direction.source != direction.target:
@@ -157,7 +157,7 @@ class NetworkWriter:
             self._lane(group if isinstance(group, int) else None, directions)
 
     def _edges(self, floor: Floor) -> Iterator[tuple[int | None, str, Properties, int]]:
-        """(place of its lane in a building, id, properties, coordinates) of a level's edges, in their lanes' order."""
+        """Iterate over (index of its lane in a building, id, properties, coordinates) of edges, in lane order."""
         listed = []
         for part in floor.storey.networks:
             counts = shapely.get_num_coordinates(part.geometry)
@@ -167,7 +167,7 @@ class NetworkWriter:
                     lane_id = at if isinstance(at, int) else None
                     listed.append((lane_id, i, p, bends))
                 else:
-                    self.draft.dropped["items of networks that are neither node nor edge"] += p.get("kind") != "node"
+                    self.draft.dropped["network items that are neither nodes nor edges"] += p.get("kind") != "node"
         listed.sort(
             key=lambda e: (
                 e[0] is None,
@@ -213,7 +213,7 @@ class NetworkWriter:
         return _Way(*anchors, motion, {"graphs": {"Only": [int(self._graph(number))]}, **group}, reverse)
 
     def _graph(self, number: int) -> str:
-        """The id of a building's graph."""
+        """Return the id of a building's graph."""
         if number not in self.draft.numbers:
             i = self.draft.numbers[number] = self.draft.claim()
             self.draft.graphs[i] = {
@@ -223,7 +223,7 @@ class NetworkWriter:
         return self.draft.numbers[number]
 
     def _lane(self, hint: int | None, directions: Sequence[_Way]) -> None:
-        """Directions as a lane; those that are no pair as lanes of their own."""
+        """Write a pair of directions as one lane, other directions as separate lanes."""
         first = next((direction for direction in directions if not direction.reverse), directions[0])
         back = next(
             (w for w in directions if w is not first and (w.source, w.target) == (first.target, first.source)), None
@@ -244,7 +244,7 @@ class NetworkWriter:
 
 
 def _plain_parameters(p: Properties) -> dict[str, Any]:
-    """What a building or a navigation graph says of a vertex or lane, without types."""
+    """Return the building's or navigation graph's parameters of a vertex or lane, without types."""
     plain = dict(mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "parameters"))
     typed = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
     return plain | {key: parameter_value(typed, key) for key in typed}

@@ -1,4 +1,4 @@
-"""Reading a site's objects: walls, doors, floors, what stands on drawings, models and lifts."""
+"""Reading a site's objects: walls, doors, floors, items on drawings, models and lifts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from app.model.features import Properties
 
 
 class ObjectReader:
-    """The objects of a site's levels: walls, doors, floors, what stands on drawings, models and lifts."""
+    """Reader of the objects of a site's levels: walls, doors, floors, items on drawings, models and lifts."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -32,7 +32,7 @@ class ObjectReader:
         return None
 
     def read(self, level: SourceLevel) -> list[tuple[str, Any, Properties]]:
-        """(id, geometry in metres, properties) of each object of the level but for its lifts."""
+        """Return (id, geometry in metres, properties) of each object of the level except lifts."""
         rows: list[tuple[str, Any, Properties]] = []
         for section, kind, category in (
             ("walls", "wall", "Wall"),
@@ -44,7 +44,7 @@ class ObjectReader:
                 raws = [self._raw_anchor(level, a) for a in anchors]
                 if any(raw is None for raw in raws):
                     raise_unreadable(
-                        "stands on anchors that neither its level nor the site has", f"{level.location}.{section}.{i}"
+                        "uses anchors that neither its level nor the site has", f"{level.location}.{section}.{i}"
                     )
                 at = np.array([place(raw, category, "anchors")[:2] for raw in raws]).reshape(-1, 2)
                 location = f"{level.location}.{section}.{i}"
@@ -78,7 +78,7 @@ class ObjectReader:
         return p
 
     def _read_drawn(self, level: SourceLevel) -> list[tuple[str, Any, Properties]]:
-        """The measurements and fiducials of a level's drawings, in metres."""
+        """Read the measurements and fiducials of a level's drawings, in metres."""
         rows: list[tuple[str, Any, Properties]] = []
         counts: Counter[str] = Counter()
         for i, drawing in elements(level.element.get("drawings"), f"{level.location}.drawings"):
@@ -90,7 +90,7 @@ class ObjectReader:
 
             def places(ids: Sequence[str], path: str, at: Mapping[str, Array] = at) -> list[Array]:
                 if any(a not in at for a in ids):
-                    raise_unreadable("stands on anchors that its drawing does not have", path)
+                    raise_unreadable("uses anchors that its drawing does not have", path)
                 return [at[a] for a in ids]
 
             for section, kind in (("measurements", "measurement"), ("fiducials", "fiducial")):
@@ -146,7 +146,7 @@ class ObjectReader:
         return rows
 
     def lift_row(self, k: int, lift: SourceLift) -> tuple[str, tuple[str, Any, Properties]]:
-        """(level, row) of a lift; it stands on its initial level, else on the lowest that it visits."""
+        """Return (level, row) of a lift: on its initial level, else on the lowest level that it visits."""
         properties = mapping(lift.element.get("properties"), f"lifts.{lift.id}.properties")
         location = f"lifts.{lift.id}"
         rect = vocabulary.rectangle(properties, location)
@@ -198,14 +198,14 @@ class ObjectReader:
 
 
 def pixels_to_metres(transform: Sequence[float], at: Sequence[float]) -> Array:
-    """Metres of a drawing's pixel (y up)."""
+    """Convert a drawing's pixel (y up) to metres."""
     scale, turn, x, y = transform
     c, s = scale * math.cos(turn), scale * math.sin(turn)
     return np.array([c * at[0] - s * at[1] + x, s * at[0] + c * at[1] + y])
 
 
 def _ring(at: Array) -> Any:
-    """A polygon; where there are too few corners for one, its points."""
+    """Build a polygon, or points if there are too few corners."""
     if not len(at):
         return None
     closed = (at[0] == at[-1]).all()
@@ -213,7 +213,7 @@ def _ring(at: Array) -> Any:
 
 
 def model_name(description: Mapping[str, Any], location: str) -> str:
-    """The name that a building would find the model by."""
+    """Return the model's name as a building refers to it."""
     if "source" not in description:
         return ""
     kind, name = vocabulary.asset(description["source"], f"{location}.source")

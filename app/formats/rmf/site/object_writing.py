@@ -1,4 +1,4 @@
-"""Writing a site's objects: walls, doors and floors on anchors, drawings and what stands on them."""
+"""Writing a site's objects: walls, doors and floors on anchors, drawings and the items on them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from app.model.features import Properties
 
 
 class ObjectWriter:
-    """Walls, doors and floors, and drawings with what stands on them."""
+    """Writer of walls, doors and floors, and of drawings with the items on them."""
 
     def __init__(self, draft: Draft, models: ModelWriter) -> None:
         self.draft, self.models = draft, models
 
     def write_objects(self, floor: Floor) -> None:
-        """The level's drawings and objects, but for lifts."""
+        """Write the level's drawings and objects, except lifts."""
         sections = {"wall": "walls", "door": "doors", "floor": "floors"}
         self._write_drawings(floor)
         for kind, p, geometry, _ in self.draft.items(floor):
@@ -51,10 +51,10 @@ class ObjectWriter:
             elif kind in ("model", "robot") and point:
                 self.models.write_model(floor, kind, p, geometry, members)
             elif kind != "lift":
-                self.draft.dropped["objects that are no part of a site"] += 1
+                self.draft.dropped["objects that a site cannot contain"] += 1
 
     def _corner_anchors(self, floor: Floor, p: Properties, geometry: Any, kind: str) -> list[int]:
-        """The anchors of a line's ends or a ring's corners."""
+        """Return the anchors of a line's ends or a ring's corners."""
         at = shapely.get_coordinates(geometry)
         at = at if kind == "floor" else at[[0, -1]]
         hints = self.draft.source_members(floor, p).get("anchors")
@@ -65,7 +65,7 @@ class ObjectWriter:
         return [self._anchor(floor, xy, hint, kind.capitalize()) for xy, hint in zip(at.tolist(), hints, strict=True)]
 
     def _anchor(self, floor: Floor, xy: Sequence[float], hint: Any, category: str) -> int:
-        """The anchor at this place: the one that it was, else any of the level, else a new one."""
+        """Return the anchor at this position: the source anchor, else any of the level, else a new one."""
         key = str(hint)
         for home in (floor.anchors, self.draft.anchors):
             if key in home and _is_near(place(home[key], category, "anchor"), xy):
@@ -82,7 +82,7 @@ class ObjectWriter:
         return int(anchor)
 
     def _solid(self, kind: str, p: Properties, element: dict[str, Any]) -> None:
-        """A door's kind, a wall's texture, and the heights of both."""
+        """Write a door's kind, a wall's texture, and the heights of both."""
         parameters = mapping(get_source_properties(p, BUILDING).get("parameters"), "parameters")
         if kind == "door":
             element["name"] = str(p.get("name") or parameter_value(parameters, "name") or "")
@@ -119,7 +119,7 @@ class ObjectWriter:
             floor.element.setdefault("floors", {})[self.draft.claim(None if k else members.get("id"))] = element
 
     def _write_drawings(self, floor: Floor) -> None:
-        """The drawings of the level's source, without what stands on them."""
+        """Write the drawings of the level's source, without the items on them."""
         drawings = {
             i: {**drawing, "anchors": dict(mapping(drawing.get("anchors"), "anchors"))}
             for i, drawing in mapping(floor.document.get("drawings"), "drawings").items()
@@ -146,7 +146,7 @@ class ObjectWriter:
             floor.element["drawings"] = drawings
 
     def write_images(self, floor: Floor) -> None:
-        """The images that drawings name."""
+        """Add the images that drawings name."""
         for i, drawing in mapping(floor.element.get("drawings"), "drawings").items():
             drawing.pop("transform", None)
             location = f"levels.{floor.id}.drawings.{i}.properties.source"
@@ -156,7 +156,7 @@ class ObjectWriter:
                 continue
             file = find_stored_image(name, self.draft.resources)
             if file is None:
-                problem = f"the image {name[:200]!r} was not in the upload: it is named and not served"
+                problem = f"the image {name[:200]!r} was not uploaded; the map names it but does not contain it"
                 self.draft.context.warn(problem, where=location)
                 continue
             self.draft.used[file] = self.draft.resources[file]
@@ -166,7 +166,7 @@ class ObjectWriter:
     def _place_on_drawing(
         self, floor: Floor, geometry: Any, members: Mapping[str, Any]
     ) -> tuple[dict[str, Any], list[int]] | None:
-        """(drawing, anchors on it) of what is measured in its pixels."""
+        """Return (drawing, anchors on it) for an item with coordinates in drawing pixels."""
         drawings = mapping(floor.element.get("drawings"), "drawings")
         i = str(members.get("drawing"))
         i = i if i in drawings else next(iter(drawings), "")

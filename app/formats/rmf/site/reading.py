@@ -1,4 +1,4 @@
-"""Reading a site: the parts of its levels, and the documents that a building would have."""
+"""Reading a site: the parts of its levels, and documents like those of a building."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
 from app.syntax import json, ron
 
 _LISTS = frozenset({"anchors", "doors", "floors", "walls", "models", "drawings"})
-"""What of a level is items; all else of it stays in the document."""
+"""Item sections of a level; its other members stay in the document."""
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """Topology and objects for each level, the drawings that were uploaded with the site, and its datum.
+    """Read topology and objects of each level, the uploaded drawings, and the site's datum.
 
-    Raises UnreadableFile naming the place.
+    Raises UnreadableFile with the location.
     """
     main = context.main or next(iter(files))
     data = files[main]
@@ -47,7 +47,7 @@ def _is_ron(name: str, data: bytes) -> bool:
 
 
 class _SiteReader:
-    """The parts of a site."""
+    """Reader of a site's parts."""
 
     def __init__(self, top: dict[str, Any], context: ReadContext) -> None:
         self.source = Source(top, context)
@@ -55,7 +55,7 @@ class _SiteReader:
         self.objects = ObjectReader(self.source)
 
     def parts(self) -> dict[PartKey, Part]:
-        """A network and objects for each level."""
+        """Return a network and objects for each level."""
         source = self.source
         taken: set[str] = set()
         networks = self.networks.read(taken)
@@ -84,7 +84,7 @@ class _SiteReader:
                 document[NAME]["site"] = site
             out[PartKey("topology", level.name, NETWORK)] = networks[i].with_document(document)
             out[PartKey("objects", level.name, BUILDING)] = features(objects[i], "local", document)
-        if not taken:  # nothing of the network is there: a map of this family alone, and of no other
+        if not taken:  # without a network the map is one of this family only
             for level in source.levels.values():
                 network = out.pop(PartKey("topology", level.name, NETWORK))
                 out[PartKey("topology", level.name, BUILDING)] = network
@@ -92,7 +92,7 @@ class _SiteReader:
         return out
 
     def _document(self, level: SourceLevel) -> dict[str, Any]:
-        """What of a level is no item, and what its items do not say."""
+        """Return the level's members that are neither items nor derived from items."""
         members = {key: value for key, value in level.element.items() if key not in _LISTS}
         members["id"] = level.id
         drawings: dict[str, Any] = {}
@@ -115,7 +115,7 @@ class _SiteReader:
         return {"level": members, "drawings": drawings, "forms": forms, "order": level.order}
 
     def _building(self) -> dict[str, dict[str, Any]]:
-        """What a building's documents would say: pixels where each level has a drawing, else metres."""
+        """Build documents like a building's: in pixels if each level has a drawing, else in metres."""
         name = text(mapping(self.source.top.get("properties"), "properties").get("name"), "properties.name")
         drawings: dict[str, tuple[list[float], str]] = {}
         for i, level in self.source.levels.items():

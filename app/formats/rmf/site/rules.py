@@ -1,4 +1,4 @@
-"""What Open-RMF's site editor wants of a site: members without a default, ids that are there, and known versions.
+"""Rules of Open-RMF's site editor for sites: required members, existing ids, supported versions.
 
 Source: open-rmf/rmf_site, crates/rmf_site_format (serde's attributes of each struct; nav_graph.rs for the export).
 """
@@ -37,17 +37,17 @@ REQUIRED: Mapping[str, tuple[str, ...]] = {
 
 
 def check(files: Files) -> Iterator[Problem]:
-    """A site as its editor loads it."""
+    """Check a site with the rules of its editor."""
     main = next(iter(files))
     if is_brief(files[main]):
         return
     top = ron.load(files[main], LIMITS) if main.endswith(".ron") else json.load(files[main], LIMITS)
     if not isinstance(top, dict):
-        yield error_finding("a site is a mapping", main)
+        yield error_finding("a site must be a mapping", main)
         return
     version = top.get("format_version")
     if not isinstance(version, str) or not version.startswith("0.") or not version[2:].isdigit():
-        yield error_finding(f'must be "0.MINOR", is {shown(version)}', main, where="format_version")
+        yield error_finding(f'must be "0.MINOR", not {shown(version)}', main, where="format_version")
     properties = top.get("properties")
     if not isinstance(properties, dict) or not isinstance(properties.get("name"), str):
         yield error_finding("a site needs a name", main, where="properties.name")
@@ -61,7 +61,7 @@ def check(files: Files) -> Iterator[Problem]:
 
 
 def _section(members: Any, section: str, main: str, location: str) -> Iterator[Problem]:
-    """Elements that lack a member."""
+    """Check that elements have their required members."""
     for i, one in _elements(members):
         if absent := missing(one, REQUIRED[section]):
             yield error_finding(f"needs {', '.join(absent)}", main, where=f"{location}.{i}")
@@ -74,7 +74,7 @@ def _elements(members: Any) -> list[tuple[str, Any]]:
 def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
     levels = _elements(top.get("levels"))
     if not levels:
-        yield error_finding("a site needs a level", main, where="levels")
+        yield error_finding("a site needs at least one level", main, where="levels")
     site = {i for i, _ in _elements(top.get("anchors"))}
     ids = list(site)
     anchor_ids = set(site)
@@ -93,7 +93,7 @@ def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
         for section in ("doors", "walls", "floors"):
             yield from _check_anchors(level.get(section), level_anchors | site, main, f"{location}.{section}")
     if repeats := duplicates(level["properties"].get("name") for _, level in levels if _is_named(level)):
-        yield warning_finding(f"levels with the same name: {names(repeats)}", main, where="levels")
+        yield warning_finding(f"duplicate level names: {names(repeats)}", main, where="levels")
     for i, lift in _elements(top.get("lifts")):
         yield from _section({i: lift}, "lifts", main, "lifts")
         cabin = {a for a, _ in _elements(lift.get("cabin_anchors"))} if isinstance(lift, dict) else set()
@@ -110,9 +110,9 @@ def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
         if isinstance(one, dict) and one.get("description") is not None and str(one["description"]) not in described
     ]
     if dangling:
-        yield error_finding(f"no description of the models {names(dangling)}", main, where="model_instances")
+        yield error_finding(f"models without a description: {names(dangling)}", main, where="model_instances")
     if repeats := duplicates(ids):
-        yield error_finding(f"ids that several elements have: {names(repeats)}", main)
+        yield error_finding(f"duplicate element ids: {names(repeats)}", main)
 
 
 def _is_named(level: Any) -> bool:
@@ -124,14 +124,14 @@ def _ends(properties: Any) -> dict[str, Any]:
 
 
 def _check_anchors(members: Any, anchors: set[str], main: str, location: str) -> Iterator[Problem]:
-    """Elements on anchors that are not there."""
+    """Check that elements use existing anchors."""
     dangling = [
         i
         for i, one in _elements(members)
         if isinstance(one, dict) and any(str(a) not in anchors for a in one.get("anchors") or ())
     ]
     if dangling:
-        yield error_finding(f"{names(dangling)} stand on anchors that are not there", main, where=location)
+        yield error_finding(f"{names(dangling)} use anchors that do not exist", main, where=location)
 
 
 def _navigation(navigation: Any, anchors: set[str], ids: list[str], main: str) -> Iterator[Problem]:
@@ -151,4 +151,4 @@ def _navigation(navigation: Any, anchors: set[str], ids: list[str], main: str) -
     yield from _check_anchors(places, anchors, main, f"{location}.locations")
     called = [one.get("name") for _, one in _elements(guided.get("locations")) if isinstance(one, dict)]
     if repeats := duplicates(name for name in called if name and name != "<Unnamed>"):
-        yield warning_finding(f"locations with the same name: {names(repeats)}", main, where=f"{location}.locations")
+        yield warning_finding(f"duplicate location names: {names(repeats)}", main, where=f"{location}.locations")

@@ -1,4 +1,4 @@
-"""A site's file, checked: its levels, lifts, drawings and what belongs to all of it."""
+"""Validated site file: levels, lifts, drawings and site-wide data."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _VERSION = re.compile(r"(\d{1,6})\.(\d{1,6})")
 
 @dataclass(slots=True)
 class SourceLevel:
-    """A level as its file says it.
+    """Level as read from the file.
 
-    anchors: [x, y, z] by id. nodes: id of a node by its anchor. cabins: anchors in lifts that are nodes of the level.
+    anchors: [x, y, z] by id. nodes: node id by anchor. cabins: anchors in lifts that are nodes of the level.
     """
 
     id: str
@@ -39,13 +39,13 @@ class SourceLevel:
 
     @property
     def location(self) -> str:
-        """Its place in the file, for messages."""
+        """Return its location in the file, for messages."""
         return f"levels.{self.id}"
 
 
 @dataclass(slots=True)
 class SourceLift:
-    """A lift as its file says it. visits: ids of the levels that it serves."""
+    """Lift as read from the file. visits: ids of the levels that it serves."""
 
     id: str
     name: str
@@ -55,7 +55,7 @@ class SourceLift:
 
 
 class Source:
-    """A site as its file says it, and what belongs to all of its levels."""
+    """Site as read from the file, with the data that all levels share."""
 
     def __init__(self, top: dict[str, Any], context: ReadContext) -> None:
         self.top, self.context = top, context
@@ -106,12 +106,12 @@ class Source:
             )
 
     def count_unknown_members(self, element: Mapping[str, Any], section: str) -> None:
-        """Count members that no release has."""
+        """Count members that no release of the format has."""
         for member in unknown(element, section):
             self.unknown_members[f"{section}: {member[:60]}" if section else member[:60]] += 1
 
     def parse_anchors(self, anchors: Any, location: str) -> dict[str, list[float]]:
-        """[x, y, z] by id."""
+        """Parse anchors to [x, y, z] by id."""
         return {key: place(raw, "General", f"{location}.{key}") for key, raw in members_by_id(anchors, location)}
 
     def _levels(self) -> dict[str, SourceLevel]:
@@ -119,7 +119,7 @@ class Source:
         if not listed:
             raise_unreadable("a site needs at least one level", "levels")
         if self.context.level != GROUND:
-            problem = f"its levels have names of their own: level={self.context.level} is not used"
+            problem = f"the file names its own levels; level={self.context.level} is ignored"
             self.context.warn(problem, where="levels")
         properties = [mapping(level.get("properties"), f"levels.{i}.properties") for i, level in listed]
         level_names = []
@@ -129,7 +129,9 @@ class Source:
             level_names.append(common.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
         names = unique_ids(level_names)
         if twice := sorted({a for a, b in zip(level_names, names, strict=True) if a != b}):
-            self.context.warn(f"levels have the same name: {', '.join(twice[:5])}; they get a number", where="levels")
+            self.context.warn(
+                f"duplicate level names: {', '.join(twice[:5])}; a number makes them unique", where="levels"
+            )
         return {
             i: SourceLevel(
                 i,
@@ -143,7 +145,7 @@ class Source:
         }
 
     def datum(self) -> Datum | None:
-        """The place on earth of (0, 0); a warning where it is not the environment's."""
+        """Return the geographic position of (0, 0); warn if it differs from the environment's datum."""
         offset = mapping(self.top.get("properties"), "properties").get("geographic_offset")
         location = "properties.geographic_offset"
         if offset is None:
@@ -153,10 +155,10 @@ class Source:
         if datum is None:
             return Datum(latitude, longitude)
         near = abs(datum.latitude - latitude) < 1e-5 and abs(datum.longitude - longitude) < 1e-5
-        if not near:  # the editor keeps single precision: a metre or so
+        if not near:  # the editor's single precision is about a metre
             self.context.warn(
-                f"its place {latitude!r}, {longitude!r} is not the environment's datum {datum.latitude!r}, "
-                f"{datum.longitude!r}, which stays: change the environment's datum, or the site",
+                f"the site's origin {latitude!r}, {longitude!r} differs from the environment's datum "
+                f"{datum.latitude!r}, {datum.longitude!r}, which is kept; change the environment's datum or the site",
                 where=location,
             )
         return None
@@ -170,7 +172,7 @@ class Source:
         for anchor in ends:
             raw = mapping(self.top.get("anchors"), "anchors").get(anchor)
             if raw is None:
-                raise_unreadable(f"there is no anchor {anchor} of the site", f"{location}.properties.reference_anchors")
+                raise_unreadable(f"unknown anchor {anchor} of the site", f"{location}.properties.reference_anchors")
             at.append(place(raw, "Lift", f"anchors.{anchor}"))
         name = common.short(text(properties.get("name"), f"{location}.properties.name")) or f"lift {i}"
         visits: list[str] = []
@@ -181,19 +183,21 @@ class Source:
         return SourceLift(i, name, lift, cabin, served)
 
     def warn_unknown(self) -> None:
-        """Warn of the members that were counted as unknown."""
+        """Warn about the unknown members."""
         for member, count in sorted(self.unknown_members.items()):
             times = f" ({count} times)" if count > 1 else ""
-            self.context.warn(f"unknown member {member!r}{times}: it is kept for the way back and not understood")
+            self.context.warn(f"unknown member {member!r}{times}; it is stored and written back unchanged")
 
     def keep_document(self, section: str, items: dict[str, Any]) -> None:
-        """Keep items without an anchor for the way back, and warn."""
+        """Store items without an anchor in the document, to be written back, and warn."""
         self.dangling.setdefault(section, {}).update(items)
-        problem = f"{len(items)} stand on no anchor of a level or a lift's cabin: they are kept for the way back only"
+        problem = (
+            f"{len(items)} items use no anchor of a level or a lift's cabin; they are stored for writing back only"
+        )
         self.context.warn(problem, where=f"navigation.guided.{section}")
 
     def items(self, level: SourceLevel, section: str) -> list[tuple[str, tuple[list[str], dict[str, Any]]]]:
-        """(id, (anchors, what else it says)) of walls, doors and floors."""
+        """Return (id, (anchors, other members)) of walls, doors and floors."""
         out = []
         for i, element in elements(level.element.get(section), f"{level.location}.{section}"):
             location = f"{level.location}.{section}.{i}.anchors"
@@ -201,7 +205,7 @@ class Source:
         return out
 
     def drawings(self) -> Iterable[tuple[str, str]]:
-        """(place, file) of the images that are named on this machine."""
+        """Iterate over (location, file name) of the images with a local source."""
         for level in self.levels.values():
             for i, drawing in elements(level.element.get("drawings"), f"{level.location}.drawings"):
                 location = f"{level.location}.drawings.{i}.properties.source"
@@ -210,16 +214,16 @@ class Source:
                     yield location, name
 
     def primary(self, level: SourceLevel) -> str | None:
-        """The drawing that a building would have."""
+        """Return the level's drawing for a building: the highest-ranked, else the first, or None."""
         listed = dict(elements(level.element.get("drawings"), f"{level.location}.drawings"))
         rankings = mapping(level.element.get("rankings"), f"{level.location}.rankings").get("drawings") or []
         ranked = references(rankings, f"{level.location}.rankings.drawings")
         return next((i for i in ranked if i in listed), next(iter(listed), None))
 
     def transform(self, drawing: Mapping[str, Any], location: str) -> list[float]:
-        """[scale, rotation, x, y] from a drawing's pixels (y up) to metres.
+        """Return [scale, rotation, x, y] from a drawing's pixels (y up) to metres.
 
-        Measurements that say the same scale in double precision say it better than pixels_per_meter.
+        Measurements take precedence if they give the same scale: they have double precision, pixels_per_meter has not.
         """
         p = mapping(drawing.get("properties"), f"{location}.properties")
         pixels = number(p.get("pixels_per_meter", 100.0), f"{location}.properties.pixels_per_meter")
@@ -240,7 +244,10 @@ class Source:
         return [scale, yaw, x, y]
 
     def instances(self, level: SourceLevel) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
-        """(id, instance, description) of the level's models; older releases say both at once, below the level."""
+        """Return (id, instance, description) of the level's models.
+
+        Older releases store instance and description as one element below the level.
+        """
         out = []
         for i, element in self.placed.get(level.id, []):
             key = element.get("description")
@@ -250,7 +257,7 @@ class Source:
         return out + [(i, element, element) for i, element in older]
 
     def _models_by_level(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
-        """The models by the level that they stand on."""
+        """Group the models by their level."""
         out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
         for i, element in elements(self.top.get("model_instances"), "model_instances"):
             parent = reference(element.get("parent"), f"model_instances.{i}.parent")

@@ -1,10 +1,10 @@
-"""Open-RMF's sites: their words, and how they stand to those of a building (``properties.openrmf``).
+"""Members of Open-RMF sites, and their conversion from and to those of a building (``properties.openrmf``).
 
-A site's elements have whole numbers as ids, unique in all of the site; an enum's value is ``{"Variant": content}`` or
+A site's elements have integers as ids, unique within the site; an enum's value is ``{"Variant": content}`` or
 ``"Variant"``. Coordinates are metres; angles are ``{"deg": v}`` or ``{"rad": v}``.
 
 Source: open-rmf/rmf_site, crates/rmf_site_format (site.rs, level.rs, anchor.rs, lane.rs, location.rs, door.rs, lift.rs,
-drawing.rs, misc.rs, model.rs, scenario.rs, nav_graph.rs), and its legacy module for what buildings say.
+drawing.rs, misc.rs, model.rs, scenario.rs, nav_graph.rs), and its legacy module for buildings.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ MEMBERS: Mapping[str, frozenset[str]] = {
         {"parent", "name", "pose", "description", "optional_properties", "source", "is_static", "scale"}
     ),
 }
-"""What rmf_site_format knows of each element, older releases' members too. Others are kept, and warned of."""
+"""Members of each element in rmf_site_format, including older releases. Others are stored with a warning."""
 
 ORDER = {
     word: rank
@@ -72,7 +72,7 @@ ORDER = {
         )
     )
 }
-"""Members in the order of their file; others follow by alphabet, ids by number."""
+"""Members in file order; others follow alphabetically, ids by number."""
 
 _SIDES = frozenset({"Left", "Right"})
 _GRAPHS = frozenset({"All"})
@@ -105,41 +105,41 @@ SHAPE = ron.Shape(
 )
 
 CABIN_WALL, CABIN_DOOR, CABIN_GAP = 0.1, 0.05, 0.01
-"""Metres; a cabin's wall, its door and the gap before it where the site does not say."""
+"""Default thickness of a cabin's wall and door, and of the gap before the door, in metres."""
 
 SAME_METRES = 1e-9
 SINGLE_PRECISION = 1e-6
-"""Relative: the editor keeps numbers in single precision."""
+"""Relative tolerance: the editor stores numbers in single precision."""
 
 
 # --- values ----------------------------------------------------------------------------------------------------------
 
 
 def reference(value: Any, location: str) -> str:
-    """The id of an element, as the key that it has in its mapping."""
+    """Check an element id; return it as a key of the element's mapping."""
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        raise_unreadable("must be the id of an element, a whole number below 2^32", location)
+        raise_unreadable("must be an element id, an integer below 2^32", location)
     return str(value)
 
 
 def references(value: Any, location: str, count: int | None = None) -> list[str]:
-    """The ids of a list; count: how many there must be."""
+    """Check a list of ids. count: required number of ids."""
     if not isinstance(value, list) or (count is not None and len(value) != count):
         raise_unreadable(f"must be a list of {count} ids" if count else "must be a list of ids", location)
     return [reference(v, f"{location}[{k}]") for k, v in enumerate(value)]
 
 
 def members_by_id(value: Any, location: str) -> list[tuple[str, Any]]:
-    """The members of a mapping whose keys are ids, by number."""
+    """Return the members of a mapping whose keys are ids, sorted by number."""
     members = mapping(value, location)
     for key in members:
         if not key.isascii() or not key.isdigit() or len(key) > 10 or int(key) >= 2**32 or str(int(key)) != key:
-            raise_unreadable(f"{key[:40]!r} is no id: a whole number below 2^32", location)
+            raise_unreadable(f"invalid id {key[:40]!r}: must be an integer below 2^32", location)
     return [(key, members[key]) for key in sorted(members, key=int)]
 
 
 def elements(value: Any, location: str) -> list[tuple[str, dict[str, Any]]]:
-    """The elements of a mapping by id, by number; each is a mapping."""
+    """Return the elements of a mapping by id, sorted by number; each is a mapping."""
     listed = members_by_id(value, location)
     for key, element in listed:
         if not isinstance(element, dict):
@@ -148,7 +148,7 @@ def elements(value: Any, location: str) -> list[tuple[str, dict[str, Any]]]:
 
 
 def variant(value: Any, location: str) -> tuple[str, Any]:
-    """(name, content) of an enum's value."""
+    """Split an enum's value into (name, content)."""
     if isinstance(value, str):
         return value, None
     if not isinstance(value, dict) or len(value) != 1:
@@ -157,17 +157,17 @@ def variant(value: Any, location: str) -> tuple[str, Any]:
 
 
 def vector(value: Any, size: int, location: str) -> list[float]:
-    """That many numbers."""
+    """Check a list of ``size`` numbers."""
     if not isinstance(value, list) or len(value) != size:
         raise_unreadable(f"must be a list of {size} numbers", location)
     out = [number(v, f"{location}[{k}]") for k, v in enumerate(value)]
     if max(map(abs, out)) > MAX_METRES:
-        raise_unreadable(f"is beyond ±{MAX_METRES:g}", location)
+        raise_unreadable(f"must be within ±{MAX_METRES:g}", location)
     return out
 
 
 def text(value: Any, where: str) -> str:
-    """A text; nothing at all is an empty one."""
+    """Check that a value is text; None becomes an empty text."""
     if value is None:
         return ""
     if not isinstance(value, str):
@@ -179,15 +179,15 @@ def angle(value: Any, location: str) -> float:
     """Radians."""
     name, content = variant(value, location)
     if name not in ("deg", "rad"):
-        raise_unreadable(f"must be deg or rad, is {name[:40]!r}", location)
+        raise_unreadable(f"must be deg or rad, not {name[:40]!r}", location)
     amount = number(content, location)
     if abs(amount) > MAX_METRES:
-        raise_unreadable(f"is beyond ±{MAX_METRES:g}", location)
+        raise_unreadable(f"must be within ±{MAX_METRES:g}", location)
     return math.radians(amount) if name == "deg" else amount
 
 
 def pose(value: Any, location: str) -> list[float]:
-    """[x, y, z, roll, pitch, yaw] of a pose, metres and radians."""
+    """Parse a pose to [x, y, z, roll, pitch, yaw] in metres and radians."""
     members = mapping(value, location)
     at = vector(members.get("trans"), 3, f"{location}.trans")
     name, content = variant(members.get("rot", {"yaw": {"rad": 0.0}}), f"{location}.rot")
@@ -198,18 +198,18 @@ def pose(value: Any, location: str) -> list[float]:
             raise_unreadable("must be three angles", f"{location}.rot")
         return [*at, *(angle(v, f"{location}.rot[{k}]") for k, v in enumerate(content))]
     if name != "quat":
-        raise_unreadable(f"must be yaw, euler_xyz or quat, is {name[:40]!r}", f"{location}.rot")
+        raise_unreadable(f"must be yaw, euler_xyz or quat, not {name[:40]!r}", f"{location}.rot")
     x, y, z, w = vector(content, 4, f"{location}.rot")
     length = x * x + y * y + z * z + w * w
     if not 1e-12 < length < 1e12:
-        raise_unreadable("is no rotation: the quaternion has no length", f"{location}.rot")
+        raise_unreadable("invalid rotation: the quaternion has length 0", f"{location}.rot")
     roll = math.atan2(2 * (w * x + y * z), length - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x) / length)))
     return [*at, roll, pitch, math.atan2(2 * (w * z + x * y), length - 2 * (y * y + z * z))]
 
 
 def pose_or_source(now: Sequence[float], source_pose: Any) -> dict[str, Any]:
-    """The pose as a site says it; as it was said where it is the same."""
+    """Convert a pose to a site's form; an unchanged pose keeps its source form."""
     if isinstance(source_pose, dict):
         was = pose(source_pose, "pose")
         turns = (abs(math.remainder(a - b, math.tau)) for a, b in zip(was[3:], now[3:], strict=True))
@@ -222,12 +222,12 @@ def pose_or_source(now: Sequence[float], source_pose: Any) -> dict[str, Any]:
 
 
 def metres(value: float) -> float:
-    """Rounded as all formats write metres."""
+    """Round to the precision of metres in all formats."""
     return round(float(value), 9) + 0.0
 
 
 def place(anchor: Any, category: str, location: str) -> list[float]:
-    """[x, y, z] of an anchor, for elements of this category."""
+    """Return [x, y, z] of an anchor, for elements of this category."""
     name, content = variant(anchor, location)
     if name == "Translate2D":
         return [*vector(content, 2, location), 0.0]
@@ -235,12 +235,12 @@ def place(anchor: Any, category: str, location: str) -> list[float]:
         members = mapping(content, location)
         return [*vector(members.get(category, members.get("General")), 2, location), 0.0]
     if name != "Pose3D":
-        raise_unreadable(f"must be Translate2D, CategorizedTranslate2D or Pose3D, is {name[:40]!r}", location)
+        raise_unreadable(f"must be Translate2D, CategorizedTranslate2D or Pose3D, not {name[:40]!r}", location)
     return pose(content, location)[:3]
 
 
 def anchor_or_source(now: Sequence[float], source_anchor: Any) -> dict[str, Any]:
-    """The anchor at this place [x, y, z]; as it was said, moved there with all its categories."""
+    """Create the anchor at [x, y, z], or move the source anchor there with all its categories."""
     if not isinstance(source_anchor, dict):
         return {"Translate2D": [metres(now[0]), metres(now[1])]}
     was = place(source_anchor, "General", "anchor")
@@ -254,7 +254,7 @@ def anchor_or_source(now: Sequence[float], source_anchor: Any) -> dict[str, Any]
 
 
 def sort_members(value: Any) -> Any:
-    """The value with its members in the format's order: equal values give equal bytes."""
+    """Sort members in the format's order: equal values give equal bytes."""
     if isinstance(value, dict):
         last = len(ORDER)
         key = sorted(value, key=lambda k: (ORDER.get(k, last), len(k) if k.isdigit() else 0, k))
@@ -263,22 +263,22 @@ def sort_members(value: Any) -> Any:
 
 
 def digest(site: Mapping[str, Any]) -> str:
-    """What tells parts of one site from those of another."""
+    """Compute the digest that distinguishes parts of different sites."""
     return hashlib.sha256(orjson.dumps(sort_members(site))).hexdigest()[:16]
 
 
 def unknown(members: Mapping[str, Any], section: str) -> list[str]:
-    """The members that no release of the format has."""
+    """Return the members that no release of the format has."""
     return sorted(members.keys() - MEMBERS[section])
 
 
 def height(value: Any, location: str) -> float | None:
-    """Metres of a top or bottom that is fixed."""
+    """Return the height of a fixed top or bottom in metres, or None."""
     if value is None:
         return None
     name, content = variant(value, location)
     if name not in ("fixed", "level_height_ratio"):
-        raise_unreadable(f"must be fixed or level_height_ratio, is {name[:40]!r}", location)
+        raise_unreadable(f"must be fixed or level_height_ratio, not {name[:40]!r}", location)
     amount = number(content, location)
     return amount if name == "fixed" else None
 
@@ -289,7 +289,7 @@ DOORS = ("SingleSliding", "DoubleSliding", "SingleSwing", "DoubleSwing", "Model"
 
 
 def door_parameters(kind: Any, location: str) -> dict[str, Any]:
-    """A door's kind in a building's words; a swing to both sides is of the forward one."""
+    """Convert a door's kind to a building's parameters; a swing to both sides keeps the forward one."""
     name, content = variant(kind, location)
     if name not in DOORS or not isinstance(content, dict):
         raise_unreadable(f"must be one of {', '.join(DOORS)} and its members", location)
@@ -300,7 +300,7 @@ def door_parameters(kind: Any, location: str) -> dict[str, Any]:
     if name[0] == "D":
         ratio = number(members.get("left_right_ratio", 1.0), f"{location}.left_right_ratio")
         out["right_left_ratio"] = [3, 1.0 / ratio if abs(ratio) > 1e-9 else 1.0]
-    if sliding:  # the editor reads a building's sliding door as one towards its right
+    if sliding:  # the editor reads a building's sliding door as sliding right
         out["motion_axis"] = [1, "end" if members.get("towards") == "Left" else "start"]
         return out | {"motion_degrees": [3, 90.0], "motion_direction": [2, 1]}
     right = members.get("pivot_on", "Left") == "Right"
@@ -318,7 +318,7 @@ def door_parameters(kind: Any, location: str) -> dict[str, Any]:
 
 
 def door_kind(parameters: Mapping[str, Any], source_kind: Any) -> dict[str, Any]:
-    """The door's kind in a site's words; what it was said as where the building's words are still the same."""
+    """Convert a building's door parameters to a site's kind; unchanged parameters keep the source kind."""
     if source_kind is not None:
         was = door_parameters(source_kind, "kind")
         if not was or all(parameter_value(was, k) == parameter_value(parameters, k) for k in was):
@@ -350,7 +350,7 @@ FACES: Mapping[str, tuple[float, float]] = {
     "left_door": (0.0, 1.0),
     "right_door": (0.0, -1.0),
 }
-"""The way out of the cabin; to its left lies the door's positive shift."""
+"""Directions out of the cabin; a door's positive shift is to the left of its direction."""
 
 
 def _or(value: Any, default: float, location: str) -> float:
@@ -359,9 +359,9 @@ def _or(value: Any, default: float, location: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Cabin:
-    """A lift's cabin: its middle and yaw in the site, its inner depth (along x, to the front) and width (along y).
+    """Lift cabin: centre and yaw in the site, inner depth (along x, to the front) and width (along y).
 
-    The reference anchors stand before its front: a gap, half a door and a wall away (``RectangularLiftCabin::aabb``).
+    The reference anchors are in front of it: a gap, half a door and a wall away (``RectangularLiftCabin::aabb``).
     """
 
     x: float
@@ -372,37 +372,37 @@ class Cabin:
     offset: tuple[float, float]
 
     def outward(self, at: Sequence[float]) -> tuple[float, float]:
-        """A place in the cabin's frame as one in the site's."""
+        """Convert a position from the cabin's frame to the site's."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return self.x + c * at[0] - s * at[1], self.y + s * at[0] + c * at[1]
 
     def inward(self, at: Sequence[float]) -> tuple[float, float]:
-        """A place in the site's frame as one in the cabin's."""
+        """Convert a position from the site's frame to the cabin's."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         dx, dy = at[0] - self.x, at[1] - self.y
         return c * dx + s * dy, -s * dx + c * dy
 
     def ends(self) -> list[list[float]]:
-        """The places of the left and the right reference anchor."""
+        """Return the positions of the left and the right reference anchor."""
         x, y = -self.offset[0], -self.offset[1]
         return [[*self.outward((x, y + side * self.width / 2.0)), 0.0] for side in (1.0, -1.0)]
 
     @property
     def pose(self) -> list[float]:
-        """[x, y, yaw]"""
+        """Return [x, y, yaw] in the site."""
         return [self.x, self.y, self.yaw]
 
 
 def rectangle(properties: Mapping[str, Any], location: str) -> dict[str, Any]:
-    """The parameters of a lift's cabin."""
+    """Return the parameters of a lift's cabin."""
     name, content = variant(properties.get("cabin"), f"{location}.cabin")
     if name != "Rect":
-        raise_unreadable(f"must be Rect, is {name[:40]!r}", f"{location}.cabin")
+        raise_unreadable(f"must be Rect, not {name[:40]!r}", f"{location}.cabin")
     return mapping(content, f"{location}.cabin")
 
 
 def cabin_offset(rect: Mapping[str, Any], location: str) -> tuple[float, float]:
-    """The cabin's middle from the middle of its reference anchors."""
+    """Return the offset of the cabin's centre from the midpoint of its reference anchors, in metres."""
     front = mapping(rect.get("front_door"), f"{location}.front_door")
     depth = number(rect.get("depth"), f"{location}.depth")
     wall, gap = _or(rect.get("wall_thickness"), CABIN_WALL, location), _or(rect.get("gap"), CABIN_GAP, location)
@@ -411,7 +411,7 @@ def cabin_offset(rect: Mapping[str, Any], location: str) -> tuple[float, float]:
 
 
 def parse_cabin(properties: Mapping[str, Any], left: Sequence[float], right: Sequence[float], location: str) -> Cabin:
-    """The cabin by its parameters and the places of its reference anchors."""
+    """Build the cabin from its parameters and the positions of its reference anchors."""
     rect = rectangle(properties, location)
     dx, dy = left[0] - right[0], left[1] - right[1]
     yaw = math.atan2(-dx, dy) if dx or dy else 0.0
@@ -425,7 +425,7 @@ def parse_cabin(properties: Mapping[str, Any], left: Sequence[float], right: Seq
 
 
 def cabin_door(rect: Mapping[str, Any], face: str, location: str) -> dict[str, Any] | None:
-    """The door on this face in a building's words: its middle in the cabin's frame."""
+    """Convert the door on this face to a building's lift door, centred in the cabin's frame, or None."""
     door = rect.get(face)
     if door is None:
         return None
@@ -442,7 +442,7 @@ def cabin_door(rect: Mapping[str, Any], face: str, location: str) -> dict[str, A
 
 
 def _reach(rect: Mapping[str, Any], face: str, door: Mapping[str, Any], location: str) -> float:
-    """Metres from the cabin's middle to the middle of a door's leaf."""
+    """Return the distance from the cabin's centre to the middle of a door's leaf, in metres."""
     half = number(rect.get("depth" if FACES[face][0] else "width"), location) / 2.0
     wall = _or(rect.get("wall_thickness"), CABIN_WALL, location)
     gap = _or(door.get("custom_gap"), _or(rect.get("gap"), CABIN_GAP, location), location)
@@ -450,7 +450,7 @@ def _reach(rect: Mapping[str, Any], face: str, door: Mapping[str, Any], location
 
 
 def door_placement(door: Mapping[str, Any], rect: Mapping[str, Any], location: str) -> tuple[str, dict[str, Any]]:
-    """(face, placement) of a building's lift door."""
+    """Convert a building's lift door to (face, placement)."""
     x, y = number(door.get("x"), f"{location}.x"), number(door.get("y"), f"{location}.y")
     side = abs(y) * rect["depth"] > abs(x) * rect["width"]
     face = ("left_door" if y > 0 else "right_door") if side else ("front_door" if x >= 0 else "back_door")
@@ -462,7 +462,7 @@ def door_placement(door: Mapping[str, Any], rect: Mapping[str, Any], location: s
 
 
 def door_anchors(rect: Mapping[str, Any], face: str) -> list[dict[str, Any]]:
-    """The anchors left and right of a cabin's door, in the cabin's frame (``level_door_anchors``)."""
+    """Create the anchors left and right of a cabin's door, in the cabin's frame (``level_door_anchors``)."""
     door = rect[face]
     (ux, uy), reach = FACES[face], _reach(rect, face, door, face)
     half = _or(door.get("thickness"), CABIN_DOOR, face) / 2.0
@@ -476,7 +476,7 @@ def door_anchors(rect: Mapping[str, Any], face: str) -> list[dict[str, Any]]:
 
 
 def cabin_size(cabin: Cabin) -> list[float]:
-    """An object's size: along x, along y, and the height that Open-RMF gives each cabin."""
+    """Return an object's size: along x, along y, and Open-RMF's height of every cabin."""
     return [cabin.depth, cabin.width, CABIN_HEIGHT]
 
 
@@ -484,10 +484,10 @@ def cabin_size(cabin: Cabin) -> list[float]:
 
 
 def parse_graphs(choice: Any, numbers_by_id: Mapping[str, int], location: str) -> tuple[int, int]:
-    """(the first graph of an element, how many it is of). numbers_by_id: the graphs' numbers by id, smallest first."""
+    """Return (first graph of an element, number of its graphs). numbers_by_id: graph numbers by id, ascending."""
     name, content = variant("All" if choice is None else choice, location)
     if name not in ("All", "Only", "AllExcept"):
-        raise_unreadable(f"must be All, Only or AllExcept, is {name[:40]!r}", location)
+        raise_unreadable(f"must be All, Only or AllExcept, not {name[:40]!r}", location)
     ids = set() if name == "All" else set(references(content, location)) & numbers_by_id.keys()
     if name == "Only":
         return min((numbers_by_id[i] for i in ids), default=0), len(ids)
@@ -495,7 +495,7 @@ def parse_graphs(choice: Any, numbers_by_id: Mapping[str, int], location: str) -
 
 
 def graph_numbers(graphs: Iterable[tuple[str, Mapping[str, Any]]], ranking: Sequence[str]) -> dict[str, int]:
-    """A building's number of each graph: its name where all are numbers, else its rank."""
+    """Number the graphs as in a building: by name if all names are numbers, else by rank."""
     listed = sorted(graphs, key=lambda item: ranking.index(item[0]) if item[0] in ranking else len(ranking))
     names = [str(graph.get("name")) for _, graph in listed]
     numbered = all(n.isascii() and n.isdigit() and len(n) < 4 for n in names) and len(set(names)) == len(names)
@@ -504,7 +504,7 @@ def graph_numbers(graphs: Iterable[tuple[str, Mapping[str, Any]]], ranking: Sequ
 
 
 def asset(value: Any, location: str) -> tuple[str, str]:
-    """(kind, name) of where something is found."""
+    """Split an asset source into (kind, name)."""
     name, content = variant(value, location)
     return name, text(content, location)
 
@@ -513,7 +513,7 @@ TEXTURES = "OpenRobotics/RMF_Materials/textures/"
 
 
 def texture_parameters(group: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """The texture of a wall or floor in a building's words; nothing where it is of another place."""
+    """Convert a wall's or floor's texture to a building's parameters; none for textures from elsewhere."""
     texture = mapping(group.get("texture"), "texture")
     source, name = asset(texture.get("source", "Local"), "texture")
     if source != "Remote" or not name.startswith(TEXTURES) or not name.endswith(".png"):
@@ -532,7 +532,7 @@ def texture_parameters(group: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 
 def texture_group(parameters: Mapping[str, Any], kind: str) -> dict[str, Any] | None:
-    """A building's texture as a site's group of textures."""
+    """Convert a building's texture to a site's texture group."""
     name = parameter_value(parameters, "texture_name")
     if not isinstance(name, str) or not name:
         return None

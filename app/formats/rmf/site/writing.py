@@ -1,7 +1,7 @@
-"""Writing a site of Open-RMF: from a site as it was read, from a building, navigation graphs, or any other network.
+"""Writing an Open-RMF site from a site, a building, navigation graphs, or any other network.
 
-Elements keep the ids that they had; new ones get the smallest that are free. An element stands on the anchors that it
-had where they are still at its place, else on any anchor there, else on a new one: geometry decides.
+Elements keep their source ids; new ones get the smallest free ids. An element uses its source anchors if they are
+still at its position, else any anchor there, else a new one: geometry takes precedence.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from app.syntax import ron
 
 FILE, FILE_RON = "map.site.json", "map.site.ron"
 ZOOM = 15
-"""Of map tiles behind a site that says none."""
+"""Default zoom level of the map tiles behind a site."""
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``map.site.json`` or ``map.site.ron``, and the drawings that it names.
+    """Write ``map.site.json`` or ``map.site.ron``, and the drawings that it names.
 
-    Raises MissingLayer where there is neither a network nor anything that came from Open-RMF.
+    Raises MissingLayer if there is neither a network nor anything that came from Open-RMF.
     """
     storeys = common.storeys(layers)
     if not storeys:
@@ -49,7 +49,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 class _Writer:
-    """One site being written."""
+    """Writer of one site."""
 
     def __init__(self, draft: Draft) -> None:
         self.draft, self.models = draft, ModelWriter(draft)
@@ -57,7 +57,7 @@ class _Writer:
         self.lifts = LiftWriter(draft)
 
     def site(self) -> dict[str, Any]:
-        """The site as a JSON-like value."""
+        """Return the site as a JSON-like value."""
         self.lifts.write()
         for floor in self.draft.floors:
             self.networks.write_nodes(floor)
@@ -149,12 +149,12 @@ class _Writer:
     def _report(self) -> None:
         draft = self.draft
         for noun, count in sorted(draft.dropped.items()):
-            draft.context.drop(noun, count, "a site has no place for it")
+            draft.context.drop(noun, count, "a site cannot store it")
         if draft.created["lanes"]:
             why = f"{draft.created['lanes']} edges come from another format"
             draft.context.fill("lanes: graphs", draft.options.graph, why, "graph")
             draft.context.fill(
-                "lanes: speed_limit", draft.options.speed_limit, f"{why}, where they have none", "speed_limit"
+                "lanes: speed_limit", draft.options.speed_limit, f"{why}, if they have none", "speed_limit"
             )
         draft.robots.report(draft.context)
         if draft.created["lifts"]:
