@@ -46,9 +46,10 @@ chaos: install-dev
 	@FLEETMAP_CHAOS=$${FLEETMAP_CHAOS:-50} $(BIN)/python -m pytest -s tests/chaos $(ARGS)
 
 # Mutations of every sample through the read boundary, for some minutes: ARGS="--minutes 30 --seed 7 --format kml".
-# First more of what `make test` tries some hundred times: texts in YAML, and odd values of words.
+# First the property tests with 2000 examples each instead of 60, and more odd values of properties.
 fuzz: install-dev
-	@FLEETMAP_EXAMPLES=2000 FLEETMAP_WORDS=50 $(BIN)/python -m pytest -q -n auto tests/formats/test_yaml.py tests/hostile/test_property_types.py
+	@$(BIN)/python -m pytest -q -n auto -m hypothesis --hypothesis-profile fuzz
+	@FLEETMAP_WORDS=50 $(BIN)/python -m pytest -q -n auto tests/hostile/test_property_types.py
 	@$(BIN)/python -m tests.hostile.fuzz $(ARGS)
 
 # The two tables of docs/security.md: hostile input and faults.

@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from app import native
 from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
@@ -26,6 +27,11 @@ from app import native
 for name in native._modules():
     importlib.import_module(name).compile_all()
 """
+
+
+settings.register_profile("test", max_examples=60, deadline=None)
+settings.register_profile("fuzz", max_examples=2000, deadline=None)  # make fuzz
+settings.load_profile("test")
 
 
 def pytest_configure(config: pytest.Config) -> None:

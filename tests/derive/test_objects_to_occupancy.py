@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import derive, parameters, upload_reader
@@ -591,7 +591,6 @@ PLACES = st.sampled_from(
 
 
 @given(st.lists(st.tuples(PLACES, SAID), min_size=1, max_size=3))
-@settings(max_examples=300, deadline=None)
 def test_random_objects_give_grid_or_error(rows: list[Any]) -> None:
     """Problems of one object are reported, and the others are drawn."""
     content = layers(objects(*rows, (shapely.box(0, 0, 1, 1), {"kind": "building"})), files={"a.stl": stl()})

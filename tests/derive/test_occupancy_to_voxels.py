@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import derive, formats
@@ -50,7 +50,6 @@ def grid_of(rows: list[list[int]], **more: Any) -> OccupancyGrid:
 cells = st.lists(st.lists(st.sampled_from([FREE, OCCUPIED, UNKNOWN]), min_size=9, max_size=9), min_size=1, max_size=9)
 
 
-@settings(max_examples=80, deadline=None)
 @given(cells, st.integers(-9, 9), st.integers(-9, 9), st.integers(-3, 3), st.integers(1, 11), st.booleans())
 def test_columns_equal_brute_force(rows: list[list[int]], x: int, y: int, floor: int, tall: int, free: bool) -> None:
     grid = grid_of(rows, origin=(x * 0.5, y * 0.5, 0.0))

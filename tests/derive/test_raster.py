@@ -55,7 +55,7 @@ def clipped(triangle: Any, low: float, high: float) -> Any:
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_surface_paints_touched_cells(seed: int, slice_: bool) -> None:
     random = np.random.default_rng(seed)
     triangles = random.uniform([-2, -3, 0], [5, 5, 2], (4, 3, 3))
@@ -96,7 +96,7 @@ def test_box_covers_exactly_its_cells() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_inside_agrees_with_the_distance_to_spheres(seed: int) -> None:
     random = np.random.default_rng(seed)
     at = random.uniform([-1, -2, 0], [4, 4, 1], (5, 3))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import derive, formats
@@ -93,7 +93,6 @@ def test_real_trees_are_projected_at_full_height(
 codes = st.tuples(st.integers(12, 16), st.integers(0, 2**15), st.sampled_from([-1.0, 2.0]))
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.lists(codes, min_size=1, max_size=12), st.integers(-5, 9), st.integers(1, 12))
 def test_bands_of_small_trees_equal_brute_force(rows: list[tuple[int, int, float]], start: int, tall: int) -> None:
     middle = sum(7 << 3 * k for k in range(15))  # the octant 0 of the root is all below the origin: shift to its middle

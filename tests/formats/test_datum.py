@@ -14,7 +14,7 @@ import pytest
 import ryml
 import shapely
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import formats
@@ -294,7 +294,6 @@ scalars = st.none() | st.booleans() | st.integers(-1000, 1000) | st.floats(-1e9,
 more = st.dictionaries(st.text("abcdef", min_size=1, max_size=5), scalars | st.lists(scalars, max_size=3), max_size=3)
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     degrees, degrees, st.floats(-10, 10), st.lists(st.tuples(degrees, degrees), min_size=3, max_size=8, unique=True),
     st.booleans(), more, more, more,

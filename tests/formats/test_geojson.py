@@ -16,7 +16,7 @@ import numpy as np
 import orjson
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import formats
@@ -174,7 +174,6 @@ rows = st.builds(
 
 
 @given(st.lists(rows, max_size=5))
-@settings(max_examples=150, deadline=None)
 def test_any_collection_round_trips(features_: list[dict[str, Any]]) -> None:
     top = orjson.loads(orjson.dumps(collection(*features_)))
     assert orjson.loads(write(read(orjson.dumps(top)))) == top

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
@@ -589,7 +589,6 @@ VALUES = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=200)
 @given(name=TEXTS, properties=st.dictionaries(TEXTS, VALUES, max_size=5))
 def test_any_property_round_trips(name, properties):
     node_properties = {"kind": "node", **properties, "name": name}
@@ -598,7 +597,6 @@ def test_any_property_round_trips(name, properties):
     equal(layers, load(save(layers))[0])
 
 
-@settings(deadline=None, max_examples=100)
 @given(name=TEXTS)
 def test_any_placemark_name_round_trips(name):
     layers, _ = load(placemark("<name>old</name><Point><coordinates>7,50</coordinates></Point>"))
@@ -634,7 +632,6 @@ def test_coordinate_text_is_plain_or_irregular(text, points):
     assert parts == [[[1, 2, 3]], points or [], [[4, 5, 0], [6, 7, 0]]]
 
 
-@settings(deadline=None, max_examples=200)
 @given(st.lists(st.lists(st.tuples(st.floats(-180, 180), st.floats(-90, 90)), max_size=5), max_size=5))
 def test_coordinates_round_trip_exactly(lists):
     texts = [" ".join(f"{x!r},{y!r}" for x, y in points) for points in lists]
@@ -721,7 +718,6 @@ def test_truncated_files_are_refused_or_read():
             load(data[:length])
 
 
-@settings(deadline=None, max_examples=150)
 @given(st.data())
 def test_mutated_files_are_refused_or_read(data):
     body = bytearray((SAMPLES / "orchard.kml").read_bytes())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -507,7 +507,6 @@ THRESHOLDS = st.one_of(st.floats(0, 1), st.sampled_from([0.0, 0.01, 0.196, 0.25,
     low=THRESHOLDS,
     kind=st.sampled_from([{}, {"file_type": "pgm"}, {"file_type": "png"}]),
 )
-@settings(max_examples=300, deadline=None)
 def test_any_uploaded_grid_round_trips(
     facts: Any, pixels: list[int], mode: str, negate: bool, high: float, low: float, kind: dict[str, str]
 ) -> None:
@@ -535,7 +534,6 @@ def test_any_uploaded_grid_round_trips(
     low=THRESHOLDS,
     kind=st.sampled_from([{}, {"file_type": "pgm"}, {"file_type": "png"}]),
 )
-@settings(max_examples=300, deadline=None)
 def test_any_stored_grid_round_trips(
     facts: Any, cells: list[int], mode: Any, negate: bool, high: float, low: float, kind: dict[str, str]
 ) -> None:
@@ -561,7 +559,6 @@ JSON = st.recursive(
 
 
 @given(extra=st.dictionaries(st.text(st.characters(codec="utf-8"), max_size=8), JSON, max_size=4))
-@settings(max_examples=300, deadline=None)
 def test_extra_keys_of_any_kind_round_trip(extra: dict[str, Any]) -> None:
     extra = {k: v for k, v in extra.items() if k not in KEYS}
     grid = grid_of([[0]], properties={"occupancy_grid": extra} if extra else {})
@@ -570,7 +567,6 @@ def test_extra_keys_of_any_kind_round_trip(extra: dict[str, Any]) -> None:
 
 
 @given(st.floats(1e-6, 1e4), st.tuples(*[st.floats(-1e7, 1e7)] * 3))
-@settings(max_examples=200, deadline=None)
 def test_numbers_round_trip_exactly(resolution: float, origin: tuple[float, float, float]) -> None:
     again, _ = read(write(OccupancyGrid(np.zeros((1, 1), np.uint8), resolution, origin))[0])
     assert (again.resolution, again.origin) == (resolution, origin)
@@ -617,7 +613,6 @@ def test_finer_cells_are_copies() -> None:
     old=st.sampled_from([0.05, 0.1, 0.03, 1.0]),
     new=st.sampled_from([0.05, 0.1, 0.02, 0.07, 0.25, 3.0, 0.013]),
 )
-@settings(max_examples=200, deadline=None)
 def test_resampling_matches_covered_areas(cells: list[list[int]], old: float, new: float) -> None:
     grid = grid_of(cells, old)
     out = resample(grid, new)
@@ -747,7 +742,6 @@ def test_truncated_and_mutated_files_are_rejected_or_read(name: str) -> None:
 
 
 @given(st.binary(max_size=200), st.booleans())
-@settings(max_examples=200, deadline=None)
 def test_any_bytes_are_rejected_or_read(data: bytes, after: bool) -> None:
     files = {"map.yaml": YAML + data if after else data, "map.pgm": PGM}
     FORMAT.detect("map.yaml", files["map.yaml"])

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import formats
@@ -297,7 +297,6 @@ def test_written_bytes_equal_library(seed: int, tmp_path: Path) -> None:
 
 
 # --- laws ---------------------------------------------------------------------------------------------------------
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.booleans())
 def test_any_tree_round_trips(seed: int, colour: bool) -> None:
     voxels = random_tree(seed, colour=colour)

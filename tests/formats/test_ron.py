@@ -6,7 +6,7 @@ import string
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import TooLarge, UnreadableFile
@@ -99,7 +99,6 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=80, deadline=None)
 @given(VALUES)
 def test_written_ron_reads_back_equal(value: Any) -> None:
     assert ron.load(ron.dump(value, vocabulary.SHAPE), LIMITS) == value

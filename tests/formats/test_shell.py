@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import TooLarge, UnreadableFile
@@ -184,7 +184,6 @@ def test_hostile_repetition_is_quick(piece: str) -> None:
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=300, deadline=None)
 def test_any_bytes_are_parsed_without_error(data: bytes) -> None:
     try:
         variables, _ = shell.assignments(data)
@@ -223,7 +222,6 @@ def test_values_match_real_shell(tmp_path: Path) -> None:
         st.sampled_from(["A", "B_1", "FIELD_NAME"]), st.text(st.characters(categories=["L", "N", "P", "S", "Zs"]))
     )
 )
-@settings(deadline=None)
 def test_exports_read_back(wanted: dict[str, str]) -> None:
     text = {name: value for name, value in wanted.items() if value.isprintable()}
     assert shell.assignments(shell.exports(text)) == (text, [])

@@ -14,7 +14,7 @@ import pytest
 import ryml
 import shapely
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app import formats
@@ -575,7 +575,6 @@ def plain(top: dict[str, Any]) -> dict[str, Any]:
     return top
 
 
-@settings(max_examples=150, deadline=None)
 @given(networks())
 def test_any_network_round_trips(top: dict[str, Any]) -> None:
     text = yaml.safe_dump(top, allow_unicode=True)

@@ -1,11 +1,7 @@
-"""YAML: what scalars mean, what is refused and on which line, and that the quick way and libyaml's agree.
-
-``FLEETMAP_EXAMPLES=5000 pytest tests/formats/test_yaml.py`` (a part of ``make fuzz``) looks longer than CI does.
-"""
+"""YAML: meaning of scalars, refusals with their lines, and agreement of the fast reader with libyaml."""
 
 from __future__ import annotations
 
-import os
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -16,7 +12,7 @@ import orjson
 import pytest
 import ryml
 import yaml as pyyaml
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile
@@ -27,8 +23,6 @@ from app.syntax.yaml.events import load_events
 from app.syntax.yaml.lines import NotSimpleError, load_lines
 
 LIMITS = Limits()
-
-examples = settings(max_examples=int(os.environ.get("FLEETMAP_EXAMPLES", "200")), deadline=None)
 
 
 def load(text: str | bytes) -> Any:
@@ -267,7 +261,6 @@ line = st.tuples(
 )  # fmt: skip
 
 
-@examples
 @given(st.lists(line, max_size=9), st.sampled_from(["\n", "\n", "\r\n"]))
 @example([(0, "", ["k: &n"], ""), (0, "- ", ["a"], ""), (0, "", ["b"], ": "), (0, "- ", ["*n"], "")], "\n")
 @example([(0, "", ["a", "1"], ": "), (2, "", ["b c"], "")], "\n")
@@ -285,7 +278,6 @@ FLOWING = [
 ]  # fmt: skip
 
 
-@examples
 @given(
     st.lists(
         st.tuples(
@@ -316,7 +308,6 @@ flowing = st.recursive(
 )
 
 
-@examples
 @given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
 def test_flow_rows_use_fast_parser(rows: list[Any]) -> None:
     text = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
@@ -340,7 +331,6 @@ def test_limits_hold_for_collections_in_flow_style() -> None:
     assert yaml.load(b"a:\n" + rows, Limits(yaml_depth=5))["a"][9] == [1, 2, {"a": [4, True], "b": [1, ""]}]
 
 
-@examples
 @given(st.text("ab1.-: \n'\"#[]{}&*!|>~é", max_size=60))
 def test_fast_and_full_parsers_agree_on_any_text(text: str) -> None:
     value = quick(text)
@@ -348,7 +338,6 @@ def test_fast_and_full_parsers_agree_on_any_text(text: str) -> None:
         assert orjson.dumps(value) == orjson.dumps(load_events(text, LIMITS)), text
 
 
-@examples
 @given(st.binary(max_size=200))
 def test_any_bytes_are_read_or_refused(data: bytes) -> None:
     try:
@@ -377,7 +366,6 @@ values = st.recursive(
 )
 
 
-@examples
 @given(st.dictionaries(texts, values, min_size=1, max_size=5))
 def test_written_yaml_reads_back_equal_also_in_pyyaml(value: dict[str, Any]) -> None:
     text = yaml.mapping(value, 0)
@@ -386,7 +374,6 @@ def test_written_yaml_reads_back_equal_also_in_pyyaml(value: dict[str, Any]) -> 
     assert yaml.mapping(dict(reversed(value.items())), 0) == text
 
 
-@examples
 @given(st.dictionaries(texts, values, min_size=1, max_size=5), st.randoms(use_true_random=False))
 def test_fast_and_full_parsers_agree_on_damaged_documents(value: dict[str, Any], random: Any) -> None:
     lines = yaml.mapping(value, 0).split("\n")
@@ -418,7 +405,6 @@ plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x
 )
 
 
-@examples
 @given(
     st.dictionaries(plain, plain | st.booleans() | st.integers(-1000, 1000) | st.lists(plain, max_size=3), min_size=1)
 )

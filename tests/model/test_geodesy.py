@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import CRS, Geod, Transformer
 
@@ -125,7 +125,6 @@ def test_points_across_antimeridian_stay_neighbours() -> None:
 
 
 @given(DATUMS, st.floats(-10_000, 10_000), st.floats(-10_000, 10_000))
-@settings(max_examples=300, deadline=None)
 def test_any_local_point_round_trips(datum: Datum, x: float, y: float) -> None:
     frame = local_frame(datum)
     lonlat = frame.to_wgs84(np.array([[x, y]]))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import Invalid, MissingDatum
@@ -220,7 +220,6 @@ lines = st.lists(st.lists(st.tuples(coordinate, coordinate), min_size=2, max_siz
 
 
 @given(lines)
-@settings(max_examples=80, deadline=None)
 def test_network_invariants_hold_for_any_drawing(drawn: list[list[tuple[float, float]]]) -> None:
     """Every vertex is within ``join`` of a node, nodes are apart, edges join nodes, and the result is reproducible."""
     objects = features([(str(k), shapely.LineString(c), {"kind": "path"}) for k, c in enumerate(drawn)], "local")

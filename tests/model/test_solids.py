@@ -95,7 +95,7 @@ def test_pose_rotates_about_fixed_axes() -> None:
 
 
 @given(st.tuples(*[st.floats(-4, 4)] * 3))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_pose_rotation_agrees_with_scipy(angles: tuple[float, float, float]) -> None:
     from scipy.spatial.transform import Rotation
 

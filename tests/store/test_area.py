@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.model.features import features
@@ -42,19 +42,16 @@ def check(area: Area) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-180, 180), st.floats(-90, 90)), min_size=3, max_size=9))
-@settings(max_examples=300, deadline=None)
 def test_area_of_any_polygon_in_degrees_is_valid(points: list[tuple[float, float]]) -> None:
     check(area_of(shapely.Polygon(points), "wgs84"))
 
 
 @given(st.lists(st.tuples(METRES, METRES), min_size=3, max_size=7), DATUMS)
-@settings(max_examples=200, deadline=None)
 def test_area_of_any_polygon_in_metres_is_valid(points: list[tuple[float, float]], datum: Datum) -> None:
     check(area_of(shapely.Polygon(points), "local", datum))
 
 
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(1e-5, 5), st.floats(1e-5, 5))
-@settings(max_examples=200, deadline=None)
 def test_box_area_covers_its_middle_and_no_point_outside(x: float, y: float, width: float, height: float) -> None:
     corners = np.array(shapely.box(x - width, y - height, x + width, y + height).exterior.coords)
     corners[:, 0] = (corners[:, 0] + 180.0) % 360.0 - 180.0

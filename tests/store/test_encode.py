@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import Damaged, Invalid
@@ -90,7 +90,6 @@ json_values = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(st.dictionaries(st.text(), json_values, max_size=4), min_size=1, max_size=5))
 def test_properties_round_trip_exactly(properties):
     ids = [f"i{k}" for k in range(len(properties))]
@@ -102,7 +101,6 @@ def test_properties_round_trip_exactly(properties):
     assert encode.pack_properties(ids, back) == packed
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1)), min_size=1, max_size=20))
 def test_interleave_is_reversible(pairs):
     x, y = (np.array(v, np.uint64) for v in zip(*pairs, strict=True))

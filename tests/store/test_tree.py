@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.errors import Invalid
@@ -61,7 +61,6 @@ def small_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tree, "check_leaves", lambda root: None)
 
 
-@settings(max_examples=150, deadline=None)
 @given(edits)
 def test_edited_tree_equals_rebuilt_tree(rounds: list[tuple[dict[bytes, int], set[bytes]]]):
     tree.FANOUT_BITS = 2
