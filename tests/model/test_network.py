@@ -194,7 +194,7 @@ def test_the_datums_frame_and_mixed_anchors() -> None:
 
 def test_a_drawing_of_the_whole_earth_is_refused() -> None:
     rows = [("a", line((-170, 0), (0, 0)), {}), ("b", line((90, 80), (150, -80)), {})]
-    with pytest.raises(Invalid, match="too large an area"):
+    with pytest.raises(Invalid, match="too much of the earth"):
         from_drawing(features(rows, "wgs84"))
 
 
