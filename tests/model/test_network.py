@@ -194,7 +194,7 @@ def test_network_of_mixed_anchors_uses_datum() -> None:
 
 def test_drawing_of_whole_earth_is_rejected() -> None:
     rows = [("a", line((-170, 0), (0, 0)), {}), ("b", line((90, 80), (150, -80)), {})]
-    with pytest.raises(Invalid, match="too large an area"):
+    with pytest.raises(Invalid, match="too much of the earth"):
         from_drawing(features(rows, "wgs84"))
 
 
