@@ -62,7 +62,7 @@ Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
 
 
 def samples() -> list[Any]:
-    """Every real file on SQLite; on PostgreSQL, which stores the same chunks, the largest file of each kind."""
+    """Return every real file for SQLite; for PostgreSQL, which stores the same chunks, the largest of each kind."""
     path = SHARED / "data" / "facts.json"
     if not path.is_file():
         return [pytest.param("sqlite", "", "", id="absent")]

@@ -104,7 +104,7 @@ def problem(answer: httpx.Response) -> dict[str, Any]:
 
 @contextmanager
 def running(settings: Settings, verify: ssl.SSLContext | bool = False) -> Iterator[Api]:
-    """A server with these settings until the block ends. verify: whose certificate to believe, of HTTPS."""
+    """Run a server with these settings. verify: TLS settings of its client, for HTTPS."""
     app = create_app(settings)
     server = uvicorn.Server(server_config(settings, app, port=0))
     thread = threading.Thread(target=server.run)

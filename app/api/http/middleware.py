@@ -138,7 +138,7 @@ class Guard:
 
 
 def _template(scope: Scope) -> str:
-    """The path template of the route that answered, ``other`` if none did."""
+    """Return the path template of the route that responded, ``other`` if none did."""
     return str(getattr(scope.get("route"), "path", "")) or "other"
 
 

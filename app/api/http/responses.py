@@ -108,7 +108,7 @@ class StrictRoute(APIRoute):
 
 
 def api_router(tag: str, prefix: str = "") -> APIRouter:
-    """A router for one noun, below ``/api/v1`` and ``prefix``; tag: its heading in the documentation."""
+    """Create the router of a resource below ``/api/v1`` and ``prefix``. tag: its heading in the documentation."""
     return APIRouter(prefix=API + prefix, tags=[tag], route_class=StrictRoute)
 
 
