@@ -52,7 +52,7 @@ SETS: Final[Mapping[str, TemplateSet]] = {
         },
     ),
     "indoor": TemplateSet(
-        "Offices and wards: narrow goals, slow robots, rooms as high as usual",
+        "Offices and wards: narrow goals, slow robots, rooms of normal height",
         {
             "tmap2": {"verts_radius": 0.5, "xy_goal_tolerance": 0.2},
             "tmap": {"verts_radius": 0.5, "xy_goal_tolerance": 0.2, "top_vel": 0.5},

@@ -37,10 +37,10 @@ from tests.conftest import TOP
 from tests.hostile import corpus
 from tests.hostile.corpus import Case
 from tests.hostile.test_connections import REFUSED, read_to_end, send_head, trickle
+from tests.hostile.test_decompression import uploads
 from tests.hostile.test_kill import kill_while_uploads_arrive
 from tests.hostile.test_misreadings import HERE, ROWS, bad_binaries, changed
 from tests.hostile.test_requests import invalid_requests
-from tests.hostile.test_unfolding import uploads
 from tests.postgres import running_cluster
 
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}

@@ -80,7 +80,7 @@ def uploads() -> Iterator[tuple[str, bytes]]:
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[Pool]:
-    pool = Pool(1, warm=("app.upload_reader", "tests.hostile.test_unfolding"))
+    pool = Pool(1, warm=("app.upload_reader", "tests.hostile.test_decompression"))
     yield pool
     pool.close()
 
