@@ -92,9 +92,7 @@ class Perturbation:
         0.15, "maximum distance by which a whole row of objects is moved", minimum=0.0, maximum=100.0, unit="m"
     )
     missing: float = parameter(0.03, "share of objects that are removed", minimum=0.0, maximum=1.0)
-    largest: float = parameter(
-        5.0, "maximum length of objects that are moved or removed", minimum=0.05, maximum=1000.0, unit="m"
-    )
+    largest: float = parameter(5.0, "maximum length of changed objects", minimum=0.05, maximum=1000.0, unit="m")
     obstacles: int = parameter(3, "number of new obstacles on each level", minimum=0, maximum=10_000)
     obstacle_size: tuple[float, float] = parameter(
         (0.3, 1.0), "smallest,largest diameter of new obstacles", minimum=0.05, maximum=50.0, unit="m"
@@ -124,9 +122,8 @@ class Perturbation:
 def perturbation(given: Layers, options: Perturbation, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Disturbed environment: objects shifted, removed and added, noise on its grids, a network that still fits.
 
-    Objects stay in their family and keep their ids; new ones are of the family ``perturbation``. Grids keep their
-    frame. Voxels, zones and images do not change. Raises CannotGenerate if the environment is too large, or there is no
-    such level.
+    Objects keep their family and ids; new ones are of the family ``perturbation``. Grids keep their frame. Voxels,
+    zones and images do not change. Raises CannotGenerate if the environment is too large, or there is no such level.
     """
     low, high = options.obstacle_size
     if low > high:

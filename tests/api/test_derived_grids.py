@@ -74,7 +74,7 @@ def test_fence_gives_a_blank_grid_and_bounds_derived_grids(api: Api) -> None:
     api.upload("paddock", {"datum.yaml": FENCE})
     grey, _ = fetch_grid(api, "paddock")
     assert set(np.unique(grey)) <= {205, 254}
-    assert any("blank" in w["problem"] for w in fetch_report(api, "paddock")["warnings"])
+    assert any("grid is empty" in w["problem"] for w in fetch_report(api, "paddock")["warnings"])
     api.upload("paddock", {"map.osm": TOWN})
     grey, map_yaml = fetch_grid(api, "paddock")
     assert map_yaml["origin"] == [0, 0, 0]
