@@ -1,4 +1,4 @@
-"""ffr_network: points and the lines between their coordinates come back, in both directions, nothing lost."""
+"""ffr_network: points and lines between their coordinates round-trip, in both directions, without loss."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def write(part: Features) -> tuple[dict[str, Any], WriteContext]:
 
 
 def seeds_tmap(data: dict[str, Any]) -> set[tuple[str, str]]:
-    """Lines as ffrnetwork_to_tmap.py finds them: points by their coordinates' text; KeyError where it would fail."""
+    """Find lines as ffrnetwork_to_tmap.py does, points by their coordinates' text; KeyError if it would fail."""
     nodes = {f"x{n['x']}y{n['y']}": n["name"] for n in data["internal_points"]}
     return {
         (nodes[f"x{e['start']['x']}y{e['start']['y']}"], nodes[f"x{e['end']['x']}y{e['end']['y']}"])
@@ -46,7 +46,7 @@ def seeds_tmap(data: dict[str, Any]) -> set[tuple[str, str]]:
 
 
 def plain(value: Any) -> Any:
-    """Without the order of lists and keys, and the difference of 0 and 0.0."""
+    """Normalise the order of lists and keys, and 0 and 0.0."""
     if isinstance(value, dict):
         return {key: plain(value[key]) for key in sorted(value)}
     if isinstance(value, list):
