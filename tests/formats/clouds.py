@@ -1,4 +1,4 @@
-"""Small readers of cloud files for tests: slow, plain, and without a line of the product's."""
+"""Small readers of cloud files for tests: slow, simple, and independent of the product's code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PLY = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint
 
 
 def pcd(data: bytes) -> tuple[dict[str, str], list[list[Any]]]:
-    """Header and points: each a list of all values, padding left out, floats as they are in their type."""
+    """Return header and points, each a list of all values without padding, floats in their own precision."""
     head, _, rest = data.partition(b"DATA ")
     kind, _, body = rest.partition(b"\n")
     header = {
@@ -52,7 +52,7 @@ def pcd(data: bytes) -> tuple[dict[str, str], list[list[Any]]]:
 
 
 def lzf(data: bytes) -> bytes:
-    """The bytes behind an LZF stream."""
+    """Decompress an LZF stream."""
     out = bytearray()
     stream = iter(data)
     for control in stream:
@@ -67,7 +67,7 @@ def lzf(data: bytes) -> bytes:
 
 
 def ply(data: bytes) -> tuple[list[str], list[list[Any]]]:
-    """Property names and vertices of a PLY whose first element they are, without lists."""
+    """Return property names and vertices of a PLY with vertices as first element, without lists."""
     head, _, body = data.partition(b"end_header\n")
     lines = head.decode().splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith("element vertex"))

@@ -1,4 +1,4 @@
-"""environment: all maps of a place in one archive, scripts whose paths are there, and the same information back."""
+"""environment: all maps of a place in one archive, scripts with valid paths, round trips."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def unzipped(data: bytes) -> dict[str, bytes]:
 
 
 def maps_of(package: dict[str, bytes]) -> dict[str, bytes]:
-    """A package without the stored layers beside its maps."""
+    """Return a package without its exact copy of the stored layers."""
     return {n: d for n, d in package.items() if not n.startswith("config/fleet_map/")}
 
 
@@ -86,7 +86,7 @@ VARIABLES = PartKey("objects", "ground", "environment")
 
 
 def sourced(files: dict[str, bytes], root: Path) -> dict[str, str]:
-    """What a robot has after ``source config/environment.sh``: every exported variable, from a clean bash."""
+    """Return every variable exported by ``source config/environment.sh`` in a clean bash."""
     for name, data in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes(data)
@@ -104,7 +104,7 @@ def sourced(files: dict[str, bytes], root: Path) -> dict[str, str]:
 
 
 def check_paths(values: dict[str, str], root: Path) -> set[str]:
-    """Each variable that names a file names one that is there; the names of those."""
+    """Check that variables with file paths refer to existing files; return their names."""
     named = set()
     for name, value in values.items():
         if name.endswith(("_FILE", "_MODELS")) and value:
@@ -240,7 +240,9 @@ def test_report_covers_every_map() -> None:
     assert ("occupancy", "nogo") in lines
     assert any(d["what"].startswith("config/location/datum.yaml: ") for d in report["template"])
     files = {w["file"] for w in report["warnings"]}
-    assert "config/metric/nogo/map.yaml" in files, "the turned grid of a map inside is told by its path here"
+    assert "config/metric/nogo/map.yaml" in files, (
+        "the rotated grid of an inner map is reported by its path in the package"
+    )
 
 
 # --- what is put in ------------------------------------------------------------------------------------------------
@@ -350,7 +352,7 @@ def test_images_and_clouds_are_in_their_directories() -> None:
 
 
 def test_failed_map_is_reported_and_others_are_written() -> None:
-    """A network in metres without a datum: no drawing of it on earth, but the network itself."""
+    """A network in metres without a datum gives no geographic drawing, but the network itself."""
     line = shapely.LineString([(0.0, 0.0), (5.0, 0.0)])
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(0.0, 0.0), {"kind": "node"}),
@@ -551,7 +553,7 @@ def offline_layers() -> Layers:
 
 
 def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:
-    """What the store would call these parts."""
+    """Return the store's hashes of these parts."""
     encoded_parts = {key: store_parts.compose(ChunkStage(lambda _: {}), part, None, "") for key, part in parts.items()}
     return {key: part.hash for key, part in encoded_parts.items() if part is not None}
 

@@ -1,4 +1,4 @@
-"""Gazebo: worlds worked out by hand, real worlds, libsdformat's own check where it is installed, grids as walls."""
+"""gazebo: worlds computed by hand, real worlds, libsdformat's own check if installed, grids as walls."""
 
 # ruff: noqa: E501 - lines of XML
 
@@ -70,7 +70,7 @@ def world(inner: str, version: str = "1.7", name: str = "w") -> dict[str, bytes]
 
 
 def one(inner: str, **more: Any) -> dict[str, Any]:
-    """The properties of the first object of a world."""
+    """Return the properties of the first object of a world."""
     return dict(objects(read_upload(world(inner, **more))).properties[0])
 
 
@@ -91,7 +91,7 @@ def report(
 
 
 def check(files: dict[str, bytes]) -> list[str]:
-    """What libsdformat says against a bundle but what it cannot find (nothing where it is not installed)."""
+    """Return libsdformat's complaints about a bundle, except missing files (none if it is not installed)."""
     if CHECKER is None:
         return []
     import tempfile
@@ -131,7 +131,7 @@ def test_yard_matches_values_computed_by_hand() -> None:
     }  # fmt: skip
     by = {f.id: f for f in part}
     quarter = round(math.pi / 2, 9)
-    # The sign stands 2 m along the x axis of a frame at (10, 20) that is turned by 90 degrees: north of it.
+    # The sign is 2 m along the x axis of a frame at (10, 20) rotated by 90 degrees: north of it.
     assert by["sign"].properties["pose"] == [10.0, 22.0, 0.0, 0.0, 0.0, quarter]
     # Nothing of the sign collides, so what is seen of it is its solid; its board is turned once more: along x again.
     assert by["sign"].properties["shapes"] == [
@@ -147,10 +147,10 @@ def test_yard_matches_values_computed_by_hand() -> None:
     ]  # fmt: skip
     assert by["crate"].properties["size"] == [2.0, 1.0, 1.0]
     assert by["crate"].geometry.bounds == pytest.approx((-3.5, -5.0, -2.5, -3.0))
-    # An include without a pose stands where its model says.
+    # An include without a pose uses the pose of its model.
     assert by["spare crate"].properties["pose"] == [7.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert by["oak"].geometry == shapely.Point(5, 5), "only its position is in the upload"
-    # The gate stands 1 m north of its model at (0, 8), its right post 4 m right of the left one.
+    # The gate is 1 m north of its model at (0, 8), its right post 4 m right of the left one.
     assert by["entrance"].geometry.bounds == pytest.approx((-2.1, 8.9, 2.1, 9.1))
     assert by["entrance"].geometry.area == pytest.approx(0.08)
     assert by["ground_plane"].geometry.bounds == (-30.0, -20.0, 30.0, 20.0)
@@ -197,7 +197,7 @@ def test_heading_is_negated_in_datum() -> None:
 
 
 def test_coordinates_match_libignition_math() -> None:
-    """Latitude 53.27, longitude -0.52, heading_deg 30: (100, 0) lies at 53.2704492641, -0.5187019410 and (0, 100) at
+    """Latitude 53.27, longitude -0.52, heading_deg 30: (100, 0) is at 53.2704492641, -0.5187019410 and (0, 100) at
     53.2707781582, -0.5207494405 (libignition-math 6.10, LOCAL2 to SPHERICAL)."""
     place = (
         "<spherical_coordinates><latitude_deg>53.27</latitude_deg><longitude_deg>-0.52</longitude_deg>"
@@ -216,7 +216,7 @@ def test_orchard_list_becomes_a_world() -> None:
     part = objects(bundle)
     assert part.ids == ("grass", "tree", "tree#2", "shed", "barrow")
     by = {f.id: f for f in part}
-    # The trunk stands 1 m along x of the tree's frame, which is turned by 90 degrees at (4, 3): at (4, 4).
+    # The trunk is 1 m along x of the tree's frame, which is rotated by 90 degrees at (4, 3): at (4, 4).
     x, y = by["tree"].geometry.centroid.coords[0]
     assert (x, y) == pytest.approx((4.0, 4.0), abs=1e-6)
     assert by["tree#2"].geometry.centroid.coords[0] == pytest.approx((-3.0, 0.0), abs=1e-6)
@@ -311,7 +311,7 @@ def test_frames_in_worlds_and_models_are_resolved() -> None:
     )
     pose = {f.id: [round(v, 6) + 0.0 for v in f.properties["pose"][:3]] for f in part}
     # a looks north at (10, 0); b is 2 m in front of it; a's link 1 m in front, c 2 m in front of that; f is 1 m left of
-    # b, which is west; e stands so that its link is at (5, 5).
+    # b, which is west; e is placed so that its link is at (5, 5).
     assert pose == {
         "a": [10, 0, 0], "b": [10, 2, 0], "c": [10, 3, 0], "d": [9, 2, 5], "e": [4, 4, 0],
     }  # fmt: skip
@@ -325,7 +325,7 @@ def test_frames_in_worlds_and_models_are_resolved() -> None:
         "<collision name='c'><geometry><sphere><radius>2</radius></sphere></geometry></collision></link></model>"
         "</model>"
     )
-    # q is 1 m above p, the joint stands 3 m along x in q's frame, the sphere half a metre above; n beside q.
+    # q is 1 m above p, the joint is 3 m along x in q's frame, the sphere half a metre above; n beside q.
     assert {(s["radius"], *s["pose"][:3]) for s in inside["shapes"]} == {(1.0, 3.0, 0.0, 2.5), (2.0, 1.0, 0.0, 2.0)}
 
 
@@ -403,7 +403,7 @@ def test_shapes_round_trip() -> None:
 
 # --- uploads -----------------------------------------------------------------------------------------------------
 def test_several_worlds_share_one_part() -> None:
-    """Each world keeps its own objects and settings; asking for one gives nothing of the others."""
+    """Each world keeps its own objects and settings; a selected world contains nothing of the others."""
     first = b'<sdf version="1.5"><world name="one"><gravity>0 0 -1</gravity><model name="m"><link name="l"/></model></world></sdf>'
     second = b'<sdf version="1.6"><world name="two"><wind/><model name="m"><link name="k"/></model></world></sdf>'
     files = {"w/short.world": first, "w/longer.world.xml": second}
@@ -459,7 +459,7 @@ def test_model_becomes_a_world_when_upload_has_none() -> None:
 
 
 def test_files_of_a_world_are_no_other_maps() -> None:
-    """A mesh, a texture or a list in a model's folder is no map of its own."""
+    """A mesh, a texture or a list in a model's directory is no separate map."""
     kml = (
         b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>p</name></Placemark></Document></kml>'
     )
@@ -511,7 +511,7 @@ def test_library_never_reads_outside_upload(uri: str) -> None:
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
     bundle = read_upload(files)
-    assert objects(bundle).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "a solid that nobody can read"
+    assert objects(bundle).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "an unreadable solid"
     assert any("supply" in w.problem or "kept" in w.problem for w in bundle.warnings)
     assert uri in offline(files, "gazebo").files["world.sdf"].decode()
 
@@ -796,7 +796,7 @@ def test_written_versions_load_in_libsdformat(version: str) -> None:
 
 # --- real worlds -------------------------------------------------------------------------------------------------
 def real_worlds(shared: Path) -> list[tuple[str, Path, dict[str, bytes]]]:
-    """(key in facts.json, path, the files it is uploaded with)."""
+    """Return (key in facts.json, path, uploaded files)."""
     out = []
     for path in sorted((shared / "data").rglob("*")):
         if path.is_file() and path.name.endswith((".world", ".sdf", ".world.xml")) and b"<world" in path.read_bytes():
@@ -812,7 +812,7 @@ def real_worlds(shared: Path) -> list[tuple[str, Path, dict[str, bytes]]]:
 
 
 def test_real_worlds_match_facts_and_round_trip(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
-    """Also: libsdformat says nothing against what is written that it does not say against the original."""
+    """libsdformat reports no errors for written files beyond those for the originals."""
     worlds = real_worlds(shared)
     assert len(worlds) > 10
     for key, path, files in worlds:
@@ -845,7 +845,7 @@ def test_real_worlds_match_facts_and_round_trip(shared: Path, facts_json: dict[s
 
 
 def test_real_models_match_expected_shapes(shared: Path, facts_json: dict[str, Any]) -> None:
-    """Collision geometry of lone models by kind, against the independent count; meshes only where they are there."""
+    """Collision geometry of single models by kind equals an independent count; meshes only if available."""
     seen = 0
     for key, entry in facts_json.items():
         facts = entry.get("facts") or {}

@@ -1,4 +1,4 @@
-"""las, laz: facts worked out by hand, laspy reads what is written, CRS and datum, lies in headers are found before
+"""las, laz: values computed by hand, laspy reads written files, CRS and datum, wrong headers are rejected before
 anything is allocated."""
 
 from __future__ import annotations

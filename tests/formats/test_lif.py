@@ -1,4 +1,4 @@
-"""lif: real layouts come back the same, facts hold on every level, what all vehicles share is canonical."""
+"""lif: real layouts round-trip, levels match facts, members that all vehicles share are canonical."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def item(layers: Layers, i: str, layer: Any = "topology") -> dict[str, Any]:
 
 
 def check(data: bytes) -> dict[str, Any]:
-    """The required members of LIF 1.0, and that references lead somewhere."""
+    """Check the required members of LIF 1.0, and that references are valid."""
     top: dict[str, Any] = json.loads(data)
     meta = top["metaInformation"]
     assert all(isinstance(meta[w], str) for w in ("projectIdentification", "creator", "exportTimestamp", "lifVersion"))

@@ -1,4 +1,4 @@
-"""Occupancy grids: equal to Nav2's rule on real maps, whole after a round trip, refused with key and line when bad."""
+"""occupancy_grid: equal to Nav2's rule on real maps, round trips, errors with key and line."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def write(layers: Layers | OccupancyGrid, **options: str) -> tuple[dict[str, byt
 
 
 def grid_of(rows: list[list[int]], resolution: float = 1.0, **more: Any) -> OccupancyGrid:
-    """Rows as a person sees them: the top one first."""
+    """Return the rows of a grid, the top one first."""
     return OccupancyGrid(np.array(rows, np.uint8)[::-1].copy(), resolution, **more)
 
 
@@ -67,7 +67,7 @@ def seen(grid: OccupancyGrid) -> list[list[int]]:
 
 
 def independent(files: dict[str, bytes], facts: Any) -> np.ndarray:
-    """The cells that the facts' own reader sees, as canonical values."""
+    """Read the cells with the facts' own reader, as canonical values."""
     cells = facts.occupancy(files)["cells"]
     return np.where(cells < 0, 255, cells).astype(np.uint8)
 
@@ -116,7 +116,7 @@ def test_real_maps_match_facts_and_round_trip(shared: Path, facts_json: dict[str
 
 
 def test_bounds_of_occupied_cells_match_facts(shared: Path, facts_json: dict[str, Any]) -> None:
-    """Catches what counts cannot: rows upside down, columns mirrored, an origin off by a cell."""
+    """Catches errors that counts miss: rows upside down, columns mirrored, an origin off by a cell."""
     for name, files, facts in real_maps(shared, facts_json):
         grid, _ = read(files, main=name.rpartition("/")[2])
         rows, columns = np.nonzero(grid.cells == 100)
@@ -217,7 +217,7 @@ def test_images_belong_to_their_yaml() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "where", "warns"),
+    ("image", "where", "warns"),
     [
         ("map.pgm", "maps/map.pgm", False),
         ("./map.pgm", "maps/map.pgm", False),
@@ -239,8 +239,8 @@ def test_images_belong_to_their_yaml() -> None:
         ("map.yaml", None, False),
     ],
 )
-def test_image_lookup_never_leaves_the_upload(said: str, where: str | None, warns: bool) -> None:
-    files = {"maps/map.yaml": YAML.replace(b"map.pgm", json.dumps(said).encode())}
+def test_image_lookup_never_leaves_the_upload(image: str, where: str | None, warns: bool) -> None:
+    files = {"maps/map.yaml": YAML.replace(b"map.pgm", json.dumps(image).encode())}
     files[where or "maps/unrelated.pgm"] = PGM
     if where is None:
         with pytest.raises(UnreadableFile, match="add this file") as error:
@@ -537,7 +537,7 @@ def test_any_uploaded_grid_round_trips(
 def test_any_stored_grid_round_trips(
     facts: Any, cells: list[int], mode: Any, negate: bool, high: float, low: float, kind: dict[str, str]
 ) -> None:
-    """Cells that the kept mode and thresholds cannot say (after an edit) go out in a mode that can."""
+    """Cells that the stored mode and thresholds cannot represent (after an edit) are written in a mode that can."""
     grid = OccupancyGrid(np.array([cells], np.uint8), 0.1, (0.0, 0.0, 0.0), mode, high, low, negate)
     served, context = write(grid, **kind)
     assert (independent(served, facts) == grid.cells).all()
@@ -653,7 +653,7 @@ def test_resolution_option_is_bounded() -> None:
 
 # --- yaw ----------------------------------------------------------------------------------------------------------
 def place(grid: OccupancyGrid) -> tuple[np.ndarray, np.ndarray]:
-    """The middle of every cell in metres [n, 2] by the definition of origin and yaw, and the cells' values [n]."""
+    """Return every cell's centre in metres [n, 2] by the definition of origin and yaw, and the cells' values [n]."""
     x, y, yaw = grid.origin
     rows, columns = np.indices(grid.cells.shape)
     u, v = (columns.ravel() + 0.5) * grid.resolution, (rows.ravel() + 0.5) * grid.resolution
@@ -671,7 +671,7 @@ def test_normalize_keeps_positions(yaw: float, origin: tuple[float, float]) -> N
     assert out.origin[2] == 0.0
     for v in out.origin[:2]:
         assert abs(v / 0.2 - round(v / 0.2)) < 1e-6
-    # Every obstacle stands in a cell that is occupied now.
+    # Every obstacle is in an occupied cell.
     at, values = place(grid)
     index = np.floor((at - out.origin[:2]) / 0.2 + 1e-9).astype(int)
     assert (index >= 0).all()

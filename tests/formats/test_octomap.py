@@ -1,4 +1,4 @@
-"""OctoMap: bytes worked out by hand, real maps, the C++ library's own tools where they are installed, hostile bytes."""
+"""octomap: bytes computed by hand, real maps, the C++ library's own tools if installed, hostile bytes."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def leaves(*given: tuple[int, int, float], **more: Any) -> VoxelMap:
 
 
 def random_tree(seed: int, values: tuple[float, ...] = (-2.0, -0.4, 0.85, 3.5), colour: bool = False) -> VoxelMap:
-    """Leaves of many depths below a few branches."""
+    """Create leaves of many depths below a few branches."""
     dice = np.random.default_rng(seed)
     out: list[tuple[int, int, float]] = []
     stack = [(int(dice.integers(1, 6)), 0)]
@@ -89,7 +89,7 @@ def random_tree(seed: int, values: tuple[float, ...] = (-2.0, -0.4, 0.85, 3.5), 
 
 
 def smallest(voxels: VoxelMap) -> dict[tuple[int, int, int], float]:
-    """Every smallest voxel by its indices; for small trees."""
+    """Return every smallest voxel by its indices; for small trees."""
     out = {}
     sides = [voxels.axis(k) for k in range(3)]
     for i, odds in enumerate(voxels.log_odds.tolist()):
@@ -133,7 +133,7 @@ def test_log_odds_are_read_and_inner_nodes_computed() -> None:
     assert not voxels.binary
     assert write(voxels) == data
     stale = header("ot", 5) + node(3.0, 0x81) + node(-1.25, 0) + node(-9, 0x0C) + node(-2.0, 0) + node(0.5, 0)
-    assert write(read(stale, "a.ot")[0]) == data, "inner nodes are made from the leaves"
+    assert write(read(stale, "a.ot")[0]) == data, "inner nodes are computed from the leaves"
 
 
 def test_inner_node_colours_are_means_of_set_colours() -> None:
@@ -246,7 +246,7 @@ def test_real_maps_match_library_counts(shared: Path, facts_json: dict[str, Any]
 
 
 def test_real_maps_round_trip_byte_for_byte(shared: Path, same: Same) -> None:
-    """The library wrote all of them but the one of 2010, which gets today's header."""
+    """The library wrote all of them except the one of 2010, which gets the current header."""
     for path in real(shared):
         data = path.read_bytes()
         voxels, _ = read(data, path.name)
@@ -464,7 +464,7 @@ FIRST = b"# Octomap OcTree binary file\n"
 
 
 def chain(levels: int) -> bytes:
-    """Inner nodes one below the other, the last with a leaf."""
+    """Create a chain of inner nodes, the last with a leaf."""
     return b"\x03\x00" * levels + b"\x02\x00"
 
 

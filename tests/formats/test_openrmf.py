@@ -1,4 +1,4 @@
-"""openrmf: real buildings come back the same, stand where the official tools place them; edits and other networks."""
+"""openrmf: real buildings round-trip, positions match the official tools; edits and other networks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""pcd: real clouds come back point by point in every encoding, facts hold, voxels hold every point, hostile bytes."""
+"""pcd: real clouds round-trip in every encoding and match facts, voxels contain every point, hostile bytes."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_compressed_data_with_padding_is_read() -> None:
 
 
 def test_float_colours_round_trip_as_text() -> None:
-    """An alpha of 255 makes a packed colour a NaN, whose text would forget it."""
+    """An alpha of 255 makes a packed colour a NaN, whose text would lose the value."""
     colour = struct.unpack("<f", struct.pack("<I", 0xFF102030))[0]
     data = header("x y z rgb", "4 4 4 4", "F F F F") + struct.pack("<4f", 0, 0, 0, colour)
     text = again(data, data="ascii")

@@ -1,4 +1,4 @@
-"""ply: real clouds come back vertex by vertex, as trimesh reads them too; meshes, both byte orders, hostile bytes."""
+"""ply: real clouds round-trip vertex by vertex, also as read by trimesh; meshes, both byte orders, hostile bytes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def again(cloud: bytes, to: str = "ply", **options: str) -> bytes:
 
 
 def vertices(data: bytes) -> Any:
-    """As trimesh reads them: its own code, and another's idea of the format."""
+    """Read vertices with trimesh, an independent implementation."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return trimesh.load(io.BytesIO(data), file_type="ply", process=False)
@@ -163,7 +163,7 @@ def test_limits_are_enforced() -> None:
 
 
 def test_voxel_centres_become_a_cloud() -> None:
-    """The colour tree's occupied voxels, at full depth, by trimesh."""
+    """The colour tree's occupied voxels at full depth, read by trimesh."""
     shelf = (SAMPLES / "octomap" / "shelf.ot").read_bytes()
     converted = offline({"shelf.ot": shelf}, "ply")
     mesh = vertices(converted.files["map.ply"])

@@ -1,5 +1,4 @@
-"""Clouds and voxels, through HTTP and by themselves: the file stays with the voxels that it made and with no others;
-time and memory."""
+"""Clouds and voxels, over HTTP and directly: the file stays with its own voxels only; time and memory."""
 
 from __future__ import annotations
 
@@ -64,7 +63,7 @@ def test_real_clouds_round_trip_over_http(api: Api, shared: Path) -> None:  # no
 
 
 def test_cloud_is_not_exported_for_other_voxels(api: Api) -> None:  # noqa: F811
-    """Another octree of the same name takes the cloud's place; the version before still has it."""
+    """Another octree with the same name replaces the cloud; the previous version still has it."""
     api.post("environments", {"name": "stale"})
     api.upload("stale", {"map.pcd": SHELF})
     api.upload("stale", {"map.bt": SHED})
@@ -122,7 +121,7 @@ def test_changed_leaves_detach_the_cloud() -> None:
 
 
 def test_centres_are_inside_their_voxels(shared: Path) -> None:
-    """octomap → pcd → voxels of the same resolution: the same occupied ones."""
+    """octomap → pcd → voxels of the same resolution gives the same occupied voxels."""
     path = shared / "data/octomap/geb079/geb079.bt"
     pcd_data = offline({"geb.bt": path.read_bytes()}, "pcd").files["map.pcd"]
     voxels = formats.read(FileGroup(get_format("octomap"), "a.bt", {"a.bt": path.read_bytes()}), ReadContext())

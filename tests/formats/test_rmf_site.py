@@ -1,4 +1,4 @@
-"""rmf_site: sites come back the same, stand where the editor places them, and say what buildings and graphs say."""
+"""rmf_site: sites round-trip, positions match the editor, conversion to buildings and graphs."""
 
 from __future__ import annotations
 
@@ -313,7 +313,7 @@ def test_environment_datum_is_kept_when_site_has_another() -> None:
 
 
 def summary(building: dict[str, Any]) -> dict[str, Any]:
-    """What both formats can say of each level."""
+    """Extract the data of each level that both formats support."""
     out: dict[str, Any] = {}
     for name, level in building["levels"].items():
         rows = {
@@ -443,7 +443,7 @@ def test_check_finds_errors_of_the_editor() -> None:
 
 
 def test_members_of_wrong_type_are_rejected_or_round_trip() -> None:
-    """A reader that takes what the writer cannot use would leave a stored map that nobody gets."""
+    """Every site that the reader accepts can also be written."""
     top = json.loads(WARD["ward.site.json"])
     places: list[tuple[Any, Any]] = []
     stack: list[Any] = [top]

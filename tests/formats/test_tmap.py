@@ -47,7 +47,7 @@ def write(layers: Layers, **options: Any) -> tuple[bytes, WriteContext]:
 
 
 def plain(data: bytes) -> dict[str, Any]:
-    """A list by node name, edges by id: with everything that stands in it, in no order."""
+    """Convert a list to nodes by name and edges by id, with all members, independent of order."""
     out: dict[str, Any] = {}
     for entry in yaml.safe_load(data):
         node = dict(entry["node"])
@@ -59,7 +59,7 @@ def plain(data: bytes) -> dict[str, Any]:
 
 
 def alike(a: Any, b: Any) -> bool:
-    """Equal, where positions are written to a nanometre."""
+    """Compare with positions to a nanometre."""
     if isinstance(a, dict) and isinstance(b, dict):
         return a.keys() == b.keys() and all(alike(a[k], b[k]) for k in a)
     if isinstance(a, list) and isinstance(b, list):
@@ -70,7 +70,7 @@ def alike(a: Any, b: Any) -> bool:
 
 
 def load_v1(data: bytes) -> list[tuple[Any, ...]]:
-    """What manager.py's load_map_from_file takes of a list; KeyError where it would fail."""
+    """Read a list as manager.py's load_map_from_file does; KeyError if it would fail."""
     out = []
     for entry in yaml.safe_load(data):
         node = entry["node"]
@@ -84,7 +84,7 @@ def load_v1(data: bytes) -> list[tuple[Any, ...]]:
 
 
 def drawn() -> Layers:
-    """A network as another format gives it."""
+    """Create a network of another format."""
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("a", shapely.Point(1.0, 2.0), {"kind": "node", "name": "Gate"}),
         ("b", shapely.Point(4.0, 6.0), {"kind": "node"}),

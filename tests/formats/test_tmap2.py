@@ -1,4 +1,4 @@
-"""tmap2: real files come back the same, facts hold in the canonical layers, nothing is dropped, bad ones are named."""
+"""tmap2: real files round-trip, layers match facts, nothing is dropped, invalid files raise errors with a location."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write(layers: Layers, **context: Any) -> tuple[bytes, WriteContext]:
 
 
 def network(layers: Layers) -> Features:
-    """The network; points of interest as the nodes that objects_to_topology makes of them."""
+    """Return the network; points of interest as nodes derived by objects_to_topology."""
     part = layers.parts[NETWORK if NETWORK in layers.parts else POINTS]
     assert isinstance(part, Features)
     return Features(
@@ -245,7 +245,7 @@ def test_older_list_is_written_with_missing_members() -> None:
 
 
 def two(first: Any, second: Any = "B") -> str:
-    """A network of two nodes and one edge between them."""
+    """Create a network of two nodes and one edge between them."""
 
     def node(name: Any, to: Any, x: float) -> dict[str, Any]:
         edges = [{"edge_id": f"e{x:g}", "node": to, "action": "move_base"}] if to is not None else []
@@ -314,7 +314,7 @@ def test_long_and_missing_edge_ids_round_trip() -> None:
 
 
 def from_elsewhere() -> Features:
-    """A network as another format gives it: on earth, without anything of tmap2."""
+    """Create a network of another format: geographic, without source properties of tmap2."""
     point, line = shapely.Point, shapely.LineString
     rows: list[tuple[str, Any, dict[str, Any]]] = [
         ("n1", point(-0.5245, 53.2686), {"kind": "node", "name": "Barn", "kml": {"style": {"icon": "x"}}, "floor": 2}),
@@ -568,7 +568,7 @@ def networks(draw: st.DrawFn) -> dict[str, Any]:
 
 
 def plain(top: dict[str, Any]) -> dict[str, Any]:
-    """With nodes and edges in a fixed order."""
+    """Sort nodes and edges."""
     for entry in top["nodes"]:
         entry["node"]["edges"].sort(key=lambda edge: json.dumps(edge, sort_keys=True))
     top["nodes"].sort(key=lambda entry: entry["node"]["name"])
