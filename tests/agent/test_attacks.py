@@ -1,4 +1,4 @@
-"""Whoever stands between a robot and its server, or in its place, cannot make the robot take a wrong or an old map."""
+"""Attackers between robot and server, or in place of the server, cannot install a wrong or an old map."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def on(part: str, change: Callable[[bytes], bytes]) -> Change:
 def attacked(
     robot: Start, gate: Gate, *, word: str, holds: int | None = 1, about: int | None = None, **rest: Any
 ) -> None:
-    """An agent that must refuse: it says why, tells the server, and what stood stands."""
+    """Run an agent that must refuse, report the reason and keep its map."""
     gate.statuses.clear()
     one = robot(server=gate.url, **rest)
     assert not one.good, one.lines
