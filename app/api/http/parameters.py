@@ -72,7 +72,7 @@ def parse_options(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]
     values: dict[str, str] = {}
     for name, value in pairs:
         if name in values:
-            raise Invalid(f"the parameter {name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+            raise Invalid(f"duplicate parameter {name[:80]!r}: give it once", [Problem("duplicate", where=name[:80])])
         values[name] = value
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
