@@ -1,4 +1,4 @@
-# The robot's side alone: no server, no database, no geometry. Build from the top of the checkout:
+# Only the agent, without server, database and geometry packages. Build from the top of the checkout:
 #   docker build -f docker/agent.Dockerfile -t fleet-map-agent .
 FROM python:3.11-slim-bookworm
 

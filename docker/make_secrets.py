@@ -1,4 +1,4 @@
-"""Make the secrets that compose.yaml mounts: random, once, beside it in ``secrets/``. Existing ones stay."""
+"""Create the random secrets that compose.yaml mounts, in ``secrets/`` beside it. Existing ones are kept."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ HERE = Path(__file__).resolve().parent
 
 
 def make(folder: Path) -> list[str]:
-    """Write what is missing: the names that were written.
+    """Write missing secrets and return their names.
 
-    The files are readable for all, since a container's user is none of this machine's; their folder is the owner's.
+    The files are readable by all, since the container's user does not exist on this machine; their folder is private.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     password = folder / "database_password"
     written = []
     if not password.exists():
         if (folder / "fleetmap_database_url").exists():
-            raise SystemExit("fleetmap_database_url is there and database_password is not: remove it, or write both")
+            raise SystemExit("fleetmap_database_url exists without database_password: remove it, or write both")
         written.append(_write(password, secrets.token_hex(24)))
     url = f"postgresql+psycopg://fleetmap:{password.read_text().strip()}@database:5432/fleetmap"
     for name, content in (("fleetmap_database_url", url), ("fleetmap_admin_token", secrets.token_urlsafe(32))):

@@ -409,7 +409,7 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
         if not name or name.startswith("_"):  # those with an underscore are Zenoh's own
             continue
         if name in out:
-            raise Invalid(f"duplicate parameter {name[:80]!r}", [Problem("duplicate parameter", where=name[:80])])
+            raise Invalid(f"duplicate parameter {name[:80]!r}: give it once", [Problem("duplicate", where=name[:80])])
         out[name] = value
     return out
 

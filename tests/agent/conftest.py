@@ -1,4 +1,4 @@
-"""Real agent processes against a real server, with a gate between them that breaks, changes and holds what passes."""
+"""Fixtures: real agent processes, a real server, and a proxy between them that breaks, changes and delays traffic."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ def network(moved: float = 0.0, count: int = 600) -> bytes:
 
 
 class Robot:
-    """``fleetmap agent --json`` in a process of its own; ``lines`` is what it printed.
+    """Process ``fleetmap agent --json``; ``lines`` is its output.
 
-    FLEETMAP_TEST_PYTHON: another interpreter for it.
+    FLEETMAP_TEST_PYTHON: interpreter to use.
     """
 
     def __init__(self, server: str, env: str, into: Path, *more: str, formats: str = "tmap2", **variables: str) -> None:

@@ -1,4 +1,4 @@
-"""A server of one environment that signs what it is told to, and does what no server should; an agent of it."""
+"""Fake server of one environment, which signs and returns anything, and an agent in this process."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class Fake:
         return json.dumps(body | self.more).encode()
 
     def request(self, ref: str, query: str) -> dict[str, Any]:
-        """What a manifest says of the request that it answers."""
+        """Return the manifest members that repeat the request."""
         values = dict(parse_qsl(query))
         entries = [unquote(e).partition("?") for e in values.get("formats", "").split(",")]
         entries += [unquote(e).partition("?") for e in values.get("optional", "").split(",") if e]
@@ -207,7 +207,7 @@ def run(one: One) -> Iterator[None]:
 
 
 class One:
-    """An agent in this process: ``lines`` is what it told."""
+    """Agent in this process; ``lines`` are its logged events."""
 
     def __init__(
         self,
@@ -237,5 +237,5 @@ class One:
 
     @property
     def detail(self) -> str:
-        """What went wrong last."""
+        """Detail of the last failure."""
         return str([x for x in self.lines if x["event"] in ("failed", "refused")][-1]["detail"])

@@ -1,4 +1,4 @@
-"""Whoever stands between a robot and its server, or in its place, cannot make the robot take a wrong or an old map."""
+"""Attackers between robot and server, or in place of the server, cannot install a wrong or an old map."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def on(part: str, change: Callable[[bytes], bytes]) -> Change:
 def attacked(
     robot: Start, gate: Gate, *, word: str, holds: int | None = 1, about: int | None = None, **rest: Any
 ) -> None:
-    """An agent that must refuse: it says why, tells the server, and what stood stands."""
+    """Run an agent that must refuse, report the reason and keep its map."""
     gate.statuses.clear()
     one = robot(server=gate.url, **rest)
     assert not one.good, one.lines
@@ -162,20 +162,20 @@ def test_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) 
         ({"channel": "staging"}, "belongs to channel 'staging'"),
         ({"channel": None}, "belongs to channel None"),
         ({"sequence": 1, "root": "0" * 64}, "possible rollback"),
-        ({"sequence": -1}, "cannot be read"),
-        ({"sequence": True}, "cannot be read"),
-        ({"root": "x"}, "cannot be read"),
-        ({"expires": "2990-01-01T00:00:00"}, "cannot be read"),
+        ({"sequence": -1}, "invalid manifest"),
+        ({"sequence": True}, "invalid manifest"),
+        ({"root": "x"}, "invalid manifest"),
+        ({"expires": "2990-01-01T00:00:00"}, "invalid manifest"),
         ({"files": []}, "missing tmap2"),
-        ({"files": [{"format": "tmap2", "name": "../../../x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
-        ({"files": [{"format": "tmap2", "name": "/etc/x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
-        ({"files": [{"format": "..", "name": "x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
-        ({"files": [{"format": "tmap2", "name": "a\nb", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
-        ({"files": [{"format": "tmap2", "name": "a/" * 1500 + "b", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
-        ({"files": [{"format": "tmap2", "name": "x" * 300, "size": 1, "sha256": "0" * 64}]}, "cannot be"),
-        ({"files": [{"format": "tmap2", "name": "x", "size": 1, "sha256": "../../x"}]}, "cannot be read"),
+        ({"files": [{"format": "tmap2", "name": "../../../x", "size": 1, "sha256": "0" * 64}]}, "file path"),
+        ({"files": [{"format": "tmap2", "name": "/etc/x", "size": 1, "sha256": "0" * 64}]}, "file path"),
+        ({"files": [{"format": "..", "name": "x", "size": 1, "sha256": "0" * 64}]}, "file path"),
+        ({"files": [{"format": "tmap2", "name": "a\nb", "size": 1, "sha256": "0" * 64}]}, "file path"),
+        ({"files": [{"format": "tmap2", "name": "a/" * 1500 + "b", "size": 1, "sha256": "0" * 64}]}, "file path"),
+        ({"files": [{"format": "tmap2", "name": "x" * 300, "size": 1, "sha256": "0" * 64}]}, "file path"),
+        ({"files": [{"format": "tmap2", "name": "x", "size": 1, "sha256": "../../x"}]}, "invalid manifest"),
         ({"files": [{"format": "tmap2", "name": n, "size": 1, "sha256": "0" * 64} for n in ("a", "a/b")]}, "folder"),
-        ({"files": 7}, "cannot be read"),
+        ({"files": 7}, "invalid manifest"),
     ],
 )  # fmt: skip
 def test_manifest_of_other_environment_or_channel_is_refused(

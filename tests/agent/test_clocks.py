@@ -1,4 +1,4 @@
-"""A robot whose clock is a minute off follows, switches at the server's time, and believes what has just expired."""
+"""Robots with a clock that is wrong by a minute: following, planned moves, expiry."""
 
 from __future__ import annotations
 

@@ -233,7 +233,7 @@ def test_status_carries_the_digest() -> None:
         ({"parameters": {"kml": {"level": "L2"}}}, "'level': 'L2'"),
         ({"parameters": {}}, "'crs': 'local'"),
         ({"missing": []}, "optional formats osm are missing without a reason"),
-        ({"closures": 7}, "cannot be read"),
+        ({"closures": 7}, "invalid manifest"),
     ],
 )
 def test_manifest_of_another_request_is_refused(

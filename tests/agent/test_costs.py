@@ -1,4 +1,4 @@
-"""What a change costs a robot, on a real site: all that its agent takes in, of the manifest too."""
+"""Number of bytes that an agent receives for a change on a real site, including the manifest."""
 
 from __future__ import annotations
 

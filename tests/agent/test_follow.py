@@ -141,7 +141,8 @@ def test_one_folder_has_one_agent_and_one_environment(api: Api, place: str, robo
     assert one.stop() == 0
     other = robot("--once", env="elsewhere")
     assert other.end() == 1
-    assert "not 'elsewhere'" in str(other.lines)
+    assert "elsewhere" in str(other.lines)
+    assert "use one directory for each environment" in str(other.lines)
 
 
 def test_hook_gets_changed_files(api: Api, place: str, robot: Start, tmp_path: Path) -> None:

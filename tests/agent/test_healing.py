@@ -1,4 +1,4 @@
-"""What a server, a clock or a disk does wrong neither ends the agent nor holds it for ever."""
+"""Faults of server, clock or disk neither stop the agent nor block it permanently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ready-made hooks with a ``ros2`` that notes what it is asked, and answers as the real one prints."""
+"""Bundled hooks with a fake ``ros2`` that records its calls and prints real responses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the server knows is what a robot drives by: the whole site on its disk, and closures that stop and free it."""
+"""End to end: a complete site on the robot's disk, and closures that block and release its route."""
 
 from __future__ import annotations
 

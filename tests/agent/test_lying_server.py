@@ -1,4 +1,4 @@
-"""Attacks by a server that lies: each is refused and reported, ``current`` stays, and the robot heals by itself."""
+"""Attacks by a malicious server: refused and reported, ``current`` unchanged, and the robot recovers by itself."""
 
 from __future__ import annotations
 

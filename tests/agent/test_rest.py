@@ -1,4 +1,4 @@
-"""What an agent costs a robot while nothing happens: memory of its own (PSS) and processor time."""
+"""Memory (PSS) and processor time of an idle agent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Before and after a switch: when a robot takes a map, and what it drives by if it cannot load it."""
+"""Switching: ``--before-switch``, hooks, and rollback if a map cannot be loaded."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None
     overlay = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
     problem = api.problem("POST", f"{url}/{overlay['id']}/accept", 422)
-    assert "no edge 'gate_barn' in version 4" in problem["detail"]
+    assert "unknown edge 'gate_barn' in version 4" in problem["detail"]
     api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
     api.post(f"{url}/{overlay['id']}/accept", expect=200)
     assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
@@ -141,7 +141,7 @@ def test_piece_of_a_bent_edge_closes_the_edge(api: Api, farm: str) -> None:
     api.post(f"{url}/{overlay['id']}/end", expect=200)
     for name in ("gate_barn~3", "barn_gate~1", "gate~1"):
         problem = api.problem("POST", url, 422, json={"kind": "blocked", "edge": name})
-        assert f"no edge '{name}'" in problem["detail"]
+        assert f"unknown edge '{name}'" in problem["detail"]
 
 
 @pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])

@@ -65,7 +65,7 @@ def test_check_reports_files_that_are_not_maps(offline: Fleetmap, tmp_path: Path
     (tmp_path / "note.txt").write_text("nothing here")
     result = offline("check", tmp_path / "note.txt")
     assert result.status == 1
-    assert "none of the files is a map" in result.err
+    assert "no file has a recognised map format" in result.err
     named = offline("check", tmp_path / "note.txt", "--format", "nav2_route")
     assert named.status == 1
     assert "would be rejected" in named.out

@@ -117,7 +117,7 @@ def test_client_reports_lost_response_after_all_attempts(talk: Talk, tmp_path: P
 
 def test_request_without_key_is_not_repeated(talk: Talk) -> None:
     client, script = talk(None)
-    with pytest.raises(RequestFailed, match="no answer"):
+    with pytest.raises(RequestFailed, match="no response"):
         client.post("/environments", {"name": "farm"})
     assert len(script.asked) == 1
 
@@ -191,7 +191,7 @@ def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk)
 
 def test_foreign_server_is_recognised(talk: Talk) -> None:
     client, _ = talk(reply(200, b"<html>", "text/html"))
-    with pytest.raises(RequestFailed, match="no JSON"):
+    with pytest.raises(RequestFailed, match="not JSON"):
         client.get("/formats")
     client, _ = talk(reply(404, b"<html>", "text/html"))
     with pytest.raises(RequestFailed, match="returned status 404"):

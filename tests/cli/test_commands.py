@@ -141,7 +141,7 @@ def test_promotion_in_two_stages_is_planned_and_cancelled(fleetmap: Fleetmap, ne
     assert fleetmap("promote", "staged", "--cancel").status == 1, "there is nothing to cancel any more"
     assert fleetmap("promote", "staged", "--cancel", "--ready", "0.5").status == 2
     assert fleetmap("promote", "staged", "1").out.strip() == "staged: production points to version 1"
-    assert "moves back" in fleetmap("promote", "staged", "2", "--failed", "0.2").out
+    assert "is rolled back" in fleetmap("promote", "staged", "2", "--failed", "0.2").out
     alone = fleetmap("promote", "staged", "2", "--window", "60")
     assert alone.status == 1
     assert "ready, failed" in alone.err

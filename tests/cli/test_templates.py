@@ -45,7 +45,7 @@ def test_template_sets_and_values_are_stored_and_reset(fleetmap: Fleetmap, farm:
     more = fleetmap("template", farm, "tmap2", "-O", "xy_goal_tolerance=0.6", "--json")
     assert more.json["changes"]["templates"] == {"tmap2": {"xy_goal_tolerance": {"from": 0.4, "to": 0.6}}}
     shown = fleetmap("template", farm)
-    assert shown.out.startswith(f"{farm}, version {first + 3}: the set outdoor")
+    assert shown.out.startswith(f"{farm}, version {first + 3}: template set outdoor")
     words = [line.split() for line in shown.out.splitlines()]
     assert ["tmap2", "action", "NavigateToPose", "environment"] in words
     assert ["tmap2", "verts_radius", "1.5", "set", "outdoor"] in words

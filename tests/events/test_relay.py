@@ -1,4 +1,4 @@
-"""What is committed is told over Zenoh: all of it, in order, also to who comes late or was cut off."""
+"""Relay: every commit is published over Zenoh in order, also to late and reconnected subscribers."""
 
 from __future__ import annotations
 

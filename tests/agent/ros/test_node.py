@@ -1,4 +1,4 @@
-"""The node on a stand-in of rclpy, with a stand-in of ``fleetmap`` that behaves as the agent does."""
+"""The ROS 2 node with fakes of rclpy and of the command ``fleetmap``."""
 
 from __future__ import annotations
 
