@@ -34,7 +34,7 @@ class Registry(Generic[T]):
     def add(self, name: str, value: T) -> None:
         """Register a value. Raises ValueError if its name is taken."""
         if name in self.entries:
-            raise ValueError(f"there is a {self._noun} {name} already, and it stays")
+            raise ValueError(f"{self._noun} {name} is already registered")
         self.entries[name] = value
 
     def all(self) -> dict[str, T]:

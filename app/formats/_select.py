@@ -55,7 +55,7 @@ def select_part(
         raise Ambiguous(f"there are several {noun}s, name one with {option}=…: {', '.join(names)}")
     matches = [key for key in matches if key.name == name]
     if not matches:
-        raise NotFound(f"there is no {noun} {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}")
+        raise NotFound(f"unknown {noun} {name!r}{did_you_mean(name, names)}; available: {', '.join(names)}")
     if len(matches) > 1:
         ground = [key for key in matches if key.level == GROUND]
         if not ground:

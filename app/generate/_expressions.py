@@ -37,7 +37,7 @@ MAX_TOKENS = 400
 """Tokens of one expression."""
 
 MAX_NUMBER = 1e9
-"""Numbers beyond it are a mistake, or a rule that explodes."""
+"""Maximum absolute value of a number: larger ones come from a typing error or from a rule that grows without end."""
 
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>\d+\.?\d*(?:[eE][+-]?\d{1,3})?|\.\d+)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)"
@@ -77,11 +77,11 @@ def raise_invalid(problem: str, location: str) -> NoReturn:
 
 
 def parse(text: str, names: frozenset[str] | set[str], location: str) -> Expression:
-    """The expression. Invalid, with the place, for anything that is not one, and for names that nobody gives."""
+    """Parse an expression. Raises Invalid with ``location`` for a syntax error or an unknown name."""
     parser = _Parser(_tokens(text, location), names, location)
     value = parser.either(0)
     if parser.peek():
-        raise_invalid(f"{parser.peek()!r} stands where the expression {text.strip()!r} should end", location)
+        raise_invalid(f"unexpected {parser.peek()!r} after the expression in {text.strip()!r}", location)
     return Expression(text, location, value)
 
 
@@ -228,7 +228,7 @@ class _Parser:
             if token not in self.names:
                 name_list = ", ".join(sorted(self.names)) or "none"
                 raise_invalid(
-                    f"nothing is called {token!r} here; there are: {name_list}; functions: {', '.join(_FUNCTIONS)}",
+                    f"unknown name {token!r}; available: {name_list}; functions: {', '.join(_FUNCTIONS)}",
                     self.where,
                 )
             return lambda n, c: n[token]

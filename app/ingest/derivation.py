@@ -123,7 +123,7 @@ def _steps(derivation: derive.Derivation, available: frozenset[Layer], without: 
 
 
 def _no_chain_error(error: MissingLayer, failed: Sequence[ChainFailure]) -> MissingLayer:
-    tried = f"; stored layers cannot replace it: {'; '.join(one.reason for one in failed)}" if failed else ""
+    tried = f"; the stored layers do not suffice: {'; '.join(one.reason for one in failed)}" if failed else ""
     return MissingLayer(f"{error.detail}{tried}")
 
 

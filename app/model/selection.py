@@ -23,7 +23,7 @@ def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[P
     if not matches:
         names = sorted({key.name for key in parts})
         listing = ", ".join(names) or "none"
-        raise NotFound(f"there is no {label} {name!r}{did_you_mean(name, names)}; there are: {listing}")
+        raise NotFound(f"unknown {label} {name!r}{did_you_mean(name, names)}; available: {listing}")
     return matches
 
 

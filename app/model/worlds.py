@@ -53,7 +53,7 @@ def select_world(part: Features, world: str | None) -> tuple[Features, list[str]
         matches = [name for name in worlds if world in (name, PurePosixPath(name).name)]
         if not matches:
             raise NotFound(
-                f"there is no world {world[:200]!r}{did_you_mean(world, worlds)}; there are: {', '.join(worlds)}"
+                f"unknown world {world[:200]!r}{did_you_mean(world, worlds)}; available: {', '.join(worlds)}"
             )
         worlds = [matches[0], *(name for name in worlds if name != matches[0])]
     if len(worlds) < 2:

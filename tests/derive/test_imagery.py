@@ -294,7 +294,7 @@ def test_image_selection_and_parameters_of_another_method() -> None:
         grid(layers(a, name="a", b=b))
     assert at(grid(layers(a, name="a", b=b), picture="b"), 2.1, 6) == OCCUPIED
     assert at(grid(layers(a, b=b)), 41, 29) == OCCUPIED, "satellite is the usual one"
-    with pytest.raises(NotFound, match="there are: satellite"):
+    with pytest.raises(NotFound, match="available: satellite"):
         grid(layers(a), picture="other")
     with pytest.raises(Invalid, match="applies only to segmentation=plan"):
         grid(layers(a), gap=2.0)

@@ -161,7 +161,7 @@ def test_one_of_several_worlds_is_cut(shared: Path) -> None:
     assert (roof.cells == 100).mean() > 0.5
     open_ = sliced(content, band=(9.5, 10.5), world="worlds/no_roof_small_warehouse")
     assert (open_.cells == 100).mean() < 0.2, "lamps hang there"
-    with pytest.raises(Invalid, match=r"there is no world 'moon'; there are: .*small_warehouse"):
+    with pytest.raises(Invalid, match=r"unknown world 'moon'; available: .*small_warehouse"):
         sliced(content, world="moon")
     building = features([("a", shapely.box(0, 0, 1, 1), {"kind": "building"})], "local")
     with pytest.raises(Invalid, match="no world is stored"):
