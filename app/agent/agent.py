@@ -385,10 +385,7 @@ class Agent:
             return None
 
     def _channel(self, plans: Sequence[Mapping[str, Any]] | None) -> str:
-        """Return the channel to follow.
-
-        After ``production`` was once followed by default, it stays the default even if the server no longer lists it.
-        """
+        """Return the channel to follow. ``production``, once followed, stays the default even if no longer listed."""
         if self.options.channel is not None:
             return self.options.channel
         stands = any(p.get("channel") == PRODUCTION and p.get("version") is not None for p in plans or ())
@@ -529,10 +526,7 @@ class Agent:
             self._log_event("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
 
     def _report(self, outcome: Outcome, *, is_planned: bool = False) -> None:
-        """Report the outcome of the channel's map.
-
-        is_planned: a planned version is reported too, so repeat this status only if it has changed.
-        """
+        """Report the outcome of the channel's map. is_planned: with a planned version, skip an unchanged status."""
         report_key = (outcome.state, outcome.detail, self._folder.current_version, self._accepted_sequence)
         if is_planned and report_key == self._reported:
             return
