@@ -49,11 +49,7 @@ CLOSURES_SECONDS = 0.1
 
 
 class Agent:
-    """The agent: keeps the map of one environment in one directory up to date.
-
-    Args:
-        clock: seconds since 1970; may be wrong by one minute.
-    """
+    """Keeps the map of one environment up to date. clock: seconds since 1970; may be wrong by one minute."""
 
     def __init__(self, options: AgentOptions, log: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
@@ -353,10 +349,7 @@ class Agent:
             self._log_event("failed", detail=outcome.detail)
 
     def _fetch_version(self, version: int, keep: Sequence[ManifestFile]) -> tuple[Manifest, dict[str, Path]]:
-        """Fetch a version by number; repeat if closures change during the download.
-
-        Returns its manifest, and path -> verified file.
-        """
+        """Fetch a version by number, again if closures change meanwhile. Return manifest, and path -> verified file."""
         for attempt in range(MAX_CLOSURE_CHANGES):
             manifest = self._manifests.fetch_planned(version)
             self._fetched = manifest
@@ -392,10 +385,7 @@ class Agent:
             return None
 
     def _channel(self, plans: Sequence[Mapping[str, Any]] | None) -> str:
-        """Return the channel to follow.
-
-        After ``production`` was once followed by default, it stays the default even if the server no longer lists it.
-        """
+        """Return the channel to follow. ``production``, once followed, stays the default even if no longer listed."""
         if self.options.channel is not None:
             return self.options.channel
         stands = any(p.get("channel") == PRODUCTION and p.get("version") is not None for p in plans or ())
@@ -477,8 +467,7 @@ class Agent:
     def _superseding_manifest(self, manifest: Manifest, seconds: float) -> Manifest | None:
         """Return the channel's newer manifest if the channel has moved during the download and its files are present.
 
-        So a map that was rolled back during its download is not installed. None if the newer map must still be fetched:
-        the next sync does that.
+        So a map that was rolled back meanwhile is not installed. None if the newer map must still be fetched.
         """
         if manifest.channel is None or (
             self._announced_sequence <= manifest.sequence and seconds < RECHECK_AFTER_SECONDS
@@ -537,11 +526,7 @@ class Agent:
             self._log_event("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
 
     def _report(self, outcome: Outcome, *, is_planned: bool = False) -> None:
-        """Report the outcome of the channel's map.
-
-        Args:
-            is_planned: a planned version is reported too, so repeat this status only if it has changed.
-        """
+        """Report the outcome of the channel's map. is_planned: with a planned version, skip an unchanged status."""
         report_key = (outcome.state, outcome.detail, self._folder.current_version, self._accepted_sequence)
         if is_planned and report_key == self._reported:
             return
@@ -576,11 +561,7 @@ class Agent:
         self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
 
     def _set_status(self, state: RobotState, detail: str | None = None, about: Subject | None = None) -> bool:
-        """Set the status and send it. Return whether it is new.
-
-        Args:
-            about: map that the status is about; default: the current one.
-        """
+        """Set the status and send it. Return whether it is new. about: its map; default: the current one."""
         current = self._folder.manifest(self._folder.current_version)
         is_loaded = self._state.activated == self._folder.current_version
         status = describe_status(
