@@ -190,9 +190,9 @@ def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
             return lambda *arguments, **__: self.keys.append(str(arguments[0])) if arguments else self
 
     session: Any = Recorder()
-    own = bus.Bus(bus.BusOptions(), query_handler=Any, explain=Any, on_status=Any, on_alive=Any)  # type: ignore[arg-type]
-    own._declare(session)
-    own.close()
+    session_bus = bus.Bus(bus.BusOptions(), query_handler=Any, explain=Any, on_status=Any, on_alive=Any)  # type: ignore[arg-type]
+    session_bus._declare(session)
+    session_bus.close()
     keys = [*session.keys, messages.events_key("fleetmap", "*"), messages.status_key("fleetmap", "*", "*")]
     assert len(keys) > 6
     documented = {re.sub(r"{[a-z]+}", "*", word) for word in words(pages["reference/zenoh.html"])}
@@ -217,11 +217,11 @@ def test_texts_contain_no_path_of_a_machine() -> None:
 
 
 def test_texts_name_only_documents_of_the_project() -> None:
-    own = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
-    own |= {f"{name}.md" for name in all_formats()}
-    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON and LIF, and in a test's upload
+    pages = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
+    pages |= {f"{name}.md" for name in all_formats()}
+    pages |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON and LIF, and in a test's upload
     for path, text in texts():
         named = set(re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text))
-        assert named <= own, f"{path} names {', '.join(sorted(named - own))}"
+        assert named <= pages, f"{path} names {', '.join(sorted(named - pages))}"
         for phrase in ("the contract", "house rules", "design page"):
             assert path == Path("tests/test_docs.py") or phrase not in text.lower(), f"{path} speaks of {phrase!r}"

@@ -102,9 +102,9 @@ print(json.dumps({
 
 
 def insert(path: Path, text: str, before: str) -> None:
-    head, found, tail = path.read_text().partition(before)
-    assert found, before
-    path.write_text(head + text + found + tail)
+    head, match, tail = path.read_text().partition(before)
+    assert match, before
+    path.write_text(head + text + match + tail)
 
 
 @pytest.fixture(scope="module")

@@ -109,8 +109,8 @@ def attacked(
 
 
 @pytest.fixture
-def held(api: Api, place: str, robot: Start, gate: Gate) -> str:
-    """A robot that holds version 1, and a server that has version 2."""
+def lagging(api: Api, place: str, robot: Start, gate: Gate) -> str:
+    """Environment at version 2 whose robot still runs version 1."""
     assert robot(server=gate.url).good
     api.upload(place, {"n.tmap2.yaml": network(1)})
     return place
@@ -129,19 +129,19 @@ def recover(robot: Start, gate: Gate) -> None:
     [{"LD_PRELOAD": "/x"}, {"PATH": "/x"}, {"A B": "1"}, {"A;rm": "1"}, {"A": "1\n2"}, {"A": 7}, [1], "x"],
 )
 def test_variables_that_change_how_programs_run(
-    held: str, robot: Start, gate: Gate, keys: Keys, variables: object
+    lagging: str, robot: Start, gate: Gate, keys: Keys, variables: object
 ) -> None:
     gate.change = signed(keys, variables=variables)
     attacked(robot, gate, word="manifest")
     recover(robot, gate)
 
 
-def test_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) -> None:
-    path = f"environments/{held}/versions/latest/manifest?formats=tmap2"
+def test_old_manifest_is_refused(api: Api, lagging: str, robot: Start, gate: Gate) -> None:
+    path = f"environments/{lagging}/versions/latest/manifest?formats=tmap2"
     gate_open = robot(server=gate.url)
     assert gate_open.good
     before = api.get(path)
-    api.upload(held, {"n.tmap2.yaml": network(2)})
+    api.upload(lagging, {"n.tmap2.yaml": network(2)})
     assert robot(server=gate.url).good
 
     def replay(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
@@ -179,19 +179,19 @@ def test_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) 
     ],
 )  # fmt: skip
 def test_manifest_of_other_environment_or_channel_is_refused(
-    held: str, robot: Start, gate: Gate, keys: Keys, members: dict[str, Any], word: str
+    lagging: str, robot: Start, gate: Gate, keys: Keys, members: dict[str, Any], word: str
 ) -> None:
     gate.change = signed(keys, **members)
     attacked(robot, gate, word=word)
 
 
-def test_agent_recovers_after_attack(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
+def test_agent_recovers_after_attack(lagging: str, robot: Start, gate: Gate, keys: Keys) -> None:
     gate.change = signed(keys, expires="2020-01-01T00:00:00Z")
     attacked(robot, gate, word="expired")
     recover(robot, gate)
 
 
-def test_manifest_is_accepted_with_clock_skew_below_a_minute(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
+def test_manifest_is_accepted_with_clock_skew_of_seconds(lagging: str, robot: Start, gate: Gate, keys: Keys) -> None:
     gate.change = signed(keys, expires=(datetime.now(timezone.utc) - timedelta(seconds=20)).isoformat())
     assert robot(server=gate.url).good
 
@@ -204,7 +204,7 @@ def test_manifest_is_accepted_with_clock_skew_below_a_minute(held: str, robot: S
         (lambda p, s, h, b: (s, {k: v for k, v in h.items() if k != SIGNATURE}, b), "no valid signature"),
     ],
 )
-def test_unsigned_manifest_is_refused(held: str, robot: Start, gate: Gate, change: Change, word: str) -> None:
+def test_unsigned_manifest_is_refused(lagging: str, robot: Start, gate: Gate, change: Change, word: str) -> None:
     gate.change = change
     attacked(robot, gate, word=word)
     recover(robot, gate)
@@ -215,7 +215,7 @@ def test_unsigned_manifest_is_refused(held: str, robot: Start, gate: Gate, chang
     [lambda b: b[:-2] + b"x\n", lambda b: b + b"x", lambda b: b[:-1], lambda _: b"", lambda b: b * 50],
     ids=["other", "more", "less", "nothing", "much more"],
 )
-def test_wrong_bytes_are_refused(held: str, robot: Start, gate: Gate, change: Callable[[bytes], bytes]) -> None:
+def test_wrong_bytes_are_refused(lagging: str, robot: Start, gate: Gate, change: Callable[[bytes], bytes]) -> None:
     gate.deltas = False
     gate.change = on("/maps/", change)
     attacked(robot, gate, word="differs from the manifest", about=2)
@@ -223,7 +223,7 @@ def test_wrong_bytes_are_refused(held: str, robot: Start, gate: Gate, change: Ca
 
 
 @pytest.mark.parametrize("kind", ["bomb", "nonsense", "other"])
-def test_poisoned_delta_is_replaced_by_the_complete_file(held: str, robot: Start, gate: Gate, kind: str) -> None:
+def test_poisoned_delta_is_replaced_by_the_complete_file(lagging: str, robot: Start, gate: Gate, kind: str) -> None:
     bodies = {"bomb": lambda b: b[:40] + zstd.compress(bytes(2**30)), "nonsense": lambda b: b[:40] + b"nonsense"}
     change = bodies.get(kind, lambda _: b"x" * 60)
     gate.change = lambda p, s, h, b: (s, h, change(b) if h.get("content-encoding") == "dcz" else b)
@@ -236,7 +236,7 @@ def test_poisoned_delta_is_replaced_by_the_complete_file(held: str, robot: Start
     assert "1 deltas could not be decoded" in switched["detail"]
 
 
-def test_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path: Path) -> None:
+def test_foreign_key_is_refused(lagging: str, robot: Start, gate: Gate, tmp_path: Path) -> None:
     foreign = Keys(tmp_path / "foreign")
     sign = signed(foreign)
 
@@ -254,8 +254,8 @@ def test_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path: P
     recover(robot, gate)
 
 
-def test_rotated_key_replaces_old_key(api: Api, held: str, robot: Start, gate: Gate, keys: Keys) -> None:
-    old = api.get(f"environments/{held}/versions/latest/manifest?formats=tmap2")
+def test_rotated_key_replaces_old_key(api: Api, lagging: str, robot: Start, gate: Gate, keys: Keys) -> None:
+    old = api.get(f"environments/{lagging}/versions/latest/manifest?formats=tmap2")
     api.post("keys")
     api.post("keys")
     one = robot(server=gate.url)

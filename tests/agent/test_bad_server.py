@@ -403,10 +403,10 @@ def test_layers_come_signed(fake: Fake, robot: Robot, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "told", ["serial//dev/ttyUSB0", "unixsock-stream//run/x", "tls/h:1#verify_name_on_connect=false"]
+    "address", ["serial//dev/ttyUSB0", "unixsock-stream//run/x", "tls/h:1#verify_name_on_connect=false"]
 )
-def test_unsupported_router_address_of_server_is_refused(fake: Fake, robot: Robot, told: str) -> None:
-    fake.ready = {"connect": f"tcp/127.0.0.1:{free_port()},{told}"}
+def test_unsupported_router_address_of_server_is_refused(fake: Fake, robot: Robot, address: str) -> None:
+    fake.ready = {"connect": f"tcp/127.0.0.1:{free_port()},{address}"}
     one = robot()
     with run(one):
         eventually(lambda: one.saw("polling"))

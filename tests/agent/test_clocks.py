@@ -58,8 +58,8 @@ def test_activation_follows_server_time(
     status = api.get(f"robots/robot?environment={place}").json()
     assert status["online"]
     assert status["lag"]["events"] == 0
-    robot_time, heard = datetime.fromisoformat(status["time"]), datetime.fromisoformat(status["received"])
-    assert abs((robot_time - heard).total_seconds() - fast) < 30, "the robot's clock shows, and decides nothing"
+    robot_time, received = datetime.fromisoformat(status["time"]), datetime.fromisoformat(status["received"])
+    assert abs((robot_time - received).total_seconds() - fast) < 30, "the robot's clock shows, and decides nothing"
 
 
 def _stands(api: Api, channel: str) -> Any:

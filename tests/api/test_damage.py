@@ -43,7 +43,7 @@ def cached(folder: Path) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Api, Path]]:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Api, Path]]:
     """Start a server whose files these tests damage."""
     folder = tmp_path_factory.mktemp("damage")
     with running(settings_for(folder, memory_cache_bytes=0)) as api:
@@ -57,8 +57,8 @@ def forget(api: Api) -> None:
     services.store.chunks.forget()
 
 
-def test_damaged_cached_maps_are_converted_again(own: tuple[Api, Path]) -> None:
-    api, folder = own
+def test_damaged_cached_maps_are_converted_again(server: tuple[Api, Path]) -> None:
+    api, folder = server
     farm = environment(api, "cached")
     api.upload(farm, {NETWORK: samples.tmap2()})
     for path in (f"/maps/{farm}/tmap2", f"/maps/{farm}/environment"):
@@ -76,10 +76,10 @@ def test_damaged_cached_maps_are_converted_again(own: tuple[Api, Path]) -> None:
     assert "fleetmap_cache_damaged_total" in api.get("/metrics").text
 
 
-def test_damaged_large_map_breaks_the_download(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_large_map_breaks_the_download(server: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.api.maps.IN_MEMORY", 100)
     monkeypatch.setattr("app.api.http.streams.CHUNK", 64)
-    api, folder = own
+    api, folder = server
     farm = environment(api, "large")
     before = set(cached(folder))
     api.upload(farm, {NETWORK: samples.tmap2({"gate": (0.0, 0.0), "barn": (11.0, 0.0), "field": (10.0, 8.0)})})
@@ -97,8 +97,8 @@ def test_damaged_large_map_breaks_the_download(own: tuple[Api, Path], monkeypatc
     assert api.get(f"/maps/{farm}/tmap2", 206, headers={"Range": "bytes=10-2000"}).content == good[10:2001]
 
 
-def test_upload_repairs_damaged_files_and_chunks(own: tuple[Api, Path]) -> None:
-    api, folder = own
+def test_upload_repairs_damaged_files_and_chunks(server: tuple[Api, Path]) -> None:
+    api, folder = server
     farm = environment(api, "healed")
     other = samples.tmap2().replace(b"0.1", b"0.2")
     first = {NETWORK: samples.tmap2(), "notes.txt": b"x" * 100_000, "small.txt": b"small"}
@@ -207,8 +207,8 @@ def test_write_check_runs_once_for_many_requests() -> None:
     assert writability.refusal() == "the disk is full"
 
 
-def test_readiness_repeats_the_write_check(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    api, probes = own[0], list[int]()
+def test_readiness_repeats_the_write_check(server: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    api, probes = server[0], list[int]()
     monkeypatch.setattr("app.api.http.dependencies.WRITABLE_SECONDS", 3600.0)
     monkeypatch.setattr("app.api.http.uploads.check_room", lambda _: probes.append(1))
     api.app.state.services.writability.forget()

@@ -59,9 +59,9 @@ def kill_repeatedly(fleet: Fleet, each: dict[str, int]) -> list[float]:
         getattr(world, f"kill_{target}")()
         time.sleep(dice.choice((0.0, 0.0, 0.1, 0.5)))
         healthy.append(world.revive(target))
-        before = fleet.made()
+        before = fleet.count_commits()
         if dice.random() < 0.7:  # otherwise the next kill hits it during its start
-            eventually(lambda n=before: fleet.made() > n, 60)
+            eventually(lambda n=before: fleet.count_commits() > n, 60)
         if dice.random() < 0.3:  # a pause, so that robots make progress
             lines = [len(robot.lines) for robot in fleet.robots]
             eventually(lambda at=lines: any(r.saw("switched", n) for r, n in zip(fleet.robots, at, strict=True)), 60)
@@ -101,15 +101,15 @@ def check_versions(fleet: Fleet, head: int) -> None:
     assert [v["version"] for v in versions] == list(range(head, -1, -1)), "a gap, a fork or a number used twice"
     assert [v["parent"] for v in versions] == [*range(head - 1, -1, -1), None]
     messages = {v["version"]: v["message"] for v in versions}
-    assert all(writer.made for writer in (*fleet.first, *fleet.writers))
+    assert all(writer.commits for writer in (*fleet.first, *fleet.writers))
     assert lost_versions(fleet, messages) == []
     counts = Counter(messages.values())
-    assert all(counts[message] == 1 for writer in fleet.writers for message in writer.made), "a commit was repeated"
+    assert all(counts[message] == 1 for writer in fleet.writers for message in writer.commits), "a commit was repeated"
 
 
 def lost_versions(fleet: Fleet, messages: dict[int, str]) -> list[int]:
     """List acknowledged versions that are missing or another commit, by the messages that the server lists."""
-    commits = [item for writer in (*fleet.first, *fleet.writers) for item in writer.made.items()]
+    commits = [item for writer in (*fleet.first, *fleet.writers) for item in writer.commits.items()]
     return [number for message, number in commits if messages.get(number) != message]
 
 

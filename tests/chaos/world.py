@@ -160,7 +160,7 @@ class Writer:
         self.name = name
         self.busy = threading.Event()
         self.stopping = threading.Event()
-        self.made: dict[str, int] = {}
+        self.commits: dict[str, int] = {}
         self.tries = 0
         self.last = 0.0
         self.problem: BaseException | None = None
@@ -205,7 +205,7 @@ class Writer:
             finally:
                 self.busy.clear()
             if answer.status_code == 201:
-                self.made[message] = answer.json()["version"]
+                self.commits[message] = answer.json()["version"]
                 self.last = time.monotonic()
                 return
             assert answer.status_code == 503, f"{answer.status_code} {answer.text}"
@@ -385,9 +385,9 @@ class Fleet:
         for writer in (*self.writers, self.promoter):
             writer.start()
 
-    def made(self) -> int:
+    def count_commits(self) -> int:
         """Number of acknowledged commits."""
-        return sum(len(writer.made) for writer in self.writers)
+        return sum(len(writer.commits) for writer in self.writers)
 
     def wait_for(self, phase: str) -> None:
         """Wait until a phase is in progress."""
@@ -395,8 +395,8 @@ class Fleet:
             self._until(lambda: any(writer.busy.is_set() for writer in self.writers))
             time.sleep(self.dice.uniform(0, 0.08))
         elif phase == RELAY:
-            count = self.made()
-            self._until(lambda: self.made() > count)
+            count = self.count_commits()
+            self._until(lambda: self.count_commits() > count)
             time.sleep(self.dice.uniform(0, 0.01))
         elif phase == DOWNLOAD:
             lines = [len(robot.lines) for robot in self.robots]
@@ -410,8 +410,8 @@ class Fleet:
         stages = set()
         if any(writer.busy.is_set() for writer in self.writers):
             stages.add(COMMIT)
-        heard = {event["version"] for event in list(self.listener.events)}
-        if any(version not in heard for writer in self.writers for version in list(writer.made.values())[-3:]):
+        received = {event["version"] for event in list(self.listener.events)}
+        if any(version not in received for writer in self.writers for version in list(writer.commits.values())[-3:]):
             stages.add(RELAY)
         if any(self._fetching(robot) for robot in self.robots):
             stages.add(DOWNLOAD)

@@ -40,7 +40,7 @@ def client_config(port: int, **more: Any) -> zenoh.Config:
 
 
 class Listener:
-    """A robot's ear: an advanced subscriber with history and recovery, as `docs/reference/zenoh.md` recommends."""
+    """A robot's listener: an advanced subscriber with history and recovery, as `docs/reference/zenoh.md` recommends."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self.events: list[dict[str, Any]] = []
@@ -81,7 +81,7 @@ def nothing(*_: Any) -> Any:
     """What nobody asks for."""
 
 
-def said(n: int, state: str = "active") -> bytes:
+def status_payload(n: int, state: str = "active") -> bytes:
     """What a robot says: that it holds version ``n``."""
     body = {"channel": "latest", "version": n, "root": f"{n:064x}", "state": state, "sequence": n}
     return json.dumps(body).encode()

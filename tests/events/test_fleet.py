@@ -17,7 +17,7 @@ from app.fleet import ReportQueue
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api
-from tests.events.conftest import client_config, eventually, said
+from tests.events.conftest import client_config, eventually, status_payload
 from tests.events.test_relay import router_of
 
 
@@ -29,10 +29,10 @@ def robot_of(api: Api, name: str) -> Any:
 def test_statuses_come_in_order(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "farm"})
     for n in range(150):
-        session.put("fleetmap/farm/robots/r1/status", said(n, "downloading" if n % 2 else "active"))
+        session.put("fleetmap/farm/robots/r1/status", status_payload(n, "downloading" if n % 2 else "active"))
     session.put("fleetmap/farm/robots/r1/status", b"{}")
-    session.put("fleetmap/nowhere/robots/r1/status", said(1))
-    session.put("fleetmap/farm/robots/r2/status", said(7))
+    session.put("fleetmap/nowhere/robots/r1/status", status_payload(1))
+    session.put("fleetmap/farm/robots/r2/status", status_payload(7))
     eventually(lambda: robot_of(api, "r2"))
     robot = eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 149 and r)
     assert robot["holds"]["version"] == 148
@@ -79,7 +79,7 @@ def test_liveliness_sets_presence(api: Api, port: int) -> None:
     robot = zenoh.open(client_config(port))
     try:
         token = robot.liveliness().declare_token("fleetmap/robots/r1")
-        robot.put("fleetmap/farm/robots/r1/status", said(1))
+        robot.put("fleetmap/farm/robots/r1/status", status_payload(1))
         assert eventually(lambda: (r := robot_of(api, "r1")) and r["online"])
         token.undeclare()  # type: ignore[no-untyped-call]
         assert eventually(lambda: not robot_of(api, "r1")["online"])
@@ -97,7 +97,7 @@ def test_robot_lost_with_router_is_offline(api: Api, port: int) -> None:
     try:
         for name, session in (("stays", stays), ("leaves", leaves)):
             tokens.append(session.liveliness().declare_token(f"fleetmap/robots/{name}"))
-            session.put(f"fleetmap/farm/robots/{name}/status", said(1))
+            session.put(f"fleetmap/farm/robots/{name}/status", status_payload(1))
             assert eventually(lambda name=name: (r := robot_of(api, name)) and r["online"])
         os.kill(router_of(api), signal.SIGKILL)
         leaves.close()  # type: ignore[no-untyped-call]
@@ -121,11 +121,11 @@ def test_reports_wait_while_database_is_unavailable(api: Api, monkeypatch: pytes
     monkeypatch.setattr(store.robots, "note_reports", away)
     intake = ReportQueue(store)
     intake.start()
-    intake.enqueue_status("farm", "r1", said(1))
-    intake.enqueue_status("farm", "r1", said(2))
+    intake.enqueue_status("farm", "r1", status_payload(1))
+    intake.enqueue_status("farm", "r1", status_payload(2))
     eventually(lambda: len(store.robots.history("farm", "r1")) == 2)
     assert len(calls) >= 3
-    intake.enqueue_status("farm", "r1", said(3))
+    intake.enqueue_status("farm", "r1", status_payload(3))
     intake.close()
     assert [r.version for _, r in store.robots.history("farm", "r1")] == [3, 2, 1], "what waits is written at the end"
 
@@ -138,7 +138,7 @@ def test_dropped_reports_are_logged(
     store.environments.create("farm")
     intake = ReportQueue(store)
     for n in range(5):
-        intake.enqueue_status("farm", "r1", said(n))
+        intake.enqueue_status("farm", "r1", status_payload(n))
     intake.start()
     intake.close()
     assert [r.version for _, r in store.robots.history("farm", "r1")] == [1, 0]
@@ -154,19 +154,21 @@ def test_flooding_robot_displaces_no_other(
     store.environments.create("farm")
     intake = ReportQueue(store)
     for n in range(100):
-        intake.enqueue_status("farm", "loud", said(n))
-        intake.enqueue_status("nowhere", "lost", said(n))
+        intake.enqueue_status("farm", "loud", status_payload(n))
+        intake.enqueue_status("nowhere", "lost", status_payload(n))
     for n in range(3):
-        intake.enqueue_status("farm", "calm", said(n))
+        intake.enqueue_status("farm", "calm", status_payload(n))
     intake.start()
     eventually(lambda: len(store.robots.history("farm", "calm")) == 3)
     assert [r.version for _, r in store.robots.history("farm", "loud")] == [2, 1, 0]
     assert "robot reports: dropped 194," in caplog.text
     assert caplog.text.count("dropped one of lost") == 1, "one line for all three"
     assert "(and 2 others)" in caplog.text
-    intake.enqueue_status("farm", "loud", said(7))
+    intake.enqueue_status("farm", "loud", status_payload(7))
     intake.close()
-    assert [r.version for _, r in store.robots.history("farm", "loud")] == [7, 2, 1, 0], "who is quiet again is heard"
+    assert [r.version for _, r in store.robots.history("farm", "loud")] == [7, 2, 1, 0], (
+        "quiet again: its report is stored"
+    )
 
 
 def test_invalid_reports_do_not_delay_presence_refresh(

@@ -17,7 +17,7 @@ from app.errors import Damaged
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.api.conftest import problem as problem_of
-from tests.events.conftest import client_config, eventually, free_port, said
+from tests.events.conftest import client_config, eventually, free_port, status_payload
 
 
 @pytest.fixture(scope="module")
@@ -203,9 +203,9 @@ def test_status_keys_with_wildcards_are_ignored(
         "fleetmap/*/robots/*/status",
         "fleetmap/wild/robots/r$*/status",
     ):
-        session.put(key, said(5))
+        session.put(key, status_payload(5))
     session.delete("fleetmap/wild/robots/r1/status")
-    session.put("fleetmap/wild/robots/r2/status", said(1))
+    session.put("fleetmap/wild/robots/r2/status", status_payload(1))
     eventually(lambda: api.get("robots/r2", expect=None).status_code == 200)
     assert [r["robot"] for r in api.get("robots?environment=wild").json()] == ["r2"]
     assert not [r for r in caplog.records if r.levelname == "ERROR"]

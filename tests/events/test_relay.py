@@ -30,11 +30,11 @@ def network(k: int) -> bytes:
 
 
 def test_commit_publishes_event(api: Api, session: zenoh.Session) -> None:
-    ear = Listener(session, "fleetmap/*/events")
+    listener = Listener(session, "fleetmap/*/events")
     api.post("environments", {"name": "farm"})
     version = api.upload("farm", {"datum.yaml": samples.DATUM}, message="measured").json()
-    ear.wait(lambda e: len(e.sequences()) >= 2)
-    created_event = next(e for e in ear.events if e["type"] == "version.created")
+    listener.wait(lambda e: len(e.sequences()) >= 2)
+    created_event = next(e for e in listener.events if e["type"] == "version.created")
     assert (created_event["environment"], created_event["version"], created_event["root"]) == (
         "farm",
         1,
@@ -45,8 +45,8 @@ def test_commit_publishes_event(api: Api, session: zenoh.Session) -> None:
     event = Event.from_json(json.dumps(created_event))
     assert event.sequence == created_event["sequence"]
     api("PUT", "environments/farm/channels/production", 200, json={"version": 1})
-    ear.wait(lambda e: any(x["type"] == "channel.moved" for x in e.events))
-    assert ear.sequences() == [1, 2, 3]
+    listener.wait(lambda e: any(x["type"] == "channel.moved" for x in e.events))
+    assert listener.sequences() == [1, 2, 3]
 
 
 def test_late_joiners_get_history(api: Api, session: zenoh.Session) -> None:
@@ -62,13 +62,13 @@ def test_late_joiners_get_history(api: Api, session: zenoh.Session) -> None:
 
 
 def test_killed_router_is_restarted_without_loss(api: Api, session: zenoh.Session, tmp_path: Path) -> None:
-    ear = Listener(session, "fleetmap/rough/events")
+    listener = Listener(session, "fleetmap/rough/events")
     api.post("environments", {"name": "rough"})
-    ear.wait(lambda e: e.sequences() == [1])
+    listener.wait(lambda e: e.sequences() == [1])
     os.kill(router_of(api), signal.SIGKILL)
     for k in range(4):
         api.upload("rough", {"n.tmap2.yaml": network(k)})
-    ear.wait(lambda e: e.sequences() == [1, 2, 3, 4, 5], 30)
+    listener.wait(lambda e: e.sequences() == [1, 2, 3, 4, 5], 30)
     assert eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
 
 
@@ -92,10 +92,10 @@ def test_restarted_server_publishes_pending_events(tmp_path: Path, port: int) ->
             eventually(lambda api=api: api.get("/readyz").json()["events"]["state"] == "connected")
             session = zenoh.open(client_config(port))
             try:
-                ear = Listener(session, "fleetmap/quiet/events")
-                ear.wait(lambda e, n=expected: e.sequences() == list(range(1, n + 1)))
+                listener = Listener(session, "fleetmap/quiet/events")
+                listener.wait(lambda e, n=expected: e.sequences() == list(range(1, n + 1)))
                 api.upload("quiet", {"n.tmap2.yaml": network(expected)})
-                ear.wait(lambda e, n=expected: e.sequences() == list(range(1, n + 2)))
+                listener.wait(lambda e, n=expected: e.sequences() == list(range(1, n + 2)))
             finally:
                 session.close()  # type: ignore[no-untyped-call]
 
@@ -236,13 +236,13 @@ def test_router_logs_do_not_block_it(monkeypatch: pytest.MonkeyPatch, capfd: pyt
     try:
         assert router.problem is None
         monkeypatch.delenv("RUST_LOG")
-        heard: list[bytes] = []
+        received: list[bytes] = []
         with zenoh.open(client_config(port)) as receiver, zenoh.open(client_config(port)) as sender:
-            subscriber = receiver.declare_subscriber("some/**", lambda sample: heard.append(bytes(sample.payload)))
-            eventually(lambda: sender.put("some/key", b"first") or heard)
+            subscriber = receiver.declare_subscriber("some/**", lambda sample: received.append(bytes(sample.payload)))
+            eventually(lambda: sender.put("some/key", b"first") or received)
             for _ in range(200):
                 sender.put("some/key", b"more", congestion_control=zenoh.CongestionControl.BLOCK)
-            eventually(lambda: heard.count(b"more") == 200)
+            eventually(lambda: received.count(b"more") == 200)
             subscriber.undeclare()  # type: ignore[no-untyped-call]
     finally:
         router.close()
@@ -267,16 +267,16 @@ def test_router_drops_only_huge_messages(monkeypatch: pytest.MonkeyPatch) -> Non
     port = free_port()
     router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}", max_reply_bytes=2**19)))
     assert router.problem is None
-    heard: list[int] = []
+    received: list[int] = []
     with contextlib.ExitStack() as stack:
         stack.callback(router.close)
         receiver, sender = (stack.enter_context(zenoh.open(client_config(port))) for _ in range(2))
-        subscriber = receiver.declare_subscriber("some/**", lambda sample: heard.append(len(sample.payload)))
-        eventually(lambda: sender.put("some/key", b"1") or heard)
+        subscriber = receiver.declare_subscriber("some/**", lambda sample: received.append(len(sample.payload)))
+        eventually(lambda: sender.put("some/key", b"1") or received)
         for size in (2**19, 2**22, 2):
             sender.put("some/key", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
-        eventually(lambda: heard[-1] == 2)
-        assert [size for size in heard if size != 1] == [2**19, 2]
+        eventually(lambda: received[-1] == 2)
+        assert [size for size in received if size != 1] == [2**19, 2]
         subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 

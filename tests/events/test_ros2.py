@@ -289,8 +289,8 @@ def test_ros2_publishes_map_updates_and_network(api: Api, session: zenoh.Session
     bridged = Heard(session, "map_updates", latched=False)
     Heard(session, f"5/map/{GRID}").wait()  # a volatile subscription counts from when the publisher knows of it
     api.upload("farm", picture((2, 3), (4, 1), (6, 4)))
-    for heard in (changes, bridged):
-        change = update_of(heard.wait())
+    for received in (changes, bridged):
+        change = update_of(received.wait())
         assert (change["x"], change["y"], change["header"][2]) == (4, 1, "map")
         assert change["cells"].tolist() == [[100, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 100]]
     expected[1, 4] = expected[4, 6] = 100
@@ -301,9 +301,9 @@ def test_ros2_publishes_map_updates_and_network(api: Api, session: zenoh.Session
         Heard(session, "5/map/nav_msgs::msg::dds_::OccupancyGrid_/TypeHashNotSupported"),
         Heard(session, "map", recovery=False),
     ]
-    for heard in late:
-        assert heard.wait() == early.wait(2)
-    attached = [heard.samples[0].attachment for heard in late]
+    for received in late:
+        assert received.wait() == early.wait(2)
+    attached = [received.samples[0].attachment for received in late]
     assert attached[2] is None, "the bridge knows no attachments"
     for sample, count in ((early.samples[0], 1), (late[0].samples[0], 2)):
         raw = bytes(sample.attachment)  # type: ignore[arg-type]
@@ -363,30 +363,30 @@ def test_each_level_has_its_topic_and_the_lowest_needs_no_name(api: Api, session
 
 def test_ros2_publishes_version_of_channel(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "west-hall"})
-    heard = Heard(session, f"5/west_hall/map/{GRID}")
+    received = Heard(session, f"5/west_hall/map/{GRID}")
     api.upload("west-hall", picture((1, 1)))
-    assert grid_of(heard.wait(1))["cells"][1, 1] == 100
+    assert grid_of(received.wait(1))["cells"][1, 1] == 100
     api("PUT", "environments/west-hall/channels/production", 200, json={"version": 1})
     api.upload("west-hall", picture((2, 2)))
     api.upload("west-hall", picture((3, 3)))
     api("PUT", "environments/west-hall/channels/production", 200, json={"version": 3})
-    assert grid_of(heard.wait(2))["cells"][3, 3] == 100, "version 2 was on no channel"
+    assert grid_of(received.wait(2))["cells"][3, 3] == 100, "version 2 was on no channel"
     api("PUT", "environments/west-hall/channels/production", 200, json={"version": 1})
-    assert grid_of(heard.wait(3))["cells"][1, 1] == 100
+    assert grid_of(received.wait(3))["cells"][1, 1] == 100
 
 
 def test_another_frame_is_a_new_map_and_no_update(api: Api, session: zenoh.Session) -> None:
     api.post("environments", {"name": "north-hall"})
-    heard = Heard(session, f"5/north_hall/map/{GRID}")
+    received = Heard(session, f"5/north_hall/map/{GRID}")
     changes = Heard(session, f"5/north_hall/map_updates/{UPDATE}", latched=False)
     api.upload("north-hall", picture((1, 1)))
-    heard.wait(1)
+    received.wait(1)
     api.upload("north-hall", picture((1, 1), width=9))
-    assert grid_of(heard.wait(2))["cells"].shape == (6, 9)
+    assert grid_of(received.wait(2))["cells"].shape == (6, 9)
     turned = samples.grid()
     turned["map.yaml"] = turned["map.yaml"].replace(b"-2.0, 0.0]", b"-2.0, 0.5]")
     api.upload("north-hall", turned)
-    pose = grid_of(heard.wait(3))["pose"]
+    pose = grid_of(received.wait(3))["pose"]
     assert pose[3:] == [0.0, 0.0, math.sin(0.25), math.cos(0.25)]
     assert not changes.samples
 
@@ -489,11 +489,11 @@ def test_ros2_keeps_last_map_and_retries_when_content_is_unavailable(
     publishing.start()
     try:
         with zenoh.open(client_config(port)) as session:
-            heard = Heard(session, "map")
-            assert grid_of(heard.wait(1))["cells"][1, 2] == ord("a")
+            received = Heard(session, "map")
+            assert grid_of(received.wait(1))["cells"][1, 2] == ord("a")
             eventually(lambda: ros2_state(tmp_path) == {"state": "connected", "topics": 2})
             state["fails"], state["root"] = 2, "b"
-            assert grid_of(heard.wait(2))["cells"][1, 2] == ord("b")
+            assert grid_of(received.wait(2))["cells"][1, 2] == ord("b")
             assert caplog.text.count("the pool is busy") == 2
             assert state["calls"] == 4, "what stands is not fetched again"
             assert grid_of(Heard(session, "map").wait())["cells"][1, 2] == ord("b")
@@ -524,11 +524,11 @@ def test_ros2_error_of_one_environment_does_not_affect_others(
     publishing.start()
     try:
         with zenoh.open(client_config(port)) as session:
-            heard = Heard(session, "good/map")
-            heard.wait()
+            received = Heard(session, "good/map")
+            received.wait()
             eventually(lambda: caplog.text.count("ROS 2: could not update bad") > 3)
             assert ros2_state(tmp_path) == {"state": "connected", "topics": 2}
-            assert len(heard.samples) == 1, "the topics of the others stay as they are"
+            assert len(received.samples) == 1, "the topics of the others stay as they are"
             assert "unexpected error" not in caplog.text
     finally:
         publishing.close()
@@ -596,8 +596,8 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
             time.sleep(0.3)
             assert len(tokens(session, "@/*/@ros2_lv/MP/a_b§map/**")) == 1
             publishing.close()
-            heard = Heard(session, "a_b/map")
-            assert grid_of(heard.wait())["resolution"] == 3.0
+            received = Heard(session, "a_b/map")
+            assert grid_of(received.wait())["resolution"] == 3.0
     finally:
         publishing.close()
         other.close()

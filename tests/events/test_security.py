@@ -27,7 +27,7 @@ from app.main import check_bus as check_settings
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import Listener, client_config, eventually, free_port, nothing, said
+from tests.events.conftest import Listener, client_config, eventually, free_port, nothing, status_payload
 from tests.events.test_fleet import robot_of
 from tests.events.test_ros2 import GRID, STRING, Heard, grid_of, tokens
 
@@ -103,10 +103,10 @@ def r2(api: Api, port: int, authority: Authority) -> Iterator[zenoh.Session]:
 
 
 def test_robot_may_subscribe_query_and_publish_its_status(api: Api, r1: zenoh.Session) -> None:
-    ear = Listener(r1, "fleetmap/farm/events")
-    ear.wait(lambda e: e.sequences() == [1, 2])  # history comes over keys of its own
+    listener = Listener(r1, "fleetmap/farm/events")
+    listener.wait(lambda e: e.sequences() == [1, 2])  # history comes over keys of its own
     api.upload("farm", {"network.tmap2.yaml": samples.tmap2()})
-    ear.wait(lambda e: e.sequences() == [1, 2, 3])
+    listener.wait(lambda e: e.sequences() == [1, 2, 3])
     reply = next(iter(r1.get("fleetmap/farm/1/version", timeout=20.0)))
     assert reply.ok is not None
     assert json.loads(bytes(reply.ok.payload))["version"] == 1
@@ -116,7 +116,7 @@ def test_robot_may_subscribe_query_and_publish_its_status(api: Api, r1: zenoh.Se
     alive = r1.liveliness().get("fleetmap/server", timeout=5.0)
     assert [str(one.ok.key_expr) for one in alive if one.ok] == ["fleetmap/server"]
     token = r1.liveliness().declare_token("fleetmap/robots/r1")
-    r1.put("fleetmap/farm/robots/r1/status", said(1))
+    r1.put("fleetmap/farm/robots/r1/status", status_payload(1))
     assert eventually(lambda: (r := robot_of(api, "r1")) and r["online"] and r["version"] == 1)
     assert robot_of(api, "r1")["vouched"], "the router lets in nobody but its users"
     token.undeclare()  # type: ignore[no-untyped-call]
@@ -136,8 +136,8 @@ def test_robot_may_publish_nothing_but_its_status(api: Api, r1: zenoh.Session, r
     for key in ("fleetmap/farm/events", f"0/map/{GRID}", "map", "anything", "fleetmap/farm/1/version"):
         r1.put(key, b'{"sequence": 9999}')
         r1.delete(key)
-    r1.put("fleetmap/farm/robots/r2/status", said(66))
-    r1.put("fleetmap/nowhere/robots/r1/status/more", said(66))
+    r1.put("fleetmap/farm/robots/r2/status", status_payload(66))
+    r1.put("fleetmap/nowhere/robots/r1/status/more", status_payload(66))
     for key in ("**", "fleetmap/**", "fleetmap/*/events", "fleetmap/farm/e$*", "fleetmap/**/robots/r1/status", "@/**"):
         r1.put(key, b'{"sequence": 9999}')
     advanced = ext.declare_advanced_publisher(
@@ -152,18 +152,18 @@ def test_robot_may_publish_nothing_but_its_status(api: Api, r1: zenoh.Session, r
     shown = [r1.liveliness().declare_token(key) for key in (*names, "fleetmap/farm/events/@adv/pub/1/1/_")]
     answered = ("fleetmap/farm/1/version", "fleetmap/**", "**", "fleetmap/farm/events/@adv/**")
     forged = [r1.declare_queryable(key, lambda query: query.reply(query.key_expr, b"forged")) for key in answered]
-    r1.put("fleetmap/farm/robots/r1/status", said(2))  # what was said before was taken or dropped before
+    r1.put("fleetmap/farm/robots/r1/status", status_payload(2))  # what was said before was taken or dropped before
     eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 2)
     version = api.upload("farm", {"network.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))}).json()
     events.wait(lambda e: e.events[-1]["version"] == version["version"])
     eventually(lambda: any("topological_map_2" in key for key, _, _ in everything))
     assert [event["sequence"] for event in events.events] == list(range(1, len(events.events) + 1))
     assert len(topics.samples) == 1
-    heard = [(key, kind, payload) for key, kind, payload in everything if key != "fleetmap/farm/robots/r1/status"]
+    received = [(key, kind, payload) for key, kind, payload in everything if key != "fleetmap/farm/robots/r1/status"]
     network = {f"0/topological_map_2/{STRING}", "topological_map_2"}
-    assert {"fleetmap/farm/events"} < {key for key, _, _ in heard} <= {"fleetmap/farm/events", *network}
-    assert all(kind == zenoh.SampleKind.PUT for _, kind, _ in heard)
-    assert not [payload for _, _, payload in heard if payload in (b'{"sequence": 9999}', said(66))]
+    assert {"fleetmap/farm/events"} < {key for key, _, _ in received} <= {"fleetmap/farm/events", *network}
+    assert all(kind == zenoh.SampleKind.PUT for _, kind, _ in received)
+    assert not [payload for _, _, payload in received if payload in (b'{"sequence": 9999}', status_payload(66))]
     assert robot_of(api, "r2") is None
     for key, expected in (("fleetmap/robots/*", []), ("fleetmap/server", ["fleetmap/server"])):
         replies = r2.liveliness().get(key, timeout=5.0)
@@ -205,7 +205,7 @@ class Wire:
     """A link between a robot and the router, with somebody who listens to it."""
 
     def __init__(self, port: int) -> None:
-        self.heard = bytearray()
+        self.received = bytearray()
         self._to = port
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._server.getsockname()[1]
@@ -224,7 +224,7 @@ class Wire:
     def _pass(self, a: socket.socket, b: socket.socket) -> None:
         with contextlib.suppress(OSError):
             while data := a.recv(2**16):
-                self.heard += data
+                self.received += data
                 b.sendall(data)
         for end in (a, b):
             with contextlib.suppress(OSError):
@@ -243,15 +243,15 @@ def test_tls_hides_passwords_and_messages(api: Api, port: int, authority: Author
     wire = Wire(port)
     try:
         with session_to(wire.port, ZenohCredentials(authority.pem, user="r1", password="word one")) as session:
-            ear = Listener(session, "fleetmap/farm/events")
-            ear.wait(lambda e: 2 in e.sequences())
-            session.put("fleetmap/farm/robots/r1/status", said(3))
+            listener = Listener(session, "fleetmap/farm/events")
+            listener.wait(lambda e: 2 in e.sequences())
+            session.put("fleetmap/farm/robots/r1/status", status_payload(3))
             eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 3)
     finally:
         wire.close()
-    assert len(wire.heard) > 2000
+    assert len(wire.received) > 2000
     for word in (b"fleetmap", b"version.created", b"word one", b"robots/r1"):  # long enough not to come by chance
-        assert word not in wire.heard
+        assert word not in wire.received
 
 
 def test_mtls_requires_robot_certificate(authority: Authority, tmp_path: Path) -> None:
@@ -309,11 +309,11 @@ def test_server_logs_in_at_external_router(authority: Authority, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("days", "foreign", "told"),
+    ("days", "foreign", "reason"),
     [(-1, False, "certificate has expired"), (2, True, "unable to get local issuer certificate")],
 )
 def test_untrusted_certificate_is_explained(
-    authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int, foreign: bool, told: str
+    authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int, foreign: bool, reason: str
 ) -> None:
     monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", REFUSED_SECONDS)
     port = free_port()
@@ -323,15 +323,17 @@ def test_untrusted_certificate_is_explained(
     bus = Bus(options, query_handler=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
         assert not bus.ensure_connected()
-        assert bus.state["detail"] == f"no router at {endpoint}: certificate not trusted: {told}"
+        assert bus.state["detail"] == f"no router at {endpoint}: certificate not trusted: {reason}"
         refused(port, ZenohCredentials(authority.pem))
-        ear = ZenohClient("farm", "r1", on_event=nothing, on_connected=nothing, login=ZenohCredentials(authority.pem))
+        listener = ZenohClient(
+            "farm", "r1", on_event=nothing, on_connected=nothing, login=ZenohCredentials(authority.pem)
+        )
         monkeypatch.setattr("app.agent.zenoh_client.CONNECT_MS", int(REFUSED_SECONDS * 1000))
-        ear.set_endpoint(endpoint, "fleetmap")
+        listener.set_endpoint(endpoint, "fleetmap")
         try:
-            eventually(lambda: ear.problem and told in ear.problem)
+            eventually(lambda: listener.problem and reason in listener.problem)
         finally:
-            ear.close()
+            listener.close()
     finally:
         bus.close()
 
@@ -372,16 +374,16 @@ def test_users_file_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reason"),
     [(b"", "no user"), (b"# x\n", "no user"), (b"r1\n", "line 1: must be NAME"), (b"r1:\n", "line 1: must be NAME"),
      (b"a:b\nr/1:x\n", "line 2: invalid name"), (b"*:x", "invalid name"), (b"server:x", "is reserved"),
      (b"a:b\na:c", "line 2: duplicate name"), (b"a:\xff", "UTF-8"), (b"a:b\x00c", "must be NAME"),
      (b"a:b\n" * 300_000, "bytes")],
 )  # fmt: skip
-def test_invalid_users_file_is_refused(text: bytes, told: str, tmp_path: Path) -> None:
+def test_invalid_users_file_is_refused(text: bytes, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "users"
     path.write_bytes(text)
-    with pytest.raises(Invalid, match=told):
+    with pytest.raises(Invalid, match=reason):
         read_users(path)
 
 
@@ -418,7 +420,7 @@ def test_missing_credential_file_is_reported_before_start(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "reason"),
     [
         ({"zenoh_certificate": "a"}, "must be set together"), ({"tls_key": "a"}, "must be set together"),
         ({"zenoh_listen": "tls/0.0.0.0:7447"}, "requires zenoh_certificate"),
@@ -428,8 +430,8 @@ def test_missing_credential_file_is_reported_before_start(tmp_path: Path) -> Non
         ({"zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "rights of other routers"),
     ],
 )  # fmt: skip
-def test_inconsistent_settings_are_refused(more: dict[str, Any], told: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_inconsistent_settings_are_refused(more: dict[str, Any], reason: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=reason):
         settings_for(tmp_path, **{"zenoh_mode": "router", **more})
 
 

@@ -77,7 +77,7 @@ def test_stochastic_rules_follow_weights_and_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "value"),
+    ("text", "value"),
     [
         ("1 + 2 * 3 - 4 / 2", 5),
         ("2 - 3 - 4", -5),
@@ -90,8 +90,8 @@ def test_stochastic_rules_follow_weights_and_seed() -> None:
         ("1e3 + .5", 1000.5),
     ],
 )
-def test_expressions_are_evaluated(said: str, value: float) -> None:
-    assert number(said, a=2, b=4) == value
+def test_expressions_are_evaluated(text: str, value: float) -> None:
+    assert number(text, a=2, b=4) == value
 
 
 def test_random_number_is_within_its_bounds() -> None:
@@ -101,7 +101,7 @@ def test_random_number_is_within_its_bounds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "why"),
+    ("text", "reason"),
     [
         ("__import__('os')", "nothing is called|no part of"),
         ("a.b", "no part of|unexpected"),
@@ -119,20 +119,20 @@ def test_random_number_is_within_its_bounds() -> None:
         ("", "missing"),
     ],
 )
-def test_invalid_expressions_raise(said: str, why: str) -> None:
-    with pytest.raises(Invalid, match=why) as refused:
-        number(said, a=2)
+def test_invalid_expressions_raise(text: str, reason: str) -> None:
+    with pytest.raises(Invalid, match=reason) as refused:
+        number(text, a=2)
     assert refused.value.problems[0].where == "here"
 
 
-@pytest.mark.parametrize("said", ["1 / 0", "sqrt(0 - 1)", "9999 ^ 16", "5 % 0", "1e300 * 1e300 * 0"])
-def test_uncomputable_expressions_raise(said: str) -> None:
+@pytest.mark.parametrize("text", ["1 / 0", "sqrt(0 - 1)", "9999 ^ 16", "5 % 0", "1e300 * 1e300 * 0"])
+def test_uncomputable_expressions_raise(text: str) -> None:
     with pytest.raises(CannotGenerate, match="cannot be computed"):
-        number(said)
+        number(text)
 
 
 @pytest.mark.parametrize(
-    ("rules", "why"),
+    ("rules", "reason"),
     [
         ("F -> FF", "missing axiom"),
         ("axiom: A", "no rule for A"),
@@ -154,8 +154,8 @@ def test_uncomputable_expressions_raise(said: str) -> None:
         ("#" * 20_001, "the maximum is 20000"),
     ],
 )
-def test_invalid_lsystem_rules_raise(rules: str, why: str) -> None:
-    with pytest.raises(Invalid, match=why):
+def test_invalid_lsystem_rules_raise(rules: str, reason: str) -> None:
+    with pytest.raises(Invalid, match=reason):
         parse(rules)
 
 

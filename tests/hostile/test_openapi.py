@@ -51,10 +51,10 @@ def test_every_response_is_declared_and_no_call_fails_the_server(api: Api) -> No
             phases=[Phase.generate],
             suppress_health_check=list(HealthCheck),
         )
-        @given(case=operation.as_strategy(), known=st.booleans())
-        def call(case: Any, known: bool) -> None:
+        @given(case=operation.as_strategy(), existing=st.booleans())
+        def call(case: Any, existing: bool) -> None:
             nonlocal count
-            names = {"env": demo.NAME, "v": "latest"} if known and case.method != "DELETE" else {}
+            names = {"env": demo.NAME, "v": "latest"} if existing and case.method != "DELETE" else {}
             case.path_parameters = {**(case.path_parameters or {}), **names}
             arguments = case.as_transport_kwargs(base_url=api.url)
             if case.operation.path == FOLLOWED:
