@@ -219,7 +219,7 @@ def test_limits_are_enforced() -> None:
         bomb.replace(b"COUNT 1 1 1 1", b"COUNT 1 1 1 %d" % (size - 12)) + struct.pack("<II", len(packed), size) + packed
     )
     assert len(read(bomb)[0]) == 1, "13 kB of 152 bytes"
-    with pytest.raises(TooLarge, match="more than 13000 bytes"):
+    with pytest.raises(TooLarge, match="more than the limit of 13000 bytes"):
         read(bomb, limits=Limits(unpacked_bytes=13_000))
 
 
