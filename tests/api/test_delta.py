@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from collections.abc import Iterator
 from typing import Any
@@ -37,7 +38,18 @@ def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         yield api
 
 
+_cache: dict[Any, Any] = {}
+"""Content of versions, which never changes."""
+
+
 def features_of(api: Api, env: str, version: int, crs: str) -> dict[Any, Any]:
+    key = api.url, env, version, crs
+    if key not in _cache:
+        _cache[key] = download_features(api, env, version, crs)
+    return dict(_cache[key])
+
+
+def download_features(api: Api, env: str, version: int, crs: str) -> dict[Any, Any]:
     out = {}
     for layer in VECTORS:
         for f in api.get(f"environments/{env}/versions/{version}/layers/{layer}?crs={crs}").json()["features"]:
@@ -48,6 +60,13 @@ def features_of(api: Api, env: str, version: int, crs: str) -> dict[Any, Any]:
 
 def cells_of(api: Api, env: str, version: int, name: str) -> Any:
     """Return cells as Nav2 has them, row 0 at the bottom; None if there is no such grid."""
+    key = api.url, env, version, name
+    if key not in _cache:
+        _cache[key] = download_cells(api, env, version, name)
+    return copy.copy(_cache[key])
+
+
+def download_cells(api: Api, env: str, version: int, name: str) -> Any:
     answer = api.get(f"environments/{env}/versions/{version}/layers/occupancy?name={name}", expect=None)
     if answer.status_code == 404:
         return None
