@@ -234,7 +234,7 @@ def test_polygon_is_stored_without_foreign_members(api: Api, farm: str, bare: st
     problem = api.problem("POST", url, 422, json={**report, "polygon": {"type": "Polygon", "coordinates": [round_]}})
     assert "1001 points" in problem["detail"]
     problem = api.problem("POST", url, 422, json={**report, "level": "attic"})
-    assert "it has ground" in problem["detail"]
+    assert "its levels: ground" in problem["detail"]
     assert (
         "no datum"
         in api.problem("POST", f"environments/{bare}/overlays", 422, json={**report, "crs": "wgs84"})["detail"]

@@ -86,7 +86,7 @@ def test_random_rules_follow_weights_and_seed() -> None:
         ("town -> house", "no rule for 'house'"),
         ("town -> ring(5)", "takes 1 values and 1 shapes"),
         ("town -> cut(0.5) a b", "takes 2 values"),
-        ("town -> ring(__import__) town", "nothing is called"),
+        ("town -> ring(__import__) town", "unknown name"),
         ("town : -> park", "missing condition"),
         ("town -> park extra", "unknown action 'park'"),
         ("T O W N -> park", "is not a rule"),

@@ -275,7 +275,7 @@ def test_slow_bodies_and_headers_time_out(api: Api) -> None:
         blank.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")
         answer, _ = read_to_end(body, b" ")
         assert answer.startswith(b"HTTP/1.1 408 ")
-        assert b"1000 bytes a second" in answer
+        assert b"1000 bytes per second" in answer
         head.sendall(b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: ")
         assert read_to_end(head, b"x")[0] == b""
         assert read_to_end(blank, b"\r\n")[0].startswith(b"HTTP/1.1 200 "), "empty lines before a request are ignored"
