@@ -54,6 +54,12 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(process.kill)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Run one worker more than there are processors: some tests wait for agents, routers and timeouts."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 def pytest_collection_finish() -> None:
     """Freeze imported and collected objects, so that the garbage collector ignores them."""
     gc.collect()
