@@ -285,7 +285,7 @@ def test_noise_raises_cannot_convert(monkeypatch: pytest.MonkeyPatch) -> None:
     labels = find_objects(grid(cells), minimum_size=0.0)
     assert len(labels) > 100
     monkeypatch.setattr(known_figures, "MAX_PIECES", 100)
-    assert "noise" in bad(cells)
+    assert "too noisy" in bad(cells)
     monkeypatch.undo()
     monkeypatch.setattr(known_figures, "MAX_FIGURES", 50)
     assert "more than 50 edges" in bad(cells)

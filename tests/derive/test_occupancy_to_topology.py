@@ -412,7 +412,7 @@ def test_grid_selection() -> None:
 def test_masks_are_used_only_when_named() -> None:
     g = grid(rooms())
     mask = Layers({PartKey("occupancy", "ground", "keepout"): g})
-    with pytest.raises(MissingLayer, match="masks contain no ways"):
+    with pytest.raises(MissingLayer, match="masks contain no paths"):
         occupancy_to_topology(mask, Parameters(), DerivationNotes())
     assert occupancy_to_topology(mask, Parameters(grid="keepout"), DerivationNotes()).parts
     both = Layers({**mask.parts, PartKey("occupancy", "ground", "floor"): grid(rooms(1))})

@@ -512,7 +512,7 @@ def test_library_never_reads_outside_upload(uri: str) -> None:
     files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
     bundle = read_upload(files)
     assert objects(bundle).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "an unreadable solid"
-    assert any("supply" in w.problem or "kept" in w.problem for w in bundle.warnings)
+    assert any("upload" in w.problem or "is stored unchanged" in w.problem for w in bundle.warnings)
     assert uri in offline(files, "gazebo").files["world.sdf"].decode()
 
 

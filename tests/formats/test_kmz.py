@@ -270,7 +270,7 @@ def test_images_beside_kml_require_option() -> None:
         (make_image(crs="EPSG:4326", transform=(1.0, 0, 178.0, 0, -1.0, 5.0)), None, "not on earth"),
         (make_image(crs="EPSG:32601", transform=(9e4, 0, 1e5, 0, -9e4, 1e5)), None, "antimeridian"),
         (make_image(crs="EPSG:4326", transform=(0.1, 0, 1.0, 0, -0.1, 89.0)), None, "beyond ±85"),
-        (make_image(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "not known"),
+        (make_image(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "unknown CRS"),
     ],
     ids=["no datum", "off earth", "antimeridian", "polar", "no such CRS"],
 )

@@ -90,7 +90,7 @@ def test_points_are_local_when_requested_or_crs_is_unknown() -> None:
     unknown = FIELD.replace(struct.pack("<H", 32630), struct.pack("<H", 32599))
     _, context, layers = read(unknown)
     assert layers.datum is None
-    assert any("not known" in w.problem for w in context.warnings)
+    assert any("unknown CRS" in w.problem for w in context.warnings)
     assert any("used as the local origin" in w.problem for w in context.warnings)
 
 

@@ -296,7 +296,7 @@ def test_network_of_other_format_is_written() -> None:
     assert entry["maxSpeed"] == 2.5
     assert entry["trajectory"]["controlPoints"][1] == {"x": 0.5, "y": 1.0}
     assert [(d.subject, d.count) for d in context.dropped] == [("attributes of edges", 1)]
-    assert "got a number" in warnings(context)
+    assert "a numeric suffix makes them unique" in warnings(context)
     back, _ = read(served)
     assert item(back, "e0")["speed_limit"] == 2.5
     line = back.parts[NETWORK]
