@@ -171,6 +171,7 @@ def names_in(package: bytes) -> list[str]:
     return zipfile.ZipFile(io.BytesIO(package)).namelist()
 
 
+@pytest.mark.parametrize("api", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("name", TEMPLATES)
 def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
     """A zipped upload and download keep the information, and equal an upload of the folder's files."""
@@ -214,6 +215,7 @@ def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[st
     assert np.abs(local_xy - truth).max() < 1e-6
 
 
+@pytest.mark.parametrize("api", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("way", [["kml"], ["geojson"], ["kml", "geojson"], ["geojson", "kml"], ["kmz"]])
 def test_network_keeps_every_node_edge_and_attribute_through_formats(
     api: Api, shared: Path, same: Same, way: list[str]

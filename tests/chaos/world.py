@@ -65,7 +65,9 @@ class World:
         self.printed: list[str] = []
         self.server: ServerProcess | None = None
         self.serve()
-        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=HEADERS, timeout=20)
+        self.http = httpx.Client(
+            base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=HEADERS, timeout=20, verify=False
+        )
 
     # --- processes that are killed and restarted ---
 
@@ -178,7 +180,7 @@ class Writer:
 
     def _run(self) -> None:
         try:
-            with httpx.Client(base_url=self._world.http.base_url, headers=HEADERS, timeout=20) as client:
+            with httpx.Client(base_url=self._world.http.base_url, headers=HEADERS, timeout=20, verify=False) as client:
                 count = 0
                 while not self.stopping.is_set():
                     count += 1
@@ -273,7 +275,7 @@ class Reader:
         params = {"environment": ENVIRONMENT}
         timeout = httpx.Timeout(5.0, read=20.0)
         with (
-            httpx.Client(base_url=self._world.http.base_url, headers=headers, timeout=timeout) as client,
+            httpx.Client(base_url=self._world.http.base_url, headers=headers, timeout=timeout, verify=False) as client,
             client.stream("GET", "events", params=params) as answer,
         ):
             if answer.status_code != 200:
