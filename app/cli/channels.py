@@ -62,7 +62,7 @@ def show(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show one channel: version, plan, roll-out and robots.
+    """Show one channel: version, plan, rollout and robots.
 
     Example: `fleetmap channels show farm production`
     """
