@@ -301,7 +301,7 @@ def _losses(fmt: Format) -> list[str]:
     if fills:
         out += [
             "## What a map fills in\n",
-            "The report lists these values under `template`. A parameter, or an environment's template, sets another value.\n",
+            "The report lists these values under `template`. Change them by parameter or environment template.\n",
             table(("what", "why", "parameter"), ((plain(w), plain(y), code(o) if o else "") for w, y, o in fills)),
         ]
     return out
