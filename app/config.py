@@ -213,8 +213,8 @@ class Settings(BaseSettings):
     )
     zenoh_certificate: Path | None = Field(
         default=None,
-        description="Certificate (PEM, with its chain) for `tls/` endpoints: of the router, and of the server for "
-        "other routers that require one.",
+        description="Certificate (PEM, with its chain) of the server's router for `tls/` endpoints, and of the server "
+        "as a client of other routers.",
     )
     zenoh_key: Path | None = Field(default=None, description="Private key of `zenoh_certificate` (PEM).")
     zenoh_ca: Path | None = Field(
@@ -240,7 +240,7 @@ class Settings(BaseSettings):
         default=64 * 2**20,
         ge=1024,
         description="Maximum size of a file (or a grid for ROS 2) sent over Zenoh; HTTP has no such limit. The "
-        "server's router drops messages larger than this and than 65 MiB, unless `zenoh_config` is set.",
+        "server's router drops messages that exceed both this size and 65 MiB, unless `zenoh_config` is set.",
     )
 
     ros2_environments: str = Field(

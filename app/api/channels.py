@@ -106,7 +106,7 @@ class OverlaysOut(BaseModel):
     """Closures in force."""
 
     count: int
-    digest: str = Field(description="Robots with equal roots and equal digests hold the same map.")
+    digest: str = Field(description="Robots with equal roots and equal digests run the same map.")
     sequence: int = Field(description="Sequence of the last event that changed the closures, or 0.")
 
 
@@ -181,7 +181,7 @@ async def list_channels(
 ) -> Response:
     """List channels, `latest` first, then by name, with planned moves and the status of their robots.
 
-    `robots.since` is set if all robots of a channel run its root: the time since when they do. `holding`, `lagging`
+    `robots.since` is the time from which all robots of a channel run its root, or null. `holding`, `lagging`
     and `failed` add up to `total`; `ready` counts the robots that have the planned version.
     """
     if robots:  # not shared: a shared result is valid until the next commit, and robot reports are not commits

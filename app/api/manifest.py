@@ -115,15 +115,16 @@ class ManifestOut(BaseModel):
         description="Hash of each layer. Equal layers of any two versions have equal hashes."
     )
     variables: dict[str, str] | None = Field(
-        None, description="Names of the site: literal variables for scripts of an `environment_template`."
+        None, description="Variables of an uploaded `environment_template`, such as `FARM_NAME`, for its scripts."
     )
 
 
 ClosuresQuery = Annotated[
     ClosureMode | None,
     Query(
-        description="How maps show the closures in force: `apply` (closed edges are omitted from formats that cannot "
-        "express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version number."
+        description="How maps show the closures in force. `apply`: closed edges are omitted, or marked in formats that "
+        "can block an edge; `mark`: they stay in all formats, with a mark; `ignore`: closures are not shown. Default: "
+        "`apply`, but `ignore` for a version number."
     ),
 ]
 

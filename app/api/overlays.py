@@ -343,8 +343,7 @@ async def nav2_edges(
 ) -> Response:
     """Return a request of `nav2_msgs/srv/DynamicEdges`.
 
-    It has the numbers of closed edges, and of edges that are open again, in the graph of
-    `maps/nav2_route?closures=mark`.
+    It contains the numbers of closed and reopened edges in the graph of `maps/nav2_route?closures=mark`.
     """
     maps = await _files_with_marks(services, env, version, "nav2_route", request, principal)
     if isinstance(maps, JobStarted):

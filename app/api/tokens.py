@@ -54,7 +54,9 @@ class TokenOut(BaseModel):
     robot: str | None
     expires: datetime | None
     created: datetime
-    ended: datetime | None = Field(description="When the token was found to have expired; it stays expired.")
+    ended: datetime | None = Field(
+        description="Time at which the server found the token expired. It stays expired, even if the clock is set back."
+    )
 
 
 class NewTokenOut(TokenOut):

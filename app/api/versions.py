@@ -263,7 +263,7 @@ async def create_version(
     summary="Edit features and cells",
 )
 def create_edit(env: EnvironmentPath, body: EditsBody, services: ServicesDep, commit: CommitDep) -> Response:
-    """Put or delete features and set cells: one version, or none.
+    """Put or delete features and set cells, all in one version or none.
 
     Edits that leave edges without their nodes are refused.
     """

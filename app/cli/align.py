@@ -30,10 +30,10 @@ Reach = Annotated[float | None, typer.Option("--reach", min=0, help="Maximum shi
 Near = Annotated[
     float | None,
     typer.Option(
-        "--near", help="Distance at which two cells [default: 0.1] or points [default: 0.5] agree, in metres."
+        "--near", help="Maximum distance of matching cells [default: 0.1] or points [default: 0.5], in metres."
     ),
 ]
-Least = Annotated[float, typer.Option("--least", min=0, max=1, help="Minimum share of agreeing cells or points.")]
+Least = Annotated[float, typer.Option("--least", min=0, max=1, help="Minimum share of matching cells or points.")]
 
 
 def align(

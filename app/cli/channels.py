@@ -62,7 +62,7 @@ def show(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Show one channel: version, plan, roll-out and robots.
+    """Show one channel: version, plan, rollout and robots.
 
     Example: `fleetmap channels show farm production`
     """
@@ -84,7 +84,7 @@ def show(
             "since (UTC)": output.minute(row.get("time")),
             "author": row.get("author"),
             "planned": planned_move_text(row),
-            "roll-out": ", ".join(f"{name} {value}" for name, value in rollout.items() if value is not None),
+            "rollout": ", ".join(f"{name} {value}" for name, value in rollout.items() if value is not None),
             "robots": f"{robots['holding']} of {robots['total']} have it, {robots['lagging']} are behind, "
             f"{robots['failed']} failed, {robots['ready']} are ready for the plan",
             "closures": f"{row['overlays']['count']} in force",

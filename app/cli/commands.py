@@ -144,7 +144,7 @@ def build(only: str | None = None) -> typer.Typer:
 
 
 def _serve_without_flags() -> None:
-    """Start the server, with --demo including a demo environment."""
+    """Start the server; with --demo also create a demo environment."""
 
 
 def _show_version(flag: bool) -> None:

@@ -14,8 +14,8 @@ from app.cli.groups import Commands
 commands = Commands("List, create, rename and delete environments.")
 
 Deleted = Annotated[str, typer.Argument(help="Name of a deleted environment.")]
-Title = Annotated[str | None, typer.Option("--title", help="Title for people.")]
-Description = Annotated[str | None, typer.Option("--description", help="Description for people.")]
+Title = Annotated[str | None, typer.Option("--title", help="Title to display.")]
+Description = Annotated[str | None, typer.Option("--description", help="Description to display.")]
 Tags = Annotated[list[str] | None, typer.Option("--tag", help="Tag; repeatable.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 

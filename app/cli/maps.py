@@ -371,7 +371,7 @@ def coverage(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the formats that an environment can be exported in, with derivations needed or data missing.
+    """List for each format whether an environment can be exported, by which derivations, or what is missing.
 
     Example: `fleetmap coverage farm`
     """

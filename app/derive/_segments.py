@@ -83,10 +83,10 @@ class Segmentation:
         "with a near-infrared band; plan: dark walls on bright paper; model: the model named by model=; auto: plan for "
         "images that look like one, else colour",
     )
-    picture: str | None = parameter(None, "name of the image; default: satellite, else the only one of a level")
+    picture: str | None = parameter(None, "name of the image; default: satellite, else the only one on a level")
     resolution: float | None = parameter(
         None,
-        "size of a pixel or cell; default: the image's, rounded up and at least 0.05, coarser if it would be too large",
+        "size of a pixel or cell; default: the image's, rounded up and at least 0.05, or coarser for a large image",
         minimum=1e-3,
         maximum=100.0,
         unit="m",

@@ -70,7 +70,7 @@ class Parameters:
 
     height: float | None = parameter(
         None,
-        f"height of the slice above the level's floor; default: {HEIGHT}, as a laser scanner sees",
+        f"height of the slice above the level's floor; default: {HEIGHT}, where a laser scanner measures",
         minimum=-1e4,
         maximum=1e4,
         unit="m",

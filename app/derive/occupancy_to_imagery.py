@@ -49,7 +49,7 @@ EDGE = (196, 64, 56)
 class Parameters:
     """Parameters of occupancy_to_imagery."""
 
-    grid: str | None = parameter(None, "name of the occupancy grid; default: `map`, or the only one")
+    grid: str | None = parameter(None, "name of the occupancy grid; default: map, else the only one")
     pixel: float | None = parameter(
         None, "size of a pixel; default: the grid's cells, or coarser to keep the image below 2^26 pixels",
         minimum=1e-3, maximum=100.0, unit="m",

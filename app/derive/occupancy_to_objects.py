@@ -73,7 +73,7 @@ class Parameters:
         "kind of site; decides whether discs are trees (forest, orchard) or posts, and sizes of objects",
     )
     grid: str | None = parameter(
-        None, "name of the grid; default: map, else the only one of a level that is no filter mask"
+        None, "name of the grid; default: map, else the only one on a level that is not a filter mask"
     )
     minimum_size: float | None = parameter(
         None,

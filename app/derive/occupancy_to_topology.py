@@ -54,7 +54,7 @@ class Parameters:
         "(generalised Voronoi diagram)",
     )
     grid: str | None = parameter(
-        None, "name of the grid; default: map, else the only one of a level that is no filter mask"
+        None, "name of the grid; default: map, else the only one on a level that is not a filter mask"
     )
     robot_radius: float = parameter(
         0.3, "radius of the robot; edges keep this distance from obstacles", minimum=0.0, maximum=100.0, unit="m"
@@ -62,8 +62,7 @@ class Parameters:
     unknown: bool = parameter(False, "whether robots may drive through unknown cells")
     unknown_grey: Literal["unknown", "free"] = parameter(
         "unknown",
-        "meaning of free cells with grey 205, which map_saver writes for unknown and a free_thresh of 0.25 reads as "
-        "free",
+        "meaning of cells with grey 205: map_saver writes it for unknown, but a free_thresh of 0.25 reads it as free",
     )
     tolerance: float = parameter(
         0.1, "maximum distance of straight edges from the skeleton or diagram", minimum=0.0, maximum=100.0, unit="m"
@@ -77,7 +76,7 @@ class Parameters:
     )
     island: float = parameter(
         2.0,
-        "diameter below which isolated pieces of free space are dropped; the largest one always stays",
+        "diameter below which isolated pieces of free space are dropped, except the largest one",
         minimum=0.0,
         maximum=1e6,
         unit="m",

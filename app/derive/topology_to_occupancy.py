@@ -51,7 +51,7 @@ class Parameters:
 
     edge_width: float | None = parameter(
         None,
-        f"width of edges that state none; default: {WIDTH}, for an OpenStreetMap way that of its class",
+        f"width of edges without one; default: {WIDTH}, for OpenStreetMap ways the width of their class",
         minimum=0.01,
         maximum=MAX_WIDTH_METRES,
         unit="m",

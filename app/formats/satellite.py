@@ -97,7 +97,7 @@ class WriteOptions:
     """Image to write, and its encoding."""
 
     picture: str | None = parameter(None, "name of the image; *: all; default: satellite, else the only one")
-    level: str | None = parameter(None, "level of the image; *: all; default: the level of the image")
+    level: str | None = parameter(None, "level of the image; *: all; default: ground, or the only one that has it")
     file_type: Literal["tif", "png"] | None = parameter(
         None, "tif: a cloud optimized GeoTIFF with everything (default); png: 8 bit with a world file"
     )

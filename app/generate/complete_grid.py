@@ -39,7 +39,7 @@ class Options:
     """Parameters of complete_grid."""
 
     grid: str | None = parameter(
-        None, "name of the grid; default: map, else the only one of a level that is no filter mask"
+        None, "name of the grid; default: map, else the only one on a level that is not a filter mask"
     )
     reach: float = parameter(
         1.0, "maximum distance of filled-in cells from a known one; 0: unlimited", minimum=0.0, maximum=1e6

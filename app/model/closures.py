@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 ClosureMode = Literal["apply", "mark", "ignore"]
-"""Display of closures in a map. ``apply``: formats that cannot express a blocked edge omit closed edges.
+"""Display of closures in a map.
 
-``mark``: closed
-edges stay and are marked. ``ignore``: the map shows the version without closures.
+``apply``: closed edges are omitted, or marked in formats that can block an edge. ``mark``: they stay, with a mark.
+``ignore``: the map shows the version without closures.
 """
 CLOSURE_MODES: tuple[ClosureMode, ...] = get_args(ClosureMode)
 

@@ -227,8 +227,8 @@ def format_page(fmt: Format) -> str:
     if fmt.write and dataclasses.fields(fmt.write_options):
         out += [
             "## Parameters of a map\n",
-            f"In the address of a map, `/maps/{{environment}}/{fmt.name}?NAME=VALUE`, or as `-O NAME=VALUE` of "
-            "`fleetmap export`. Parameters of a [derivation](../derivations.md) go the same way.\n",
+            f"In the URL of a map, `/maps/{{environment}}/{fmt.name}?NAME=VALUE`, or as `-O NAME=VALUE` of "
+            "`fleetmap export`. Parameters of a [derivation](../derivations.md) are set in the same way.\n",
             parameters(fmt.write_options),
         ]
     for name, doc in further:
@@ -273,7 +273,7 @@ def _facts(fmt: Format) -> str:
         ("Files", codes(fmt.files)),
         ("Media types", codes(dict.fromkeys(fmt.files.values()))),
         ("Uploads end in", codes(fmt.extensions)),
-        ("Layers", ", ".join(sorted(fmt.layers)) + (" (of a grid only its place)" if fmt.traits.outlines else "")),
+        ("Layers", ", ".join(sorted(fmt.layers)) + (" (only the position of a grid)" if fmt.traits.outlines else "")),
         ("A map needs", wants + (", and a datum" if needs.datum else "")),
         ("A map also uses", ", ".join(sorted(needs.also))),
         ("Coordinates", ANCHORS.get(needs.anchor or "", "")),
@@ -281,7 +281,7 @@ def _facts(fmt: Format) -> str:
         ("Blocked edges", "stay in a map, with a mark" if fmt.traits.marks_blocked else ""),
         (
             "Parts",
-            f"one at a time, by `{parts.level}` and `{parts.name}`; `*` gives all" if parts else "",
+            f"one at a time, by `{parts.level}` and `{parts.name}`; `*` selects all" if parts else "",
         ),
         ("Direction", "read only" if fmt.write is None else "written only" if fmt.read is None else ""),
     ]
@@ -295,13 +295,13 @@ def _losses(fmt: Format) -> list[str]:
     if drops:
         out += [
             "## What a map drops\n",
-            "The report of each map lists what was dropped of this map, with counts, under `dropped`.\n",
+            "The report of each map lists the data dropped from it, with counts, under `dropped`.\n",
             table(("what", "why"), ((plain(item), plain(why)) for item, why in drops)),
         ]
     if fills:
         out += [
             "## What a map fills in\n",
-            "The report lists it under `template`. A parameter, or an environment's template, sets another value.\n",
+            "The report lists these values under `template`. Change them by parameter or environment template.\n",
             table(("what", "why", "parameter"), ((plain(w), plain(y), code(o) if o else "") for w, y, o in fills)),
         ]
     return out
@@ -315,9 +315,9 @@ def _rules(fmt: Format) -> list[str]:
     return [
         "## Rules of its consumers\n",
         prose(inspect.getdoc(module) or ""),
-        "`fleetmap check` and the report of each map list what breaks a rule. *Refused*: a consumer does not load the "
-        "map, or misreads it (`level: error`). *Doubtful*: it loads the map, and may not do what is meant "
-        "(`level: warning`).\n",
+        "`fleetmap check` and the report of each map list broken rules. *Refused*: a consumer does not load the "
+        "map, or misreads it (`level: error`). *Doubtful*: it loads the map, but may not use it as "
+        "intended (`level: warning`).\n",
         table(("level", "where", "finding"), rows),
     ]
 
@@ -337,7 +337,7 @@ def _layers(one: Derivation) -> str:
         ("also uses", ", ".join(sorted(one.also))),
         ("gives", one.gives + (f" ({', '.join(sorted(one.part_names))})" if one.part_names else "")),
         ("cost", f"{one.cost:g}"),
-        ("further derivations", "none may follow: its result is good for a map only" if one.is_terminal else ""),
+        ("further derivations", "none: its result is used for maps only" if one.is_terminal else ""),
     ]
     return table(("", ""), [row for row in rows if row[1]])
 
@@ -371,7 +371,7 @@ def settings() -> str:
     for name, field in Settings.model_fields.items():
         low, above, high = (next((getattr(m, w) for m in field.metadata if hasattr(m, w)), None) for w in LIMITS)
         default = field.default if field.default_factory is None else None
-        is_size = name.endswith("_bytes") or name.endswith("_bytes_per_second")
+        is_size = name.endswith("_bytes")
         size = is_size and isinstance(default, int) and default > 0
         shown = format_size(int(default)) if size else _text(default)
         rows.append(
@@ -500,7 +500,7 @@ def _operation(method: str, path: str, operation: Mapping[str, Any], role: str) 
     shown = operation.get("parameters", [])
     if "maps" in operation["tags"] and "{format}" in path:
         shown = [p for p in shown if p["in"] != "query" or p["name"] in ("derive", "closures")]
-        out.append("It also takes the parameters of the [format](formats.md) and of [derivations](derivations.md).\n")
+        out.append("It also accepts the parameters of the [format](formats.md) and of [derivations](derivations.md).\n")
     out.append(
         table(
             ("parameter", "in", "type", "default", "meaning"),

@@ -203,16 +203,16 @@ def _map_paths(paths: dict[str, Any]) -> None:
     ):
         names = [n for n in ("env", "v", "format") if "{" + n + "}" in path] + list(extra)
         content: dict[str, Any] = {"application/octet-stream": {}, "application/zip": {}}
-        describing = "The file if the map is a single file, else a zip." if not extra else "The file."
+        describing = "The file of the map, or a zip if it has several." if not extra else "The file."
         short = " Uses the channel `production` if it exists, else `latest`." if path.startswith("/maps") else ""
         operation = {
             "tags": ["maps"],
             "summary": summary,
             "operationId": "get_" + "_".join(["map", *(["file"] if extra else []), *(["short"] if short else [])]),
-            "description": f"{describing}{short} Missing layers are derived. Send `If-None-Match` with repeated "
-            "requests. `Link` refers to the report on raw, derived, filled-in and dropped information. If a format has "
-            "parameters for level and name, `*` selects all: `?level=*&grid=*`. Files of other levels than the default "
-            "one are below a folder named like the level (`L2/map.yaml`).",
+            "description": f"Return {describing[0].lower()}{describing[1:]}{short} Missing layers are derived. Send "
+            "`If-None-Match` with repeated requests. The header `Link` refers to the report of the map. If a format "
+            "has parameters for level and name, `*` selects all: `?level=*&grid=*`. Files of other levels than the "
+            "default one are below a folder named like the level (`L2/map.yaml`).",
             "parameters": [_path_parameter(name) for name in names] + _query_parameters() + _header_parameters(),
             "responses": {
                 "200": {"description": describing, "headers": _HEADERS, "content": content},
@@ -308,18 +308,20 @@ def _query_parameters() -> list[dict[str, Any]]:
     A name that occurs several times is listed once, with its meaning for each format or derivation.
     """
     out: dict[str, dict[str, Any]] = {}
+    users: dict[str, dict[str, list[str]]] = {}  # names of formats and derivations, by parameter and text
     declared = [(fmt.name, fmt.write_options) for fmt in formats.all_formats().values() if fmt.write]
     declared += [(step.name, step.parameters) for step in all_derivations().values()]
     for name, options in declared:
         for option in parameters.describe(options):
-            text = f"`{name}`: {_option_text(option)}"
             entry = out.setdefault(
                 option["name"],
                 {"name": option["name"], "in": "query", "description": "", "schema": dict(option["schema"])},
             )
             if entry["schema"] != option["schema"]:
                 entry["schema"] = {"type": "string"}
-            entry["description"] = f"{entry['description']} {text}".strip()
+            users.setdefault(option["name"], {}).setdefault(_option_text(option), []).append(f"`{name}`")
+    for name, texts in users.items():
+        out[name]["description"] = " ".join(f"{', '.join(names)}: {text}" for text, names in texts.items())
     derive = {
         "name": "derive",
         "in": "query",
@@ -329,8 +331,9 @@ def _query_parameters() -> list[dict[str, Any]]:
     closures = {
         "name": "closures",
         "in": "query",
-        "description": "How the map shows the closures in force: `apply` (closed edges are omitted from formats that "
-        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version number.",
+        "description": "How the map shows the closures in force. `apply`: closed edges are omitted, or marked in "
+        "formats that can block an edge; `mark`: they stay in all formats, with a mark; `ignore`: closures are not "
+        "shown. Default: `apply`, but `ignore` for a version number.",
         "schema": {"type": "string", "enum": list(CLOSURE_MODES)},
     }
     return [derive, closures, *(out[name] for name in sorted(out))]

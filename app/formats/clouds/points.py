@@ -412,7 +412,7 @@ FRAME_DOC = (
     "local in others"
 )
 NAME_DOC = "name of the voxel map; *: all; default: map, else the only one"
-LEVEL_DOC = "level of the voxel map; *: all; default: the one it is on"
+LEVEL_DOC = "level of the voxel map; *: all; default: ground, or the only one that has it"
 
 MAX_POINTS = 2**25
 """Maximum number of points generated from voxels."""

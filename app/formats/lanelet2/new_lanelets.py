@@ -28,9 +28,9 @@ class WriteOptions:
     """Properties of new lanelets that the network does not specify."""
 
     width: float = parameter(1.0, "width of lanes for edges without width", minimum=0.01, maximum=100.0, unit="m")
-    subtype: str = parameter("road", "subtype of lanes without subtype in their source: road, walkway, crosswalk …")
+    subtype: str = parameter("road", "subtype of lanes whose source has none, such as road, walkway or crosswalk")
     location: str = parameter("urban", "location of new lanes: urban or nonurban")
-    bounds: str = parameter("virtual", "type of the bounds of new lanes: virtual, line_thin, curbstone …")
+    bounds: str = parameter("virtual", "type of the bounds of new lanes, such as virtual, line_thin or curbstone")
     projector_info: bool = parameter(
         False, "also write map_projector_info.yaml (Local: local_x and local_y are metres in the environment's frame)"
     )

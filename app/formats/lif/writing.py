@@ -58,12 +58,12 @@ class WriteOptions:
         None, "project of the file if no source specifies one; default: the name of the map"
     )
     orientation_type: Literal["TANGENTIAL", "GLOBAL"] = parameter(
-        "TANGENTIAL", "reference of vehicle_orientation on edges of other formats"
+        "TANGENTIAL", "reference of vehicle_orientation on edges from other formats"
     )
     vehicle_orientation: float = parameter(
-        0.0, "orientation of vehicles on edges of other formats", minimum=-3.2, maximum=3.2, unit="rad"
+        0.0, "orientation of vehicles on edges from other formats", minimum=-3.2, maximum=3.2, unit="rad"
     )
-    rotation_allowed: bool = parameter(False, "allow vehicles to rotate on edges of other formats")
+    rotation_allowed: bool = parameter(False, "allow vehicles to rotate on edges from other formats")
     layout_version: str = parameter("1", "version of layouts without one")
 
 

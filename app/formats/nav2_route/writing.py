@@ -46,8 +46,8 @@ from app.syntax.decimals import METRES
 class WriteOptions:
     """Values to write if no source has them."""
 
-    graph_name: str | None = parameter(None, "name of a graph without name in its source; default: the map's")
-    frame_id: str = parameter(FRAME, "frame of nodes without frame in their source")
+    graph_name: str | None = parameter(None, "name of a graph whose source has none; default: the map's")
+    frame_id: str = parameter(FRAME, "frame of nodes whose source has none")
 
 
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}

@@ -62,7 +62,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 class WriteOptions:
     """Values to write if no source has them."""
 
-    graph_name: str | None = parameter(None, "name of a graph without name in its source; default: the map's")
+    graph_name: str | None = parameter(None, "name of a graph whose source has none; default: the map's")
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ class WriteOptions:
     grid: str | None = parameter(
         None, "name of the grid; *: all, including masks drawn from zones; default: map, else the only one"
     )
-    level: str | None = parameter(None, "level of the grid; *: all; default: the one it is on")
+    level: str | None = parameter(None, "level of the grid; *: all; default: ground, or the only one that has it")
     file_type: Literal["pgm", "png"] | None = parameter(
         None, "image format; default: pgm, or png if unknown can only be transparent"
     )

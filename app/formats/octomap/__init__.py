@@ -62,13 +62,13 @@ class WriteOptions:
     """Selection of the voxels, and their encoding."""
 
     name: str | None = parameter(None, "name of the voxel map; *: all; default: map, else the only one")
-    level: str | None = parameter(None, "level of the voxel map; *: all; default: the one it is on")
+    level: str | None = parameter(None, "level of the voxel map; *: all; default: ground, or the only one that has it")
     kind: Literal["bt", "ot"] | None = parameter(
         None, "bt: free and occupied only; ot: log-odds and colours; default: as uploaded"
     )
     depth: int | None = parameter(
         None,
-        f"level of detail: merge voxels below this depth ({DEPTH}: smallest voxels, each level above doubles their "
+        f"level of detail: merge voxels below this depth ({DEPTH}: smallest voxels; each step down doubles their "
         "edge) into the most occupied of them",
         minimum=1,
         maximum=DEPTH,

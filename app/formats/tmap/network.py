@@ -146,7 +146,7 @@ class WriteOptions:
         None, "name of the network and its pointset; default: that of the source, else of the map"
     )
     fail_policy: str = parameter("fail", "fail_policy of edges without one")
-    fluid_navigation: bool = parameter(True, "drive edges of other formats without stopping at their end")
+    fluid_navigation: bool = parameter(True, "drive edges from other formats without stopping at their end")
     recovery: str = parameter("", "recovery_behaviours_config of edges without one")
     restrictions: str = parameter(ANYWHERE, "planning and runtime restrictions of nodes and edges without any")
     parent_frame: str = parameter(FRAME, "parent_frame of nodes without one")
