@@ -46,7 +46,7 @@ def parse(cls: type[T], values: Mapping[str, Any], label: str = "parameter") -> 
         if name not in fields_by_name:
             accepted = ", ".join(fields_by_name) or "none"
             problems.append(
-                Problem(f"no such {label}{did_you_mean(name, fields_by_name)}; accepted: {accepted}", where=name)
+                Problem(f"unknown {label}{did_you_mean(name, fields_by_name)}; accepted: {accepted}", where=name)
             )
             continue
         try:
@@ -131,7 +131,7 @@ def _convert(hint: Any, value: Any) -> Any:
         return number
     if hint is str:
         if not isinstance(value, (str, int, float)):
-            raise ValueError(f"must be a text, got {value!r}")
+            raise ValueError(f"must be a string, got {value!r}")
         return str(value)
     raise TypeError(f"parameters of type {hint} are not supported")
 

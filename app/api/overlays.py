@@ -270,7 +270,7 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
         problem = f"must be a valid GeoJSON Polygon or MultiPolygon, got {shape.geom_type}: {reason}"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     if (count := int(shapely.get_num_coordinates(shape))) > MAX_POINTS:
-        problem = f"has {count} points, and the maximum is {MAX_POINTS}: simplify it"
+        problem = f"has {count} points; the limit is {MAX_POINTS}: simplify it"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     clean: dict[str, Any] = json.loads(shapely.to_geojson(shape))
     return clean

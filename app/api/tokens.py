@@ -140,7 +140,7 @@ def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Respon
     """
     tokens = {token.id: token for token in services.store.tokens.all()}
     if id not in tokens:
-        raise NotFound("no token has this id")
+        raise NotFound(f"unknown token {id[:80]!r}")
     if _is_full_admin(tokens[id]) and not any(_is_full_admin(t) for t in tokens.values() if t.id != id):
         raise Conflict("this is the last administrator's token: create another one first")
     services.store.tokens.delete(id)

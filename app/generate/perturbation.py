@@ -135,7 +135,7 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
     objects = sum(len(p) for p in given.vector("objects").values())
     if cells > MAX_CELLS or objects > MAX_OBJECTS:
         raise CannotGenerate(
-            f"there are {cells} cells and {objects} objects, the maximum is {MAX_CELLS} and {MAX_OBJECTS}: split the "
+            f"there are {cells} cells and {objects} objects; the limits are {MAX_CELLS} and {MAX_OBJECTS}: split the "
             "environment, or make its grid coarser"
         )
     levels = sorted({k.level for k in given.parts if k.layer in ("objects", "occupancy", "topology")})

@@ -44,7 +44,7 @@ def check(request: DerivationRequest) -> None:
         if name not in everything:
             accepted = ", ".join(sorted(derive.parameter_names(request.method))) or "none"
             near = did_you_mean(name, derive.parameter_names(request.method))
-            problem = f"no such parameter of {request.method}{near}; accepted: {accepted}"
+            problem = f"unknown parameter of {request.method}{near}; accepted: {accepted}"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 

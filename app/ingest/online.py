@@ -151,7 +151,7 @@ def check_free(base: Version, chosen: Parameters, *, replace: bool) -> None:
     old = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
     if old is not None and not replace and (old.provenance.information != "derived" or old.provenance.is_edited):
         raise Conflict(
-            f"the picture {chosen.level}/{chosen.picture} is {old.provenance.information}: set replace=true to replace "
+            f"the image {chosen.level}/{chosen.picture} is {old.provenance.information}: set replace=true to replace "
             "it, or choose another name with picture"
         )
 
@@ -199,7 +199,7 @@ def plan_mosaic(provider: Provider, box: tuple[float, float, float, float], reso
     if count > MAX_REQUESTS or width * height > MAX_PIXELS:
         cost = f"{width} × {height} pixels and about {count} requests"
         raise Invalid(
-            f"the picture would take {cost}, the maximum is {MAX_PIXELS} pixels and {MAX_REQUESTS} requests: set a "
+            f"the image would take {cost}; the limit is {MAX_PIXELS} pixels and {MAX_REQUESTS} requests: set a "
             "coarser resolution",
             [Problem("too fine for a site of this size", where="resolution")],
         )
@@ -376,7 +376,7 @@ class Fetcher:
             raise self._provider_error(f"returns {status}")
         kind = answer.headers.get("content-type", "").partition(";")[0].strip().lower()[:80]
         if kind and not kind.startswith("image/") and kind != "application/octet-stream":
-            raise self._provider_error(f"sends {kind!r} instead of a picture: check FLEETMAP_IMAGERY_URL")
+            raise self._provider_error(f"sends {kind!r} instead of an image: check FLEETMAP_IMAGERY_URL")
         if answer.headers.get("content-encoding", "identity").lower() != "identity":
             raise self._provider_error("sends a compressed response although none was requested")
         length = answer.headers.get("content-length", "")
@@ -489,7 +489,7 @@ def prepare_picture(
     picture, missing = assemble_image(fetched.sheet, fetched.answers, fetched.attribution, limits)
     warnings = []
     if missing:
-        why = f"the provider has no picture for {missing} of {len(fetched.answers)} tiles; they are transparent"
+        why = f"the provider has no image for {missing} of {len(fetched.answers)} tiles; they are transparent"
         warnings.append(Problem(why))
     inputs = (*fetched.site, {"datum": base.datum.as_dict() if base.datum else None})
     provenance = Provenance("derived", None, (), None, (dict(fetched.provenance_step),), fetched.attribution, inputs)
@@ -515,7 +515,7 @@ def assemble_image(
         inner = shown[row - block.row : end - block.row, column - block.column : right - block.column]
         pixels[row:end, column:right] = inner
     if missing == len(mosaic.blocks):
-        raise CannotDerive("the imagery provider has no picture of this place at this resolution", step=METHOD)
+        raise CannotDerive("the imagery provider has no image of this place at this resolution", step=METHOD)
     properties = {"attribution": list(attribution)} if attribution else {}
     image = pixels if (pixels[..., 3] < 255).any() else np.ascontiguousarray(pixels[..., :3])
     return GeoImage(image, mosaic.transform, MERCATOR, properties), missing
@@ -529,12 +529,12 @@ def _decode_tile(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.
     try:
         (part,) = upload_reader.read({name: data}, hints, EnvironmentContext(), limits).layers(None).parts.values()
     except (BadUpload, ValueError) as error:
-        raise CannotDerive(f"the imagery provider sends a picture that cannot be read: {error}", step=METHOD) from error
+        raise CannotDerive(f"the imagery provider sends an image that cannot be read: {error}", step=METHOD) from error
     assert isinstance(part, GeoImage)
     height, width, bands = part.pixels.shape
     if (height, width) != (block.height, block.width) or part.pixels.dtype != np.uint8:
         raise CannotDerive(
-            f"the imagery provider sends pictures of {width} × {height} pixels instead of {block.width} × "
+            f"the imagery provider sends images of {width} × {height} pixels instead of {block.width} × "
             f"{block.height}: check FLEETMAP_IMAGERY_TILE_SIZE",
             step=METHOD,
         )

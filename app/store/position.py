@@ -204,5 +204,5 @@ def _rank(cursor: str) -> Rank:
         guessed, size, away, name = cursor.split(" ")
         return int(guessed), float(size), float(away), name
     except ValueError:
-        problems = [Problem("from the last page's Link header", where="cursor")]
-        raise Invalid("invalid cursor: use the one in the Link header of the last page", problems) from None
+        problems = [Problem("invalid cursor", where="cursor")]
+        raise Invalid("invalid cursor: take it from the Link header of the previous page", problems) from None

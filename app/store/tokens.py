@@ -98,7 +98,7 @@ class Tokens:
         """Revoke a token. Raises NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.token).where(tables.token.c.id == id)).rowcount:
-                raise NotFound(f"there is no token {id[:80]!r}")
+                raise NotFound(f"unknown token {id[:80]!r}")
 
     def find(self, text: str) -> Token | None:
         """Find the token with this secret; None if it is unknown or expired."""

@@ -360,7 +360,7 @@ def _previous_version(connection: Connection, row: Row[Any], idempotency: Idempo
     if record is None:
         return None
     if record.fingerprint != idempotency.fingerprint:
-        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was used for another request: use a new key")
+        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was already used for another request: use a new one")
     return int(record.version)
 
 

@@ -287,7 +287,7 @@ def _complete_group(
             raise Invalid(f"the upload has no file {main_name!r}", [Problem("no such file", where="file")])
     if len(names) > 1:
         reason = (
-            f"the options describe one picture, but the upload has several: select one with file=…: {', '.join(names)}"
+            f"the options describe one image, but the upload has several: select one with file=…: {', '.join(names)}"
         )
         raise Invalid(reason, [Problem(reason, where="file")])
     if not names:

@@ -276,7 +276,7 @@ def test_url_templates_support_tms_rows_and_wmts_names() -> None:
         ("silent", Unavailable, "in time"),
         ("elsewhere", CannotDerive, "another host"),
         ("circle", CannotDerive, "redirects more than"),
-        ("missing", CannotDerive, "no picture of this place"),
+        ("missing", CannotDerive, "no image of this place"),
         ("small", CannotDerive, "64 × 64 pixels instead of 256 × 256"),
         ("torn", CannotDerive, "cannot be read"),
         ("bomb", CannotDerive, "cannot be read"),

@@ -344,7 +344,7 @@ def test_unreadable_drawings_are_warned_of() -> None:
         ({}, "was not uploaded"),
         ({"plan.png": b"GIF89a"}, "cannot be read"),
         ({"plan.png": png(plan())[:200]}, "cannot be read"),
-        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "the maximum is"),
+        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "the limit is"),
     ):
         notes = DerivationNotes()
         with pytest.raises(MissingLayer, match="floor plan"):

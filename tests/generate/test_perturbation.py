@@ -300,7 +300,7 @@ def test_invalid_perturbations_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(full, **{**ALONE, "obstacles": 3})
     monkeypatch.setattr("app.generate.perturbation.MAX_CELLS", 1000)
-    with pytest.raises(CannotGenerate, match="the maximum is 1000"):
+    with pytest.raises(CannotGenerate, match="the limits are 1000"):
         disturbed(before)
 
 

@@ -141,7 +141,7 @@ class _Reader:
         if level is None or level == "":
             level = self.context.level
         elif not isinstance(level, str):
-            raise_unreadable("must be a text", f"{location}.layoutLevelId")
+            raise_unreadable("must be a string", f"{location}.layoutLevelId")
         level = check_name(level, f"{location}.layoutLevelId")
         for kind, items in self.items.items():
             for at, item in enumerate(self._list(row, f"{kind}s", location)):
