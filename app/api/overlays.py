@@ -249,7 +249,7 @@ def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
         return
     problems = [place_problem(overlay.closure, version) for version in versions]
     if None not in problems:
-        problem = f"the polygon cannot be closed: {problems[0]}"
+        problem = f"the polygon cannot become a closure: {problems[0]}"
         raise Invalid(problem, [Problem(str(problems[0]), where="polygon")])
 
 

@@ -141,14 +141,14 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
     levels = sorted({k.level for k in given.parts if k.layer in ("objects", "occupancy", "topology")})
     if options.level is not None:
         if options.level not in levels:
-            reason = f"unknown level {options.level!r}; available: {', '.join(levels)}"
+            reason = f"unknown level {options.level!r:.80}; available: {', '.join(levels)}"
             raise CannotGenerate(f"level: {reason}", [Problem(reason, where="level")])
         levels = [options.level]
     if options.severity == 0.0:
         raise CannotGenerate("severity: must be above 0", [Problem("must be above 0", where="severity")])
     if options.grid is not None and options.grid not in {k.name for k in given.grids()}:
         grid_names = ", ".join(sorted({k.name for k in given.grids()})) or "none"
-        reason = f"unknown grid {options.grid!r}; available: {grid_names}"
+        reason = f"unknown grid {options.grid!r:.80}; available: {grid_names}"
         raise CannotGenerate(f"grid: {reason}", [Problem(reason, where="grid")])
     parts: dict[PartKey, Part] = {}
     for level in levels:

@@ -158,7 +158,7 @@ class Areas:
                 computed[environment_id] = head.number, compute_area(self._chunks.stage(), head.parts, head.datum)
             except Damaged as error:
                 log.critical(
-                    "area: not computed, the last one stays (environment=%s, reason=%s)",
+                    "area: not computed, the previous one is kept (environment=%s, reason=%s)",
                     head.environment,
                     error.detail,
                 )

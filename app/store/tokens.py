@@ -45,7 +45,7 @@ class Tokens:
         the role robot. token: a secret chosen by the operator. Raises Conflict if it exists already.
         """
         if role not in get_args(Role):
-            raise Invalid(f"role must be one of {', '.join(get_args(Role))}, got {role!r}")
+            raise Invalid(f"role must be one of {', '.join(get_args(Role))}, got {role!r:.80}")
         if role == "robot" and robot is None:
             raise Invalid("a token with the role robot must name its robot")
         if expires is not None and expires.tzinfo is None:

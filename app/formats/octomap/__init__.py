@@ -274,7 +274,7 @@ def _read_full(
     if body_size % record.itemsize:
         size = record.itemsize
         raise _unreadable_error(
-            f"the tree has {body_size} bytes: must be a multiple of {size}, the bytes of a node of {header.id}",
+            f"the tree has {body_size} bytes: must be a multiple of {size}, the size of a node of {header.id}",
             location="data",
         )
     nodes = np.frombuffer(data, record, body_size // record.itemsize, header.body)
