@@ -401,10 +401,10 @@ class _Writer:
         fill, filled, options = self.context.fill, self.filled, self.options
         if filled["edges"]:
             why = f"{filled['edges']} edges come from a format without it"
-            reason = f"{why}, if they have none"
+            reason = f"{why}; used for those without one"
             fill("edges: action", options.action, reason, "action")
             if isinstance(options, ListOptions):
-                fill("edges: top_vel", options.top_vel, f"{why}, if they have no speed limit", "top_vel")
+                fill("edges: top_vel", options.top_vel, f"{why}; used for those without a speed limit", "top_vel")
                 fill("edges: inflation_radius", options.inflation_radius, why, "inflation_radius")
                 fill("edges: map_2d", self.document["metric_map"], why)
             else:
@@ -416,7 +416,7 @@ class _Writer:
             fill("edges: recovery_behaviours_config", options.recovery, why, "recovery")
         if filled["nodes"]:
             why = f"{filled['nodes']} nodes come from a format without it"
-            reason = f"{why}, if they have none"
+            reason = f"{why}; used for those without one"
             fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", reason, "verts_radius")
             fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, reason, "xy_goal_tolerance")
             fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")
