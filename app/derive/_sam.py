@@ -179,7 +179,7 @@ def segments(
     if not best_masks:
         raise CannotConvert(
             f"{name}: the model {model.name} finds nothing with a confidence of at least {sure:g} and a stability of "
-            f"at least {stable:g}"
+            f"at least {stable:g}: lower one of them"
         )
     return _masks_to_segments(ground, best_masks, model, min_area, notes, name)
 

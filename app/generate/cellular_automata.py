@@ -184,9 +184,9 @@ def _grow_site(
     )
     if joined.all():
         raise CannotGenerate("no free space is left: use a lower density, another rule, or a smaller robot_radius")
-    notes.drop("free cells", closed, "in isolated places, which are filled")
+    notes.drop("free cells", closed, "in isolated areas, which are filled")
     if passages:
-        notes.fill("passages", passages, "joined isolated places of free space")
+        notes.fill("passages", passages, "joined isolated areas of free space")
     if border is look:
         _cells.add_objects(site, coarse, joined, look)
     else:

@@ -254,7 +254,7 @@ class _Level:
         self._shaken(loose)
         back = separate(things)
         if back:
-            self.notes.drop("shifts", back, "their new place is occupied")
+            self.notes.drop("moves of objects", back, "their new place is occupied")
         fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
         phrases = self._summary(things)
         out: dict[PartKey, Part] = {}
@@ -436,7 +436,7 @@ class _Level:
             if not t.gone and into is not None:
                 cells[into][inside] = OCCUPIED
         if blocked_count:
-            self.notes.drop("shifts", blocked_count, "their new place is occupied or unknown")
+            self.notes.drop("moves of pieces of the grid", blocked_count, "their new place is occupied or unknown")
         added = self._paint_obstacles(key, grid, cells)
         phrases = self._summary(loose) + ([f"{added} new obstacles"] if added else [])
         if phrases:

@@ -158,7 +158,7 @@ def test_small_regions_are_dropped() -> None:
     part = objects(layers(local(farm())), notes, minimum_area=15.0)
     assert not of(part, "tree")
     assert len(of(part, "building")) == 1
-    assert any(d.subject == "spots" and d.count >= len(TREES) for d in notes.dropped)
+    assert any(d.subject == "small regions" and d.count >= len(TREES) for d in notes.dropped)
 
 
 def on_earth() -> GeoImage:

@@ -155,7 +155,7 @@ def test_turned_objects_keep_shape_and_do_not_collide() -> None:
         assert shapely.hausdorff_distance(seen, g) < 0.01, "pose and outline agree"
     for k, a in enumerate(part.geometry):
         assert not any(a.intersects(b) for b in part.geometry[k + 1 :])
-    assert any(d.subject == "shifts" for d in notes.dropped)
+    assert any(d.subject == "moves of objects" for d in notes.dropped)
 
 
 def room(cells: Any = None, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyGrid:

@@ -99,7 +99,7 @@ class _Writer:
         updated = meta.get("last_updated")
         if not (isinstance(updated, str) and LAST_UPDATED.match(updated)):
             meta["last_updated"] = EPOCH
-            self.context.fill("meta.last_updated", EPOCH, "no source has it in the form that the schema requires")
+            self.context.fill("meta.last_updated", EPOCH, "no source specifies it in the form that the schema requires")
             if updated is not None:
                 self.context.warn(
                     f"last_updated {updated!r} is not a time; {EPOCH} is written", where="meta.last_updated"
@@ -412,7 +412,7 @@ class _Writer:
                 fill("edges: fail_policy", options.fail_policy, why, "fail_policy")
                 fill("edges: fluid_navigation", options.fluid_navigation, why, "fluid_navigation")
                 fill("edges: restrictions", options.restrictions, why, "restrictions")
-                fill("edges: config, goal", "the default ones", why)
+                fill("edges: config, goal", "the defaults", why)
             fill("edges: recovery_behaviours_config", options.recovery, why, "recovery")
         if filled["nodes"]:
             why = f"{filled['nodes']} nodes come from a format without it"
