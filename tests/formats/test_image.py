@@ -224,7 +224,7 @@ def test_jpeg_with_many_scans_is_refused() -> None:
 def test_unknown_critical_chunk_and_late_header_are_refused() -> None:
     with pytest.raises(UnreadableFile, match="unknown chunk"):
         grey(png(1, 1, zlib.compress(b"\0\7"), extra=chunk(b"ABCD", b"")))
-    with pytest.raises(UnreadableFile, match="begin with its header"):
+    with pytest.raises(UnreadableFile, match="start with its header"):
         grey(images.PNG_MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
 
 

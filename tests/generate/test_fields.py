@@ -219,7 +219,7 @@ def test_one_way_aisles_alternate_directions() -> None:
         ("vineyard", {"canopy_base": 2, "canopy_top": 1}, "must be above canopy_base"),
         ("vineyard", {"rows": 100, "row_length": 700}, "node_spacing: there would be"),
         ("warehouse", {"docks": 30}, "docks: 34 docks, chargers and parking places need 105 m"),
-        ("warehouse", {"robot_radius": 1.5}, "aisle: 4.80 m from row to row"),
+        ("warehouse", {"robot_radius": 1.5}, "aisle: rows 4.80 m apart"),
     ],
 )
 def test_invalid_field_parameters_raise_before_work(name: str, values: dict[str, Any], why: str) -> None:
