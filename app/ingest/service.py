@@ -423,8 +423,8 @@ def check_if_match(header: str | None, head: Version) -> None:
     tags = [t.strip().removeprefix("W/").strip('"') for t in header.split(",")]
     if "*" not in tags and str(head.number) not in tags and head.root not in tags:
         raise StaleParent(
-            f"the head of {head.environment} is version {head.number} (root {head.root}), not {header}: "
-            "fetch it, check what changed, and repeat the change on top of it"
+            f"the head of {head.environment} is version {head.number} (root {head.root}), which If-Match "
+            f"{header[:80]} does not include: review the changes in between and send it again"
         )
 
 

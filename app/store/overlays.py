@@ -135,7 +135,7 @@ class Overlays:
             row = environment_row(connection, environment, lock=True)
             stored = _read(connection, row, id)
             if stored.state != before:
-                raise Conflict(f"overlay {id} is {stored.state}, not {before}")
+                raise Conflict(f"overlay {id} is {stored.state}: only {before} overlays can be {state}")
             if state == "accepted":
                 _require_room(connection, row, stored)
             values: dict[str, Any] = {"state": state, "decided_by": checked_text(author, "an author"), "decided": now}

@@ -304,7 +304,10 @@ class Versions:
             if expected is not None and head.number != expected:
                 record = self.idempotent(environment, idempotency.key) if idempotency else None
                 if record is None:
-                    raise StaleParent(f"the head of {environment} is version {head.number}, not {expected}")
+                    raise StaleParent(
+                        f"the head of {environment} is version {head.number}, the change was made for version "
+                        f"{expected}: review the changes in between and send it again"
+                    )
             try:
                 return self.commit(
                     environment,

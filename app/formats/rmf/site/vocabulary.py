@@ -152,7 +152,7 @@ def variant(value: Any, location: str) -> tuple[str, Any]:
     if isinstance(value, str):
         return value, None
     if not isinstance(value, dict) or len(value) != 1:
-        raise_unreadable('must be a variant: a text or {"Variant": content}', location)
+        raise_unreadable('must be a variant: a string or {"Variant": content}', location)
     return next(iter(value.items()))
 
 
