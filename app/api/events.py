@@ -334,7 +334,7 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
 
 def _reply_from(file: CachedFile, max_bytes: int) -> Reply:
     if file.size > max_bytes:
-        raise TooLarge(f"the map has {file.size} bytes, and the limit over Zenoh is {max_bytes}: fetch it over HTTP")
+        raise TooLarge(f"the map has {file.size} bytes; the limit over Zenoh is {max_bytes}: fetch it over HTTP")
     return Reply(file.read(), file.media_type)
 
 

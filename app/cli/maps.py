@@ -404,7 +404,8 @@ def show_report(report: Mapping[str, Any]) -> None:
         output.print_status(f"{name}: {line['information']}{f' ({steps})' if steps else ''}")
     for line in report.get("template") or ():
         source = f" ({line['from']})" if line.get("from", "default") != "default" else ""
-        output.print_status(f"filled in: {line['what']} = {line['value']}{source}: {line['why']}")
+        value = "(empty)" if line["value"] == "" else line["value"]
+        output.print_status(f"filled in: {line['what']} = {value}{source}: {line['why']}")
     for line in report.get("dropped") or ():
         output.print_status(f"dropped: {line['count']} × {line['what']}: {line['why']}", style="yellow")
     output.show_warnings(report.get("warnings") or ())
