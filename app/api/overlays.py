@@ -189,7 +189,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
     """
     if (body.polygon is None) == (body.edge is None):
         raise Invalid(
-            "invalid obstruction: give either polygon or edge", [Problem("one of polygon and edge", where="body")]
+            "invalid obstruction: give either polygon or edge", [Problem("give either polygon or edge", where="body")]
         )
     if body.state == "accepted" and principal.role not in ("editor", "admin"):
         raise Denied("only editors can accept an overlay: report it without state, and an editor decides")

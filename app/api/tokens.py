@@ -106,11 +106,13 @@ def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Resp
                 [Problem("missing time zone", where="expires")],
             )
         if body.expires <= datetime.now(UTC):
-            raise Invalid("expires is in the past: give a later time", [Problem("past", where="expires")])
+            raise Invalid(
+                "expires is in the past: give a later time", [Problem("must be in the future", where="expires")]
+            )
     if body.robot is not None and body.role != "robot":
         raise Invalid(
             "robot requires the role robot: omit it, or set role to robot",
-            [Problem("role is not robot", where="robot")],
+            [Problem("requires the role robot", where="robot")],
         )
     robot = _robot_name(body)
     token, secret = services.store.tokens.create(body.name, body.role, body.environments, robot, body.expires)

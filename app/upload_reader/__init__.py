@@ -284,7 +284,7 @@ def _complete_group(
     if main_name is not None:
         names = [n for n in names if n == main_name or n.rpartition("/")[2] == main_name]
         if not names:
-            raise Invalid(f"the upload has no file {main_name[:200]!r}", [Problem("no such file", where="file")])
+            raise Invalid(f"the upload has no file {main_name[:200]!r}", [Problem("unknown file", where="file")])
     if len(names) > 1:
         reason = (
             f"the options describe one image, but the upload has several: select one with file=…: {', '.join(names)}"

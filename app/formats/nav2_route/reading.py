@@ -37,7 +37,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     rows = top.get("features") if isinstance(top, dict) else None
     if not isinstance(top, dict) or not isinstance(rows, list):
         raise UnreadableFile(
-            "a route graph must be an object with an array of features", [Problem("no array", where="features")]
+            "a route graph must be an object with an array of features", [Problem("missing array", where="features")]
         )
     if len(rows) > context.limits.features:
         raise TooLarge(f"the file has {len(rows)} features; the limit is {context.limits.features}")
