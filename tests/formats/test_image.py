@@ -142,8 +142,8 @@ def test_pgm_reader_ignores_data_after_pixels() -> None:
     ("data", "reason"),
     [
         (b"", "unknown type"),
-        (b"GIF89a", "unknown type"),
-        (b"P9 1 1 255\n", "unknown type"),
+        (b"GIF89a", "unsupported image type"),
+        (b"P9 1 1 255\n", "unsupported image type"),
         (b"P1 1 1\n0", "PBM and PPM"),
         (b"P5 ", "width"),
         (b"P5 2", "height"),
