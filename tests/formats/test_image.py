@@ -141,7 +141,7 @@ def test_pgm_reader_ignores_data_after_pixels() -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "unknown type"),
+        (b"", "unsupported image type"),
         (b"GIF89a", "unsupported image type"),
         (b"P9 1 1 255\n", "unsupported image type"),
         (b"P1 1 1\n0", "PBM and PPM"),
