@@ -438,7 +438,7 @@ def _ensure_first_token(store: Store, settings: Settings) -> None:
     if settings.admin_token is not None:
         text = settings.admin_token.get_secret_value()
         if len(text) < 22:
-            log.warning("FLEETMAP_ADMIN_TOKEN is short and can be guessed: use 32 random characters")
+            log.warning("tokens: FLEETMAP_ADMIN_TOKEN is short and can be guessed; use 32 random characters")
         if store.tokens.find(text) is None:
             with contextlib.suppress(Conflict):  # another server has created it at the same time
                 store.tokens.create("administrator", "admin", token=text)

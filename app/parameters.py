@@ -46,7 +46,7 @@ def parse(cls: type[T], values: Mapping[str, Any], label: str = "parameter") -> 
         if name not in fields_by_name:
             accepted = ", ".join(fields_by_name) or "none"
             problems.append(
-                Problem(f"no such {label}{did_you_mean(name, fields_by_name)}; accepted: {accepted}", where=name)
+                Problem(f"unknown {label}{did_you_mean(name, fields_by_name)}; accepted: {accepted}", where=name)
             )
             continue
         try:
@@ -91,16 +91,16 @@ def _convert(hint: Any, value: Any) -> Any:
         return _convert(next(a for a in args if a is not type(None)), value)
     if origin is Literal:
         if value not in args:
-            raise ValueError(f"must be one of {', '.join(map(str, args))}, got {value!r}")
+            raise ValueError(f"must be one of {', '.join(map(str, args))}, got {value!r:.80}")
         return value
     if origin is tuple:
         if not isinstance(value, (str, list, tuple)):
-            raise ValueError(f"must be comma-separated values, got {value!r}")
+            raise ValueError(f"must be comma-separated values, got {value!r:.80}")
         parts = value.split(",") if isinstance(value, str) else list(value)
         if len(args) == 2 and args[1] is Ellipsis:
             return tuple(_convert(args[0], p) for p in parts)
         if len(parts) != len(args):
-            raise ValueError(f"must be {len(args)} comma-separated values, got {value!r}")
+            raise ValueError(f"must be {len(args)} comma-separated values, got {value!r:.80}")
         return tuple(_convert(a, p) for a, p in zip(args, parts, strict=True))
     if hint is bool:
         if isinstance(value, bool):
@@ -110,14 +110,14 @@ def _convert(hint: Any, value: Any) -> Any:
             return True
         if text in ("0", "false", "no", "off"):
             return False
-        raise ValueError(f"must be true or false, got {value!r}")
+        raise ValueError(f"must be true or false, got {value!r:.80}")
     if hint is int:
         if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
-            raise ValueError(f"must be a whole number, got {value!r}")
+            raise ValueError(f"must be a whole number, got {value!r:.80}")
         try:
             integer = int(_digits(value))
         except (TypeError, ValueError):
-            raise ValueError(f"must be a whole number, got {value!r}") from None
+            raise ValueError(f"must be a whole number, got {value!r:.80}") from None
         if not -(2**63) <= integer < 2**63:
             raise ValueError("must be a whole number of at most 64 bits")
         return integer
@@ -125,13 +125,13 @@ def _convert(hint: Any, value: Any) -> Any:
         try:
             number = float(_digits(value))
         except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"must be a number, got {value!r}") from None
+            raise ValueError(f"must be a number, got {value!r:.80}") from None
         if isinstance(value, bool) or not math.isfinite(number):
-            raise ValueError(f"must be a finite number, got {value!r}")
+            raise ValueError(f"must be a finite number, got {value!r:.80}")
         return number
     if hint is str:
         if not isinstance(value, (str, int, float)):
-            raise ValueError(f"must be a text, got {value!r}")
+            raise ValueError(f"must be a string, got {value!r:.80}")
         return str(value)
     raise TypeError(f"parameters of type {hint} are not supported")
 

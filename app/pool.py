@@ -248,7 +248,7 @@ def _call_worker(
     except (EOFError, OSError) as error:
         worker.process.join(1.0)
         code = worker.process.exitcode
-        raise WorkerDied(f"the worker process died (exit code {code}): the input is damaged or too large") from error
+        raise WorkerDied(f"a worker process died (exit code {code}): the input may be damaged or too large") from error
     return ok, value
 
 

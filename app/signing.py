@@ -116,7 +116,7 @@ class Keys:
         data = (self._folder / f"{keys[0].id}.pem").read_bytes()
         private = serialization.load_pem_private_key(data, None)
         if not isinstance(private, Ed25519PrivateKey):
-            raise TypeError(f"{self._folder}/{keys[0].id}.pem is no Ed25519 key")
+            raise TypeError(f"{self._folder}/{keys[0].id}.pem is not an Ed25519 key")
         return keys, private
 
     def _create(self, keys: list[PublicKey], old: Ed25519PrivateKey | None) -> PublicKey:

@@ -101,7 +101,7 @@ def check_set(name: str, location: str = "set") -> str:
     """Check the name of a template set. Raises Invalid with the valid names."""
     if name not in SETS:
         near = did_you_mean(name, SETS)
-        reason = f"unknown template set {name[:80]!r}{near}; known sets: {', '.join(SETS)}"
+        reason = f"unknown template set {name[:80]!r}{near}; available: {', '.join(SETS)}"
         raise Invalid(reason, [Problem(reason, where=location)])
     return name
 

@@ -110,7 +110,7 @@ def test_error_lists_every_problem_with_accepted_values() -> None:
     assert [p.where for p in error.value.problems] == ["resolution", "height", "count"]
     assert "accepted: resolution, count" in error.value.problems[1].problem
     assert "at most 10" in error.value.problems[2].problem
-    with pytest.raises(Invalid, match="no such option; accepted: none"):
+    with pytest.raises(Invalid, match="unknown option; accepted: none"):
         parameters.parse(type("None_", (), {"__dataclass_fields__": {}}), {"a": "1"}, "option")
 
 

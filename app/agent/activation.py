@@ -199,7 +199,8 @@ class Activation:
                 raise AgentStopped
             if ended.status == DELAY_STATUS:
                 detail = (
-                    f"version {manifest.version} is ready since {since}: --before-switch {command} delays the switch"
+                    f"version {manifest.version} has been ready since {since}; "
+                    f"--before-switch {command} delays the switch"
                 )
                 return Outcome("waiting", detail, manifest)
             reason = f"version {manifest.version} is refused: --before-switch {command} {ended.text}"

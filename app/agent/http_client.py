@@ -249,7 +249,7 @@ class ServerClient:
                 return
             part.unlink(missing_ok=True)
             if overlays is not None and self._overlays not in (None, overlays):
-                raise ClosuresChanged(f"{file.path} has other closures than its manifest")
+                raise ClosuresChanged(f"closures in {file.path} have changed since its manifest was signed")
             if fresh and complete:
                 break
             old = None  # an unusable delta or partial file: once more from the start

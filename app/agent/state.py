@@ -74,7 +74,7 @@ def load(path: Path, environment: str) -> AgentState:
     try:
         body = json.loads(path.read_bytes())
         if body["form"] not in (1, STATE_FORMAT):
-            raise ValueError(f"unknown form {body['form']!r:.80}, this agent reads 1 and {STATE_FORMAT}")
+            raise ValueError(f"unsupported format {body['form']!r:.80}; this agent reads 1 and {STATE_FORMAT}")
         state = AgentState(
             environment=str(body["environment"]),
             key=base64.b64decode(body["key"]) if body.get("key") else None,

@@ -150,7 +150,7 @@ def _datum(text: str) -> Datum | None:
         except (orjson.JSONDecodeError, ValidationError):
             raise Invalid(
                 'datum must be LAT,LON or {"latitude": …, "longitude": …, "altitude"?, "heading"?} in degrees',
-                [Problem("not a datum", where="datum")],
+                [Problem("invalid datum", where="datum")],
             ) from None
     latitude, longitude = numbers(text, "datum", "LAT,LON")
     return Datum(latitude, longitude)

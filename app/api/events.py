@@ -159,7 +159,8 @@ async def stream_events(
         text = last_event_id.strip()
         if not (text.isascii() and text.isdigit() and len(text) <= 18):
             raise Invalid(
-                "invalid Last-Event-ID: it must be the number in an event's id", [Problem("not a number", where="id")]
+                "invalid Last-Event-ID: it must be the number in an event's id",
+                [Problem("must be a number", where="id")],
             )
         start = int(text)
     start = await run_in_threadpool(
@@ -305,7 +306,7 @@ def answer_zenoh_query(
     values = dict(parameters)
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
-        raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
+        raise Invalid("derive must be true or false", [Problem("must be true or false", where="derive")])
     mode = closure_mode(values.pop("closures", None))
     version, _ = services.store.channels.target(environment, parse_version_ref(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
@@ -326,7 +327,7 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
         raise Invalid(
             "invalid position: give lat and lon in degrees, and no other parameter, as in "
             "server/where?lat=53.2687;lon=-0.5244",
-            [Problem("lat and lon", where="parameters")],
+            [Problem("give lat and lon", where="parameters")],
         )
     hits, _ = services.store.areas.locate(*parse_position(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
     return Reply(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
@@ -334,7 +335,7 @@ def _locate(services: Services, parameters: Mapping[str, str]) -> Reply:
 
 def _reply_from(file: CachedFile, max_bytes: int) -> Reply:
     if file.size > max_bytes:
-        raise TooLarge(f"the map has {file.size} bytes, and the limit over Zenoh is {max_bytes}: fetch it over HTTP")
+        raise TooLarge(f"the map has {file.size} bytes; the limit over Zenoh is {max_bytes}: fetch it over HTTP")
     return Reply(file.read(), file.media_type)
 
 

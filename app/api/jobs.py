@@ -41,7 +41,7 @@ def _require_job_owner(services: ServicesDep, principal: Principal, id: str) -> 
     """Return a job that the caller may see. Raises NotFound for any other job, as if it did not exist."""
     job = services.store.jobs.get(id)
     if job.owner != principal.id and not (principal.has_role("admin") and principal.environments is None):
-        raise NotFound(f"there is no job {id[:80]!r}")
+        raise NotFound(f"unknown job {id[:80]!r}")
     return job
 
 

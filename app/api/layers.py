@@ -427,7 +427,10 @@ def _box(text: str | None, crs: Anchor) -> Box | None:
         return parse_box(text)
     x0, y0, x1, y1 = numbers(text, "bbox", "X0,Y0,X1,Y1")
     if not (x0 <= x1 and y0 <= y1 and max(map(abs, (x0, y0, x1, y1))) <= MAX_METRES):
-        raise Invalid("bbox must be X0,Y0,X1,Y1 in metres, with X0 ≤ X1 and Y0 ≤ Y1", [Problem("range", where="bbox")])
+        raise Invalid(
+            "bbox must be X0,Y0,X1,Y1 in metres, with X0 ≤ X1 and Y0 ≤ Y1",
+            [Problem("must be X0,Y0,X1,Y1", where="bbox")],
+        )
     return x0, y0, x1, y1
 
 

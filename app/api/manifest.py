@@ -378,7 +378,8 @@ def _entries(required: str, optional: str) -> list[_Entry]:
     entries = [_entry(text, "formats", required=True) for text in required.split(",") if text.strip()]
     if not entries:
         raise Invalid(
-            f"no format given: list 1 to {MAX_FORMATS} formats, comma-separated", [Problem("empty", where="formats")]
+            f"no format given: list 1 to {MAX_FORMATS} formats, comma-separated",
+            [Problem("must not be empty", where="formats")],
         )
     entries += [_entry(text, "optional", required=False) for text in optional.split(",") if text.strip()]
     names = [entry.format for entry in entries]

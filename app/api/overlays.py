@@ -189,7 +189,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
     """
     if (body.polygon is None) == (body.edge is None):
         raise Invalid(
-            "invalid obstruction: give either polygon or edge", [Problem("one of polygon and edge", where="body")]
+            "invalid obstruction: give either polygon or edge", [Problem("give either polygon or edge", where="body")]
         )
     if body.state == "accepted" and principal.role not in ("editor", "admin"):
         raise Denied("only editors can accept an overlay: report it without state, and an editor decides")
@@ -249,7 +249,7 @@ def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
         return
     problems = [place_problem(overlay.closure, version) for version in versions]
     if None not in problems:
-        problem = f"the polygon cannot be closed: {problems[0]}"
+        problem = f"the polygon cannot become a closure: {problems[0]}"
         raise Invalid(problem, [Problem(str(problems[0]), where="polygon")])
 
 
@@ -270,7 +270,7 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
         problem = f"must be a valid GeoJSON Polygon or MultiPolygon, got {shape.geom_type}: {reason}"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     if (count := int(shapely.get_num_coordinates(shape))) > MAX_POINTS:
-        problem = f"has {count} points, and the maximum is {MAX_POINTS}: simplify it"
+        problem = f"has {count} points; the limit is {MAX_POINTS}: simplify it"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     clean: dict[str, Any] = json.loads(shapely.to_geojson(shape))
     return clean

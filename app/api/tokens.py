@@ -108,11 +108,13 @@ def create_token(body: TokenBody, services: ServicesDep, _: ServerAdmin) -> Resp
                 [Problem("missing time zone", where="expires")],
             )
         if body.expires <= datetime.now(UTC):
-            raise Invalid("expires is in the past: give a later time", [Problem("past", where="expires")])
+            raise Invalid(
+                "expires is in the past: give a later time", [Problem("must be in the future", where="expires")]
+            )
     if body.robot is not None and body.role != "robot":
         raise Invalid(
             "robot requires the role robot: omit it, or set role to robot",
-            [Problem("role is not robot", where="robot")],
+            [Problem("requires the role robot", where="robot")],
         )
     robot = _robot_name(body)
     token, secret = services.store.tokens.create(body.name, body.role, body.environments, robot, body.expires)
@@ -142,7 +144,7 @@ def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Respon
     """
     tokens = {token.id: token for token in services.store.tokens.all()}
     if id not in tokens:
-        raise NotFound("no token has this id")
+        raise NotFound(f"unknown token {id[:80]!r}")
     if _is_full_admin(tokens[id]) and not any(_is_full_admin(t) for t in tokens.values() if t.id != id):
         raise Conflict("this is the last administrator's token: create another one first")
     services.store.tokens.delete(id)

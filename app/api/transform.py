@@ -54,7 +54,7 @@ def transform(
 ) -> Response:
     """Convert `latlon` or `xy`; the response has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):
-        raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("one of latlon and xy", where="query")])
+        raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("give either latlon or xy", where="query")])
     datum = services.store.versions.get(env, parse_version_ref(version)).datum
     if datum is None:
         raise MissingDatum(f'{env} has no datum: PATCH it with {{"datum": {{…}}}} or upload a datum.yaml')

@@ -162,7 +162,9 @@ async def get_actions(
         floor = map_id if map_id is not None and level != "*" else vda5050.level_map_id(site, _other(version, name))
         maps.append(_actions(version, floor, name if level is not None else None, outcome))
     if not maps:
-        raise CannotConvert("no level has this map: " + "; ".join(f"{m['level']}: {m['detail']}" for m in missing[:20]))
+        raise CannotConvert(
+            "this map is not available on any level: " + "; ".join(f"{m['level']}: {m['detail']}" for m in missing[:20])
+        )
     body = {"environment": env, "version": version.number, "root": version.root, **maps[0], "maps": maps}
     return json_response(body | {"missing": missing}, headers={"cache-control": "no-store"})
 
@@ -200,7 +202,7 @@ def _levels(version: Version, level: str | None) -> list[str]:
     if level == "*":
         return names
     if level is not None and level not in names:
-        raise NotFound(f"version {version.number} has no level {level[:80]!r}; its levels are: {', '.join(names[:50])}")
+        raise NotFound(f"version {version.number} has no level {level[:80]!r}; its levels: {', '.join(names[:50])}")
     return [level or default]
 
 

@@ -353,7 +353,7 @@ def _upload(form: UploadForm, request: Request) -> tuple[Upload, str]:
     fields = FormFields(form, request.query_params.multi_items())
     mode = fields.take("mode") or "replace"
     if mode not in ("replace", "merge"):
-        raise Invalid("mode must be replace or merge", [Problem("unknown", where="mode")])
+        raise Invalid("mode must be replace or merge", [Problem("must be replace or merge", where="mode")])
     hints, message, dry_run = fields.take_hints(), fields.take("message"), fields.take_flag("dry_run")
     upload = Upload(
         files=tuple(form.files),

@@ -85,8 +85,8 @@ def show(
             "author": row.get("author"),
             "planned": planned_move_text(row),
             "rollout": ", ".join(f"{name} {value}" for name, value in rollout.items() if value is not None),
-            "robots": f"{robots['holding']} of {robots['total']} have it, {robots['lagging']} are behind, "
-            f"{robots['failed']} failed, {robots['ready']} are ready for the plan",
+            "robots": f"{robots['holding']} of {robots['total']} run it, {robots['lagging']} are behind, "
+            f"{robots['failed']} failed, {robots['ready']} are ready for the planned move",
             "closures": f"{row['overlays']['count']} in force",
             "root hash": row.get("root"),
         }

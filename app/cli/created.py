@@ -44,7 +44,7 @@ def ensure_environment(
         if refused.status != 404 or str(refused.problem.get("type")).endswith(":gone"):
             raise
         if dry_run:
-            detail = f"no environment {name} yet: a dry run does not create it"
+            detail = f"unknown environment {name!r}: a dry run does not create it"
             raise RequestFailed(
                 {"title": "No such environment", "detail": detail}, status=404, hint=refused.hint
             ) from None
@@ -70,7 +70,7 @@ def _check_new_name(client: Client, name: str, create: bool | None, refused: Req
     if create is None:
         near = slip(name, (row["name"] for row in client.pages("/environments", {}, limit=MAX_NAMES)))
         if near is not None:
-            raise Invalid(f"no environment {name!r} (did you mean {near}?): use --create if the name is right")
+            raise Invalid(f"unknown environment {name!r} (did you mean {near}?): use --create if the name is right")
 
 
 @contextmanager

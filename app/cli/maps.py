@@ -113,7 +113,7 @@ def export_map(
     Example: `fleetmap export farm occupancy_grid -o maps/ -O resolution=0.1`
     """
     if to == "-" and as_json:
-        raise typer.BadParameter("--json and -o - both want standard output")
+        raise typer.BadParameter("--json and -o - cannot be combined: both write to standard output")
     params: dict[str, str] = options.pairs(option)
     params |= {} if derive else {"derive": "false"}
     with Client(server, token) as client:
@@ -196,7 +196,7 @@ def convert(
     from app.upload_reader import UploadHints, parse_drawn_layer
 
     if out == "-" and as_json:
-        raise typer.BadParameter("--json and -o - both want standard output")
+        raise typer.BadParameter("--json and -o - cannot be combined: both write to standard output")
     fmt = formats.get_format(to)
     ours = {p["name"] for p in parameters.describe(fmt.write_options)}
     ours |= {name for step in all_derivations() for name in parameter_names(step)}
@@ -404,7 +404,8 @@ def show_report(report: Mapping[str, Any]) -> None:
         output.print_status(f"{name}: {line['information']}{f' ({steps})' if steps else ''}")
     for line in report.get("template") or ():
         source = f" ({line['from']})" if line.get("from", "default") != "default" else ""
-        output.print_status(f"filled in: {line['what']} = {line['value']}{source}: {line['why']}")
+        value = "(empty)" if line["value"] == "" else line["value"]
+        output.print_status(f"filled in: {line['what']} = {value}{source}: {line['why']}")
     for line in report.get("dropped") or ():
         output.print_status(f"dropped: {line['count']} × {line['what']}: {line['why']}", style="yellow")
     output.show_warnings(report.get("warnings") or ())

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from app.store.store import Store
     from app.store.verify import Finding, VerifyResult
 
-REMOVED = "nothing: removed, since no version uses it"
+REMOVED = "removed, since no version uses it"
 MAX_ROUNDS = 10
 """Maximum number of checks and repairs: a chunk tree is repaired level by level."""
 
@@ -262,8 +262,9 @@ def _show(
         versions = [f"{environment} {number}" for environment, number in f.versions]
         more = f" and {len(versions) - MAX_VERSIONS} more" if len(versions) > MAX_VERSIONS else ""
         version_names = ", ".join(versions[:MAX_VERSIONS]) + more or "none"
-        source = healed.get((f.kind, f.name))
-        rows.append((f"{f.kind} {f.name[:16]}", f.problem, version_names, f"repaired from {source}" if source else ""))
+        source = healed.get((f.kind, f.name), "")
+        repair = f"repaired from {source}" if source and source != REMOVED else source
+        rows.append((f"{f.kind} {f.name[:16]}", f.problem, version_names, repair))
     output.show_table(("what", "problem", "versions", "repair"), rows)
     left = sum((f.kind, f.name) not in healed for f in verification.findings)
     if not left:

@@ -359,7 +359,7 @@ def derive(
         )
         return
     if method is None:
-        raise typer.BadParameter("missing derivation: choose one of `fleetmap derive`")
+        raise typer.BadParameter("missing derivation: list them with `fleetmap derive`")
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
     with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
         result = client.post(quote_path("environments", environment, "derivations"), body, repeat=True)

@@ -32,7 +32,7 @@ HOW_TO_SUPPLY: Mapping[Layer, str] = {
     "topology": "a network: upload a tmap2 or OSM file, or a drawing (KML, GeoJSON) with layer=topology",
     "occupancy": "an occupancy grid: upload a map.yaml with its image",
     "voxels": "a voxel map: upload an OctoMap file or a point cloud (pcd, ply, las)",
-    "imagery": "a georeferenced picture: upload a GeoTIFF, or a PNG with its world file",
+    "imagery": "a georeferenced image: upload a GeoTIFF, or a PNG with its world file",
     "zones": "zones: upload a drawing with layer=zones",
     "resources": "the files that belong to the objects: upload them together with the objects' file",
 }
@@ -332,7 +332,7 @@ def _plan_with_parameters(
     further = f"; if a layer is derived, also {', '.join(derivation_parameters)}" if derivation_parameters else ""
     wrong = sorted(names)
     near = did_you_mean(wrong[0], [*format_parameters, *derivation_parameters])
-    problem = f"no such parameter of {fmt.name} for this map{near}; accepted: {accepted}{further}"
+    problem = f"unknown parameter of {fmt.name} for this map{near}; accepted: {accepted}{further}"
     raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
 
 

@@ -112,10 +112,12 @@ def segments(
             regions.append(Region(kind, min(mean, 1.0), attributes))  # type: ignore[arg-type]
             label[at][inside] = len(regions)
     if not regions:
-        raise CannotConvert(f"{name}: the model {model.name} finds nothing with a confidence of at least {sure:g}")
+        raise CannotConvert(
+            f"{name}: the model {model.name} finds nothing with a confidence of at least {sure:g}: lower it"
+        )
     area = round(other * ground.resolution**2)
     notes.drop("m² of ground", area, f"{name}: the classes of this model map them to no kind")
-    notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m²")
+    notes.drop("small regions", small, f"{name}: smaller than minimum_area={min_area:g} m²")
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 

@@ -116,7 +116,7 @@ def plan_to_grid(picture: GeoImage, how: FloorPlanOptions, notes: DerivationNote
     walls = _walls(ink, picture, frame, size)
     paper, shaded = _sample_picture(~unknown, picture, frame)
     walls, specks = _drop_specks(walls, how.speck / resolution**2)
-    notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² counts as dirt or lettering")
+    notes.drop("specks of ink", specks, f"{name}: less than {how.speck:g} m², so they count as dirt or lettering")
     has_unknown = bool(unknown.any())
     if has_unknown:
         inside = (walls == 0) & paper & ~shaded

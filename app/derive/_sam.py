@@ -179,7 +179,7 @@ def segments(
     if not best_masks:
         raise CannotConvert(
             f"{name}: the model {model.name} finds nothing with a confidence of at least {sure:g} and a stability of "
-            f"at least {stable:g}"
+            f"at least {stable:g}: lower one of them"
         )
     return _masks_to_segments(ground, best_masks, model, min_area, notes, name)
 
@@ -266,7 +266,7 @@ def _prompt_masks(
     masks = answer["masks"] if small is None else small
     if masks.ndim != 4 or masks.shape[0] != n or scores.shape != masks.shape[:2] or 0 in masks.shape:
         raise CannotConvert(
-            f"the model {model.name} answers {n} points with masks {masks.shape} and iou_predictions {scores.shape}: "
+            f"the model {model.name} returns for {n} points masks {masks.shape} and iou_predictions {scores.shape}: "
             "expected [points, masks, height, width] and [points, masks]"
         )
     if masks.shape[1] == 4:  # the first mask is for several points; here each prompt has one

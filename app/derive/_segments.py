@@ -298,7 +298,7 @@ class _RegionBuilder:
     def small(self, notes: DerivationNotes, name: str) -> None:
         """Note the number of regions that were too small."""
         min_area = self.minimum_area * self.size**2
-        notes.drop("spots", self.few, f"{name}: smaller than minimum_area={min_area:g} m²")
+        notes.drop("small regions", self.few, f"{name}: smaller than minimum_area={min_area:g} m²")
 
     def add(self, mask: NDArray[np.bool_], at: tuple[slice, slice], region: Region) -> None:
         """Add a region: the mask within a window of the image."""

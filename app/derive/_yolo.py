@@ -72,7 +72,7 @@ def segments(
     remaining = _drop_duplicates(detections)
     if not remaining:
         raise CannotConvert(
-            f"{name}: the model {model.name} finds nothing with a confidence of at least {confidence:g}"
+            f"{name}: the model {model.name} finds nothing with a confidence of at least {confidence:g}: lower it"
         )
     label = np.zeros(ground.valid.shape, np.int32)
     regions: list[Region] = []
@@ -95,8 +95,12 @@ def segments(
         attributes = {"area": round(area, 2), "model": model.name, **way_attributes(kind, mask, ground.resolution)}
         regions.append(Region(kind, round(one.score, 3), attributes))  # type: ignore[arg-type]
         window[mask] = len(regions)
-    notes.drop("things", other, f"{name}: the classes of this model map them to no kind")
-    notes.drop("spots", small, f"{name}: smaller than minimum_area={min_area:g} m², or hidden by more confident ones")
+    notes.drop("detected objects", other, f"{name}: the classes of this model map them to no kind")
+    notes.drop(
+        "detected objects",
+        small,
+        f"{name}: smaller than minimum_area={min_area:g} m², or hidden by more confident ones",
+    )
     return Segments(label, regions, np.zeros(label.shape, bool))
 
 

@@ -157,7 +157,7 @@ def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: D
         )
     if count > MAX_FIGURES:
         raise CannotConvert(
-            f"{name} would be {count} objects, the maximum is {MAX_FIGURES}: set minimum_size above {limit:g} m"
+            f"{name} would be {count} objects; the limit is {MAX_FIGURES}: set minimum_size above {limit:g} m"
         )
     return _rows(shapes, grid, context, parameters.height, floor)
 

@@ -130,7 +130,9 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
         island=parameters.island / cell,
         voronoi=parameters.method == "voronoi",
     )
-    notes.drop("places", islands, f"{called}: isolated and less than island={parameters.island:g} m across")
+    notes.drop(
+        "areas of free space", islands, f"{called}: isolated and less than island={parameters.island:g} m across"
+    )
     count, _ = _skeleton.pieces(graph)
     if count > 1:
         notes.warn(f"the network has {count} disconnected pieces; the robot does not fit between them", where=called)
@@ -143,7 +145,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
             max_edge=parameters.max_edge / cell,
             seed=parameters.seed,
         )
-        notes.drop("samples", alone, f"{called}: nothing to join them to, or in dropped places")
+        notes.drop("samples", alone, f"{called}: nothing to join them to, or in dropped areas")
     elif parameters.method == "voronoi":
         graph = (
             _skeleton.divide_edges(graph, space, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph

@@ -154,7 +154,7 @@ def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[S
     width, height = max(1, right - left), max(1, top - bottom)
     if width * height > COLUMNS:
         raise CannotConvert(
-            f"the grid {name} would be {width} × {height} columns of voxels of {edge:g} m, the maximum is {COLUMNS}: "
+            f"the grid {name} would be {width} × {height} columns of voxels of {edge:g} m; the limit is {COLUMNS}: "
             "use a coarser resolution"
         )
     out = np.zeros((height, width), np.uint8)

@@ -85,7 +85,7 @@ def _pixels(data: bytes, name: str, level: str, notes: DerivationNotes) -> NDArr
     try:
         with Image.open(io.BytesIO(data), formats=KINDS) as image:
             if image.width * image.height > MAX_PIXELS:
-                reason = f"{image.width} × {image.height} pixels, the maximum is {MAX_PIXELS}"
+                reason = f"{image.width} × {image.height} pixels; the limit is {MAX_PIXELS}"
             else:
                 clear = "transparency" in image.info or "A" in image.getbands()
                 grey = image.mode in ("1", "L", "LA")

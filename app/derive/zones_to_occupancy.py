@@ -160,7 +160,7 @@ def _zones(layers: Layers, level: str, notes: DerivationNotes) -> list[_Zone]:
                 expiring += p.get("expires") is not None and "overlay" not in p  # a closure ends by itself
                 out.append(zone)
     notes.drop("zones of other kinds", other, "masks express only keepout, preferred lanes and speed limits")
-    notes.drop("zones without an area", flat, "they are no polygons")
+    notes.drop("zones without an area", flat, "they are not polygons")
     if expiring:
         notes.warn(f"{expiring} zones have an expiry; masks contain them until they are derived again")
     return out

@@ -359,7 +359,7 @@ class Bus:
         try:
             function(*arguments)
         except Exception:
-            log.exception("handling a Zenoh message failed")
+            log.exception("Zenoh: handling a message failed")
 
     def _handle_query(self, query: zenoh.Query) -> Reply | DeferredReply:
         key = str(query.key_expr)

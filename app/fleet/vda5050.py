@@ -115,7 +115,7 @@ def read_state(message: Any) -> tuple[VehicleMaps, ...]:
         (enabled if status == "ENABLED" else disabled).setdefault(map_id, []).append(version)
     for map_id, versions in enabled.items():
         if len(set(versions)) > 1:
-            raise _invalid_state_error(f"several versions of {map_id[:80]} are ENABLED: only one is allowed", "maps")
+            raise _invalid_state_error(f"several versions of map {map_id[:80]!r} are ENABLED: enable only one", "maps")
     for (kind, map_id, version), why in _failures(message).items():
         if kind == "downloadMap" and version in (*enabled.get(map_id, ()), *disabled.get(map_id, ())):
             continue

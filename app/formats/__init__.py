@@ -95,7 +95,7 @@ def get_format(name: str) -> Format:
     """Return the format of this name. Raises NotFound, which lists the known formats."""
     formats = all_formats()
     if name not in formats:
-        raise NotFound(f"there is no format {name!r}{did_you_mean(name, formats)}; known formats: {', '.join(formats)}")
+        raise NotFound(f"unknown format {name!r:.80}{did_you_mean(name, formats)}; available: {', '.join(formats)}")
     return formats[name]
 
 

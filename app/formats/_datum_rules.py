@@ -31,7 +31,7 @@ def check(files: Files) -> Iterator[Problem]:
     for key, bound in (("datum_latitude", 90.0), ("datum_longitude", 180.0)):
         value = top.get(key)
         if not is_number(value) or abs(value) > bound:
-            yield error_finding(f"must be degrees within ±{bound:g}, is {shown(value)}", main, where=key)
+            yield error_finding(f"must be degrees within ±{bound:g}, got {shown(value)}", main, where=key)
         else:
             position[key] = value
     if abs(position.get("datum_latitude", 0.0)) > MAX_DATUM_LATITUDE:
@@ -70,7 +70,7 @@ def _navsat(parameters: Any, position: dict[str, Any], main: str) -> Iterator[Pr
             )
         return
     if not numbers(datum, 3, 3):
-        yield error_finding(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=location)
+        yield error_finding(f"must be [latitude, longitude, yaw], got {shown(datum)}", main, where=location)
         return
     if len({type(v) for v in datum}) > 1:
         yield warning_finding(

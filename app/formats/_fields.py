@@ -54,10 +54,10 @@ class Number:
         if number is None and self.or_other:
             return "", ""
         if number is None:
-            return f"must be a number{unit and ' of' + unit}, is {_shorten(value)}", ""
+            return f"must be a number{unit and ' of' + unit}, got {_shorten(value)}", ""
         if not self.low <= number <= self.high or (self.above and number == self.low):
             bounds = f"above {self.low:g} and at most" if self.above else f"from {self.low:g} to"
-            return f"must be {bounds} {self.high:g}{unit}, is {_shorten(value)}", ""
+            return f"must be {bounds} {self.high:g}{unit}, got {_shorten(value)}", ""
         if self.usual and not self.usual[0] <= number <= self.usual[1]:
             return "", f"{_shorten(value)}{unit} is unusual: {self.hint}"
         return "", ""
@@ -84,7 +84,7 @@ class Text:
         """Return (error, doubt); the error is always empty."""
         if not isinstance(value, str) or (_CONDITION.fullmatch(value) and not _CALL.search(value)):
             return "", ""
-        return "", f"{_shorten(value)} is not a condition of words; a planner that evaluates it runs it as code"
+        return "", f"{_shorten(value)} is not a simple condition; a planner that evaluates it would run it as code"
 
 
 _CONDITION = re.compile(r"[\w\s&|~!()=<>'\",.:/+*-]*")
@@ -100,7 +100,7 @@ class Quaternion:
         parts = [_number(value.get(axis, 0.0)) for axis in "xyzw"] if isinstance(value, dict) else [None]
         numbers = [part for part in parts if part is not None]
         if len(numbers) < 4:
-            return f"must be a mapping of numbers x, y, z, w, is {_shorten(value)}", ""
+            return f"must be a mapping of numbers x, y, z, w, got {_shorten(value)}", ""
         length = math.hypot(*numbers)
         return "", "" if abs(length - 1.0) < 0.01 else f"quaternion of length {length:g}: must be 1"
 

@@ -107,7 +107,7 @@ def write(grid: OccupancyGrid, stem: str, context: WriteContext) -> dict[str, by
         if info is None:
             return {}
         document = masks.params(stem, info)
-        why = "not in any source: values of Nav2's examples"
+        why = "no source specifies it: values of Nav2's examples"
         context.fill("filter info: type, base, multiplier", info.as_dict(), why)
     kind = next(masks.servers(document)).get("type", KEEPOUT)
     if kind in (SPEED_PERCENT, SPEED_METRES) and bool((grid.cells == UNKNOWN).any()):

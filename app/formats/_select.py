@@ -48,18 +48,18 @@ def select_part(
         level_names = sorted({key.level for key in every})
         near = did_you_mean(level or "", level_names)
         raise NotFound(
-            f"there is no {noun} on the level {level!r}{near}; there are {noun}s on: {', '.join(level_names)}"
+            f"there is no {noun} on level {level!r:.80}{near}; levels with {noun}s: {', '.join(level_names)}"
         )
     name = name or (default if default in names else names[0] if len(names) == 1 else None)
     if name is None:
-        raise Ambiguous(f"there are several {noun}s, name one with {option}=…: {', '.join(names)}")
+        raise Ambiguous(f"there are several {noun}s ({', '.join(names)}): name one with {option}=…")
     matches = [key for key in matches if key.name == name]
     if not matches:
-        raise NotFound(f"unknown {noun} {name!r}{did_you_mean(name, names)}; available: {', '.join(names)}")
+        raise NotFound(f"unknown {noun} {name!r:.80}{did_you_mean(name, names)}; available: {', '.join(names)}")
     if len(matches) > 1:
         ground = [key for key in matches if key.level == GROUND]
         if not ground:
             levels = ", ".join(key.level for key in matches)
-            raise Ambiguous(f"{noun} {name!r} exists on several levels, name one with level=…: {levels}")
+            raise Ambiguous(f"{noun} {name!r} exists on several levels ({levels}): name one with level=…")
         matches = ground
     return matches

@@ -120,7 +120,7 @@ def lines(net: MergedNetwork, context: WriteContext, name: str) -> list[Line]:
             members[ONEWAY] = True
             oneway += 1
         out.append(Line(edge.source, edge.target, members))
-    context.drop("attributes of edges", dropped_count, "the format has no place for them")
+    context.drop("attributes of edges", dropped_count, "the format cannot store them")
     context.drop(
         "attributes of the opposite direction", differing, "a line has one set of attributes for both directions"
     )

@@ -375,7 +375,7 @@ def _mapviz(document: Mapping[str, Any], datum: Datum, old: tuple[Any, Any], con
         new_origin: dict[str, Any] = {"name": "dont_change_this", "latitude": None, "longitude": None}
         new_origin |= {"altitude": MAPVIZ_ALTITUDE, "heading": 0.0}
         mapviz = {"local_xy_origins": [new_origin]}
-        context.fill("mapviz_initialize_origin", "one origin at the datum", "not in any source")
+        context.fill("mapviz_initialize_origin", "one origin at the datum", "no source specifies it")
         old = (None, None)
     origins = mapviz.get("local_xy_origins") if isinstance(mapviz, dict) else None
     if not isinstance(mapviz, dict) or not isinstance(origins, list):
@@ -396,7 +396,7 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     defaults = {key: getattr(_options(context), key) for key in NAVSAT}
     for key in NAVSAT:
         if key not in navsat:
-            context.fill(f"navsat_transform_node: {key}", defaults[key], "not in any source", key)
+            context.fill(f"navsat_transform_node: {key}", defaults[key], "no source specifies it", key)
     listed = navsat.pop("datum", None)
     yaw: Any = listed[2] if isinstance(listed, list) and len(listed) > 2 else None
     more = listed[3:] if isinstance(listed, list) else []

@@ -199,7 +199,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         if node.z or its.get("z") is True:
             text += f"  z: {yaml.decimal(numbers([node.z or 0.0], METRES)[0])}\n"
         out.append(f"{text}{yaml.mapping(members, 2) if members else ''}")
-    context.drop("attributes of nodes", dropped_count, "the format has no place for them")
+    context.drop("attributes of nodes", dropped_count, "the format cannot store them")
     context.drop("names of nodes that are not their ids", unnamed, "a point's name is its node's id")
     ranks = {k: rank for rank, k in enumerate(order)}
     line_texts = []

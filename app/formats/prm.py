@@ -363,7 +363,7 @@ def _node_texts(net: MergedNetwork, ids: Sequence[Any], pixels: Array, context: 
         dropped_count += bool(p.keys() - NODE_CANONICAL - {NAME})
         x, y = (yaml.text(_plain(v)) for v in pixels[k].tolist())
         out.append(f"- id: {yaml.text(i)}\n  x: {x}\n  y: {y}\n{yaml.mapping(members, 2) if members else ''}")
-    context.drop("attributes of nodes", dropped_count, "the format has no place for them")
+    context.drop("attributes of nodes", dropped_count, "the format cannot store them")
     if renamed:
         context.warn(f"{renamed} nodes got a number as id; their old id is used as name unless they had one")
     return out

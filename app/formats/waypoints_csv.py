@@ -102,10 +102,10 @@ def _axes(header: Sequence[str]) -> tuple[str, str] | None:
 
 def _number(text: str, column: str, location: str) -> float:
     if not _DECIMAL.fullmatch(text):
-        raise_unreadable(f"must be a number, is {text[:60]!r}", f"{location}, {column}")
+        raise_unreadable(f"must be a number, got {text[:60]!r}", f"{location}, {column}")
     value = float(text)
     if not abs(value) <= LIMITS[column]:
-        raise_unreadable(f"must be within ±{LIMITS[column]:g}, is {text[:60]}", f"{location}, {column}")
+        raise_unreadable(f"must be within ±{LIMITS[column]:g}, got {text[:60]}", f"{location}, {column}")
     return value
 
 

@@ -128,7 +128,7 @@ def get_generator(name: str) -> Generator:
     generators = all_generators()
     if name not in generators:
         raise NotFound(
-            f"unknown generator {name!r}{did_you_mean(name, generators)}; available: {', '.join(generators)}"
+            f"unknown generator {name!r:.80}{did_you_mean(name, generators)}; available: {', '.join(generators)}"
         )
     return generators[name]
 

@@ -141,7 +141,7 @@ class _Shape:
 def parse(text: str, constants: Mapping[str, float]) -> Grammar:
     """Parse rules to a grammar. Raises Invalid, which names the rule and the problem."""
     if len(text) > MAX_TEXT_CHARACTERS:
-        raise_invalid(f"the rules have {len(text)} characters, the maximum is {MAX_TEXT_CHARACTERS}", "rules")
+        raise_invalid(f"the rules have {len(text)} characters; the limit is {MAX_TEXT_CHARACTERS}", "rules")
     statements = [s.strip() for line in text.splitlines() for s in line.partition("#")[0].split(";")]
     statements = [s for s in statements if s]
     if not 0 < len(statements) <= MAX_RULES:

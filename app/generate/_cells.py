@@ -91,9 +91,7 @@ def add_objects(site: Site, place: GridFrame, occupied: Bool, seen: CellStyle) -
     """Add an object for each piece of occupied cells (joined by their sides), all of the same look."""
     pieces = _pieces(occupied)
     if len(pieces) > MAX_OBJECTS:
-        raise CannotGenerate(
-            f"the site would have {len(pieces)} objects, the maximum is {MAX_OBJECTS}: make it smaller"
-        )
+        raise CannotGenerate(f"the site would have {len(pieces)} objects; the limit is {MAX_OBJECTS}: make it smaller")
     numbers: dict[str, int] = {}
     floor = site.elevation(GROUND)
     shapely.prepare(site.fence)

@@ -63,7 +63,7 @@ class Expression:
         except (ArithmeticError, ValueError) as error:
             self._stop(str(error))
         if not abs(value) <= MAX_NUMBER:
-            self._stop(f"{value:g} is beyond ±{MAX_NUMBER:g}")
+            self._stop(f"{value:g} exceeds ±{MAX_NUMBER:g}")
         return value
 
     def _stop(self, reason: str) -> NoReturn:
@@ -92,13 +92,13 @@ def _tokens(text: str, location: str) -> list[str]:
     while at < end:
         match = _TOKEN.match(text, at)
         if match is None:
-            raise_invalid(f"{text[at:].strip()[:20]!r} is no part of an expression", location)
+            raise_invalid(f"{text[at:].strip()[:20]!r} is not part of an expression", location)
         out.append(match.group().strip())
         at = match.end()
         if len(out) > MAX_TOKENS:
-            raise_invalid(f"an expression has at most {MAX_TOKENS} numbers, names and signs", location)
+            raise_invalid(f"the expression has more than {MAX_TOKENS} numbers, names and signs", location)
     if not out:
-        raise_invalid("an expression is missing", location)
+        raise_invalid("missing expression", location)
     return out
 
 
@@ -163,7 +163,7 @@ class _Parser:
     def either(self, depth: int) -> Value:
         """Alternatives, the loosest binding."""
         if depth > MAX_DEPTH:
-            raise_invalid(f"an expression is at most {MAX_DEPTH} deep", self.where)
+            raise_invalid(f"the expression is nested deeper than {MAX_DEPTH} levels", self.where)
         terms = [value for _, value in self._series(depth + 1, ("|",), self._both)]
         return terms[0] if len(terms) == 1 else lambda n, c: float(any(v(n, c) != 0 for v in terms))
 
@@ -176,7 +176,7 @@ class _Parser:
             return self._compared(depth)
         self.next_token()
         if depth > MAX_DEPTH:
-            raise_invalid(f"an expression is at most {MAX_DEPTH} deep", self.where)
+            raise_invalid(f"the expression is nested deeper than {MAX_DEPTH} levels", self.where)
         inner = self._not(depth + 1)
         return lambda n, c: float(inner(n, c) == 0)
 
@@ -199,7 +199,7 @@ class _Parser:
             return self._power(depth)
         self.next_token()
         if depth > MAX_DEPTH:
-            raise_invalid(f"an expression is at most {MAX_DEPTH} deep", self.where)
+            raise_invalid(f"the expression is nested deeper than {MAX_DEPTH} levels", self.where)
         inner = self._signed(depth + 1)
         return lambda n, c: -inner(n, c)
 
@@ -210,7 +210,7 @@ class _Parser:
         self.next_token()
         exponent = self.next_token()
         if not exponent.isdecimal() or int(exponent) > 16:
-            raise_invalid(f"a power is a whole number from 0 to 16, got {exponent!r}", self.where)
+            raise_invalid(f"an exponent must be a whole number from 0 to 16, got {exponent!r}", self.where)
         return lambda n, c: math.prod([base(n, c)] * int(exponent))
 
     def _primary(self, depth: int) -> Value:
@@ -233,7 +233,7 @@ class _Parser:
                 )
             return lambda n, c: n[token]
         raise_invalid(
-            f"a number, a name or ( is expected, got {token!r}" if token else "the expression ends too early",
+            f"expected a number, a name or (, got {token!r}" if token else "the expression ends too early",
             self.where,
         )
 
@@ -261,9 +261,7 @@ class _Parser:
     def _expect(self, sign: str) -> None:
         got = self.next_token()
         if got != sign:
-            raise_invalid(
-                f"{sign!r} is expected, got {got!r}" if got else f"{sign!r} is missing at the end", self.where
-            )
+            raise_invalid(f"expected {sign!r}, got {got!r}" if got else f"missing {sign!r} at the end", self.where)
 
 
 def _fold(parts: list[tuple[str, Value]]) -> Value:

@@ -180,7 +180,7 @@ def open_field(
     _lay(out, lines, spacing, count_lost=row_count is None)
     nodes = 2 + 2 * options.docks + sum(len(stops(out, aisle)) for aisle in out.aisles[1:])
     if nodes > MAX_NODES - 200:
-        raise invalid_option_error("node_spacing", f"there would be {nodes} nodes, the maximum is {MAX_NODES - 200}")
+        raise invalid_option_error("node_spacing", f"there would be {nodes} nodes; the limit is {MAX_NODES - 200}")
     return out
 
 
@@ -200,13 +200,12 @@ def _check_room(site: Site, options: FieldOptions, spacing: float, half: float, 
     if spacing / 2 < needed:
         raise invalid_option_error(
             word,
-            f"{spacing:.2f} m from row to row are too narrow for a robot of {options.robot_radius:g} m radius between "
-            f"rows that reach {half:.2f} m to the side: at least {2 * needed:.2f} m are needed with cells of "
-            f"{site.resolution:g} m",
+            f"rows {spacing:.2f} m apart that reach {half:.2f} m to each side are too close for a robot of radius "
+            f"{options.robot_radius:g} m: at least {2 * needed:.2f} m are needed with cells of {site.resolution:g} m",
         )
     if options.headland / 2 < needed:
         raise invalid_option_error(
-            "headland", f"{options.headland:g} m are too few to turn: at least {2 * needed:.2f} m are needed"
+            "headland", f"must be at least {2 * needed:.2f} m for robots to turn, got {options.headland:g} m"
         )
 
 
@@ -391,14 +390,14 @@ def yard(out: Field) -> dict[str, float]:
         open_to = lowest(out, u, min(radius + 0.3, options.headland / 2))
         if open_to is None or open_to > reach or not free.contains(rectangle(*place, out.yaw, 0.6, 0.4)):
             raise invalid_option_error(
-                "yard", f"{options.yard:g} m are too few for the docks of a robot of {radius:g} m radius"
+                "yard", f"{options.yard:g} m is too shallow for the docks of a robot of radius {radius:g} m"
             )
         site.box(
             f"charger{k + 1}", "machine", place, (0.6, 0.4, 0.9), yaw=out.yaw, colour="charger", name=f"Charger {k + 1}"
         )
     below = lowest(out, gate, min(radius + 0.5, options.headland / 2))
     if below is None or lane.v - below < 0.5:
-        raise invalid_option_error("yard", f"{options.yard:g} m are too few for a gate")
+        raise invalid_option_error("yard", f"{options.yard:g} m is too shallow for a gate")
     site.node("Gate", out.to_local(gate, below), yaw=out.yaw + math.pi / 2)
     site.add_edges("YardGate", "Gate", speed=0.5)
     start = first + radius + 1.0

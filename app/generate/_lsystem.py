@@ -118,10 +118,10 @@ class Budget:
 def parse(text: str) -> System:
     """Parse rules to an L-system. Raises Invalid, which names the statement and the problem."""
     if len(text) > MAX_TEXT_CHARACTERS:
-        raise_invalid(f"the rules have {len(text)} characters, the maximum is {MAX_TEXT_CHARACTERS}", "rules")
+        raise_invalid(f"the rules have {len(text)} characters; the limit is {MAX_TEXT_CHARACTERS}", "rules")
     statements = _statements(text)
     if len(statements) > MAX_RULES:
-        raise_invalid(f"there are {len(statements)} statements, the maximum is {MAX_RULES}", "rules")
+        raise_invalid(f"there are {len(statements)} statements; the limit is {MAX_RULES}", "rules")
     constants: dict[str, float] = {}
     axiom: tuple[Word, ...] | None = None
     rules: dict[tuple[str, int], list[Rule]] = {}
@@ -143,7 +143,9 @@ def parse(text: str) -> System:
                 raise_invalid("a constant must not be random: use rand in a rule", location)
             constants[match[1]] = _expressions.parse(match[2], frozenset(constants), location)(constants, never)
         else:
-            raise_invalid(f"{statement[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", location)
+            raise_invalid(
+                f"{statement[:60]!r} is not a statement: use axiom: …, name = number, or symbol -> symbols", location
+            )
     if axiom is None:
         raise_invalid("missing axiom, such as axiom: F A(1)", "rules")
     system = System(axiom, {key: tuple(match) for key, match in rules.items()}, constants)
@@ -173,7 +175,7 @@ def _rule(head: str, tail: str, constants: Mapping[str, float], location: str) -
         raise_invalid(f"{head.strip()[:60]!r} is not a symbol with names, such as A(l, w) : l > 1 @ 2", location)
     names = tuple(part.strip() for part in match[2].split(",")) if match[2] and match[2].strip() else ()
     if not all(_NAME.fullmatch(name) for name in names) or len(set(names)) != len(names) or len(names) > 8:
-        raise_invalid(f"({match[2]}) must be up to 8 different names", location)
+        raise_invalid(f"({match[2]}) must be at most 8 different names", location)
     scope = frozenset({*constants, *names})
     condition_text = match[3] or ""
     if match[3] is not None and not condition_text.strip():
@@ -225,7 +227,7 @@ def _inside(text: str, at: int, location: str) -> tuple[list[str], int]:
             start = at + 1
         deep += (sign == "(") - (sign == ")")
         at += 1
-    return raise_invalid(") is missing", location)
+    return raise_invalid("missing )", location)
 
 
 def _check_symbols(system: System) -> None:
@@ -239,8 +241,8 @@ def _check_symbols(system: System) -> None:
             takes = [str(n) for symbol, n in system.rules if symbol == letter]
             takes += [f"{minimum} to {maximum}" if minimum < maximum else str(minimum)] if letter in TURTLE else []
             if takes:
-                raise_invalid(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", location)
-            raise_invalid(f"no rule for {letter}, and it is no symbol of the turtle", location)
+                raise_invalid(f"{letter} takes {' or '.join(takes)} values, got {len(values)}", location)
+            raise_invalid(f"no rule for {letter}, which is not a turtle symbol either", location)
 
 
 # --- rewriting -------------------------------------------------------------------------------------------------------

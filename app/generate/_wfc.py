@@ -132,9 +132,7 @@ def learn(
     teach = [_blocks(one, tile).min(axis=(2, 3)) for one in symmetries(sure, symmetry)]
     tiles, index = _distinct(np.concatenate([b.reshape(-1, tile * tile) for b in blocks]))
     if len(tiles) > MAX_TILES:
-        raise CannotGenerate(
-            f"the sample has {len(tiles)} different tiles, the maximum is {MAX_TILES}: use smaller ones"
-        )
+        raise CannotGenerate(f"the sample has {len(tiles)} different tiles; the limit is {MAX_TILES}: use smaller ones")
     maps, at = [], 0
     for b in blocks:
         rows, columns = b.shape[:2]
@@ -151,7 +149,7 @@ def learn(
     patterns, pattern_index = _distinct(np.concatenate(windows))
     if len(patterns) > MAX_PATTERNS:
         raise CannotGenerate(
-            f"the sample has {len(patterns)} different patterns, the maximum is {MAX_PATTERNS}: use a smaller pattern, "
+            f"the sample has {len(patterns)} different patterns; the limit is {MAX_PATTERNS}: use a smaller pattern, "
             "fewer symmetries, or a simpler sample"
         )
     counts = np.bincount(pattern_index, minlength=len(patterns))
@@ -439,7 +437,8 @@ def collapse_model(
     """
     if shape[0] * shape[1] > MAX_PLACES:
         raise CannotGenerate(
-            f"{shape[1]} × {shape[0]} tiles are more than {MAX_PLACES}: make the site smaller, or use larger tiles"
+            f"the site has {shape[1]} × {shape[0]} tiles; the limit is {MAX_PLACES}: make the site smaller, "
+            "or use larger tiles"
         )
     lattice = Lattice.from_shape(shape, model.size, periodic=periodic)
     initial = lattice.fitting(model.patterns, fixed, wall)

@@ -125,7 +125,7 @@ def forest(given: Layers, options: ForestOptions, source: RandomSource, notes: D
     columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
     if rows * columns > MAX_OBJECTS:
         raise invalid_option_error(
-            "spacing", f"{columns} × {rows} cells are more than {MAX_OBJECTS}: use a larger spacing"
+            "spacing", f"the forest has {columns} × {rows} cells; the limit is {MAX_OBJECTS}: use a larger spacing"
         )
     born, stays = _rule(options.rule)
     alive = source.stream("cells").random((rows, columns)) < options.density
@@ -157,13 +157,15 @@ def _grow_site(
     coarse = GridFrame(place.x, place.y, options.cell, place.columns // step, place.rows // step)
     if min(coarse.rows, coarse.columns) < 5:
         raise invalid_option_error(
-            "cell", f"{coarse.columns} × {coarse.rows} cells are too few: there must be at least 5 × 5"
+            "cell",
+            f"the site has {coarse.columns} × {coarse.rows} cells, and at least 5 × 5 are required: use smaller cells "
+            "or a larger site",
         )
     if coarse.rows * coarse.columns * max(options.iterations, 1) > MAX_STEPS:
         raise invalid_option_error(
             "iterations",
-            f"{coarse.rows * coarse.columns} cells times {options.iterations} are more than {MAX_STEPS}: use fewer, "
-            "or larger cells",
+            f"{coarse.rows * coarse.columns} cells times {options.iterations} iterations exceed the limit of "
+            f"{MAX_STEPS}: use fewer iterations, or larger cells",
         )
     occupied = source.stream("cells").random((coarse.rows, coarse.columns)) < options.density
     occupied = _automata.run_automaton(occupied, born, stays, options.iterations, outside=True)
@@ -182,9 +184,9 @@ def _grow_site(
     )
     if joined.all():
         raise CannotGenerate("no free space is left: use a lower density, another rule, or a smaller robot_radius")
-    notes.drop("free cells", closed, "in isolated places, which are filled")
+    notes.drop("free cells", closed, "in isolated areas, which are filled")
     if passages:
-        notes.fill("passages", passages, "joined isolated places of free space")
+        notes.fill("passages", passages, "joined isolated areas of free space")
     if border is look:
         _cells.add_objects(site, coarse, joined, look)
     else:

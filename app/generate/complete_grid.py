@@ -85,7 +85,7 @@ def _complete_grid(
 ) -> OccupancyGrid:
     name = grid_label(key)
     if grid.cells.size > MAX_CELLS:
-        raise CannotGenerate(f"{name} has {grid.cells.size} cells, the maximum is {MAX_CELLS}")
+        raise CannotGenerate(f"{name} has {grid.cells.size} cells; the limit is {MAX_CELLS}")
     known_cells = grid.cells != UNKNOWN
     grey = unknown_grey(grid)
     if grey is not None:
@@ -97,7 +97,7 @@ def _complete_grid(
     count = int(np.count_nonzero(target))
     if count > MAX_FILLED_CELLS:
         raise invalid_option_error(
-            "reach", f"{name}: {count} cells would be filled in, the maximum is {MAX_FILLED_CELLS}: use a smaller reach"
+            "reach", f"{name}: {count} cells would be filled in; the limit is {MAX_FILLED_CELLS}: use a smaller reach"
         )
     if not count:
         raise invalid_option_error("reach", f"{name}: no unknown cell is that close to a known one: use a larger reach")

@@ -57,9 +57,7 @@ def crop_rows(given: Layers, options: CropRows, source: RandomSource, notes: Der
     )
     plants = sum(int(row.length / options.plant_spacing) + 1 for row in out.rows) * options.rows_per_bed
     if plants > _trees.MAX_PLANTS:
-        raise invalid_option_error(
-            "plant_spacing", f"there would be {plants} plants, the maximum is {_trees.MAX_PLANTS}"
-        )
+        raise invalid_option_error("plant_spacing", f"there would be {plants} plants; the limit is {_trees.MAX_PLANTS}")
     if max(row.length for row in out.rows) / options.plant_spacing > _trees.MAX_PER_ROW:
         raise invalid_option_error("plant_spacing", f"a row would have more than {_trees.MAX_PER_ROW} plants")
     _field.ground(out, field_colour="soil")

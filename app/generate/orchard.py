@@ -51,7 +51,7 @@ def orchard(given: Layers, options: Orchard, source: RandomSource, notes: Deriva
     )
     trees = sum(int(row.length / options.tree_spacing) + 1 for row in out.rows)
     if trees > _trees.MAX_TREES:
-        raise invalid_option_error("tree_spacing", f"there would be {trees} trees, the maximum is {_trees.MAX_TREES}")
+        raise invalid_option_error("tree_spacing", f"there would be {trees} trees; the limit is {_trees.MAX_TREES}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
         site.mark(f"row{row.number}", "tree_row", out.line(row), name=f"Row {row.number}")

@@ -135,20 +135,20 @@ def perturbation(given: Layers, options: Perturbation, source: RandomSource, not
     objects = sum(len(p) for p in given.vector("objects").values())
     if cells > MAX_CELLS or objects > MAX_OBJECTS:
         raise CannotGenerate(
-            f"there are {cells} cells and {objects} objects, the maximum is {MAX_CELLS} and {MAX_OBJECTS}: split the "
+            f"there are {cells} cells and {objects} objects; the limits are {MAX_CELLS} and {MAX_OBJECTS}: split the "
             "environment, or make its grid coarser"
         )
     levels = sorted({k.level for k in given.parts if k.layer in ("objects", "occupancy", "topology")})
     if options.level is not None:
         if options.level not in levels:
-            reason = f"unknown level {options.level!r}; available: {', '.join(levels)}"
+            reason = f"unknown level {options.level!r:.80}; available: {', '.join(levels)}"
             raise CannotGenerate(f"level: {reason}", [Problem(reason, where="level")])
         levels = [options.level]
     if options.severity == 0.0:
         raise CannotGenerate("severity: must be above 0", [Problem("must be above 0", where="severity")])
     if options.grid is not None and options.grid not in {k.name for k in given.grids()}:
         grid_names = ", ".join(sorted({k.name for k in given.grids()})) or "none"
-        reason = f"unknown grid {options.grid!r}; available: {grid_names}"
+        reason = f"unknown grid {options.grid!r:.80}; available: {grid_names}"
         raise CannotGenerate(f"grid: {reason}", [Problem(reason, where="grid")])
     parts: dict[PartKey, Part] = {}
     for level in levels:
@@ -254,7 +254,7 @@ class _Level:
         self._shaken(loose)
         back = separate(things)
         if back:
-            self.notes.drop("shifts", back, "their new place is occupied")
+            self.notes.drop("moves of objects", back, "their new place is occupied")
         fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
         phrases = self._summary(things)
         out: dict[PartKey, Part] = {}
@@ -436,7 +436,7 @@ class _Level:
             if not t.gone and into is not None:
                 cells[into][inside] = OCCUPIED
         if blocked_count:
-            self.notes.drop("shifts", blocked_count, "their new place is occupied or unknown")
+            self.notes.drop("moves of pieces of the grid", blocked_count, "their new place is occupied or unknown")
         added = self._paint_obstacles(key, grid, cells)
         phrases = self._summary(loose) + ([f"{added} new obstacles"] if added else [])
         if phrases:

@@ -74,7 +74,7 @@ def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes
     parts += sum(row.length / options.leg_spacing * 2 for row in out.rows if row.kind == "row")
     if parts > _trees.MAX_PLANTS:
         raise invalid_option_error(
-            "hoop_spacing", f"there would be {int(parts)} hoops and legs, the maximum is {_trees.MAX_PLANTS}"
+            "hoop_spacing", f"there would be {int(parts)} hoops and legs; the limit is {_trees.MAX_PLANTS}"
         )
     if max(row.length for row in legs) / options.hoop_spacing * CHORDS > _trees.MAX_PER_ROW:
         raise invalid_option_error(

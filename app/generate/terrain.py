@@ -81,7 +81,8 @@ def terrain(given: Layers, options: Options, source: RandomSource, notes: Deriva
     columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
     if options.vegetation and rows * columns > MAX_OBJECTS:
         raise invalid_option_error(
-            "spacing", f"{columns} × {rows} positions for trees are too many: use a larger spacing"
+            "spacing",
+            f"there are {columns} × {rows} positions for trees; the limit is {MAX_OBJECTS}: use a larger spacing",
         )
     n = int(options.detail)
     x, y = np.linspace(box[0], box[2], n), np.linspace(box[1], box[3], n)

@@ -102,7 +102,7 @@ def town(given: Layers, options: Options, source: RandomSource, notes: Derivatio
     need = options.robot_radius + SLACK * site.resolution
     if streets.walk / 2 < need:
         raise invalid_option_error(
-            "sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs at least {2 * need:.2f} m"
+            "sidewalk", f"{streets.walk:.2f} m is too narrow for the robot, which needs at least {2 * need:.2f} m"
         )
     _paint(site, streets, layout, boundary)
     _buildings(site, [lot for lot in layout.lots if lot.use in _blocks.ROOFS])
@@ -124,7 +124,9 @@ def _town_boundary(site: Site, options: Options) -> Any:
     boundary = None if options.boundary is None else _polygon(options.boundary)
     outline = shapely.box(0.0, 0.0, options.width, options.depth) if boundary is None else boundary
     if outline.area > MAX_AREA_M2:
-        raise invalid_option_error("boundary", f"{outline.area / 1e6:.1f} km² are more than {MAX_AREA_M2 / 1e6:g} km²")
+        raise invalid_option_error(
+            "boundary", f"the town has {outline.area / 1e6:.1f} km²; the limit is {MAX_AREA_M2 / 1e6:g} km²"
+        )
     around = shapely.buffer(outline, MARGIN, join_style="mitre", mitre_limit=3.0)
     fence = site.set_fence(around, room=options.sidewalk / 2 - options.robot_radius)
     if not site.is_given:
@@ -148,13 +150,13 @@ def _polygon(numbers: Sequence[float]) -> Any:
     if len(numbers) % 2 or not 6 <= len(numbers) <= 2 * MAX_BOUNDARY_POINTS:
         raise wrong(f"must be x,y of 3 to {MAX_BOUNDARY_POINTS} corners, got {len(numbers)} numbers")
     if max(map(abs, numbers)) > 1e6:
-        raise wrong("must be within a million metres of the origin")
+        raise wrong("must be within ±1e6 m")
     ring = [(mm(x), mm(y)) for x, y in zip(numbers[::2], numbers[1::2], strict=True)]
     polygon = shapely.Polygon(ring)
     if not polygon.is_valid:
         raise wrong(f"is not a valid polygon: {shapely.is_valid_reason(polygon)}")
     if polygon.area < 100.0:
-        raise wrong(f"has an area of {polygon.area:g} m², a town needs at least 100 m²")
+        raise wrong(f"must have an area of at least 100 m², got {polygon.area:g} m²")
     return shapely.normalize(polygon)
 
 

@@ -53,7 +53,7 @@ def vineyard(given: Layers, options: Vineyard, source: RandomSource, notes: Deri
     )
     vines = sum(int(row.length / options.vine_spacing) + 1 for row in out.rows)
     if vines > _trees.MAX_PLANTS:
-        raise invalid_option_error("vine_spacing", f"there would be {vines} vines, the maximum is {_trees.MAX_PLANTS}")
+        raise invalid_option_error("vine_spacing", f"there would be {vines} vines; the limit is {_trees.MAX_PLANTS}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
         _trellis(site, out, row, options)

@@ -82,9 +82,7 @@ def warehouse(given: Layers, options: Warehouse, source: RandomSource, notes: De
     site.draw(site.fence, "floor")
     pallets = sum(4 * row.length / BAY for row in out.rows)
     if pallets > _trees.MAX_PLANTS:
-        raise invalid_option_error(
-            "racks", f"there would be {int(pallets)} pallets, the maximum is {_trees.MAX_PLANTS}"
-        )
+        raise invalid_option_error("racks", f"there would be {int(pallets)} pallets; the limit is {_trees.MAX_PLANTS}")
     for row in out.rows:
         _rack(site, out, row, options, source.stream(f"pallets {row.number}"))
     _field.network(
@@ -198,7 +196,7 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
             words = {"openrmf": {"parameters": {"is_parking_spot": [4, True]}}}
             site.draw(rectangle(*out.to_local(u, v), out.yaw, 2 * radius + 0.4, 2 * radius + 0.4), "concrete")
         if v > lane.v - radius:
-            raise invalid_option_error("yard", f"{options.yard:g} m are too few for a robot of {radius:g} m radius")
+            raise invalid_option_error("yard", f"{options.yard:g} m is too shallow for a robot of radius {radius:g} m")
         site.node(name, out.to_local(u, mm(v)), yaw=facing, **words)
         site.add_edges(stop, name, speed=0.5)
     _walls(site, doors, options.wall_height)

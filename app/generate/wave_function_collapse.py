@@ -137,7 +137,7 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     sample, known_cells = _whole_tiles(sample, known_cells, tile, notes)
     if sample.size > MAX_SAMPLE_CELLS * tile * tile:
         raise invalid_option_error(
-            "sample", f"has {sample.size // tile**2} tiles, the maximum is {MAX_SAMPLE_CELLS}: use a larger tile"
+            "sample", f"has {sample.size // tile**2} tiles; the limit is {MAX_SAMPLE_CELLS}: use a larger tile"
         )
     site = Site(given, options, notes)
     place = _cells.site_grid_frame(site, options.width, options.depth, resolution, step=tile)
@@ -150,7 +150,7 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     if min(rows, columns) < max(pattern, 2 * thick + 1):
         min_side = max(pattern, 2 * thick + 1) * tile * resolution
         raise invalid_option_error(
-            "width", f"{columns} × {rows} tiles are too few: each side must be at least {min_side:g} m"
+            "width", f"the site has only {columns} × {rows} tiles: each side must be at least {min_side:g} m"
         )
     if thick:
         ring = max(pattern - 1, thick) * tile

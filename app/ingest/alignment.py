@@ -71,7 +71,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
     if key not in entries:
         stored = [f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy"]
         name = f"{request.level}/{request.grid}"
-        raise NotFound(f"unknown grid {name}{did_you_mean(name, stored)}; stored grids: {', '.join(stored) or 'none'}")
+        raise NotFound(f"unknown grid {name!r}{did_you_mean(name, stored)}; available: {', '.join(stored) or 'none'}")
     if not request.pairs and request.layer == "occupancy" and key == target:
         reason = "a grid cannot be aligned with itself: name another grid, a layer (objects, voxels) or pairs of points"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
@@ -146,7 +146,7 @@ def _derive_target(loaded: Layers, request: AlignmentRequest, target: PartKey, n
     unknown = request.values.keys() - derive.parameter_names(step.name)
     if unknown:
         accepted = ", ".join(sorted(derive.parameter_names(step.name)))
-        reason = f"no such parameter of {step.name}; accepted: {accepted}"
+        reason = f"unknown parameter of {step.name}; accepted: {accepted}"
         raise Invalid(reason, [Problem(reason, where=f"body.onto.parameters.{name}") for name in sorted(unknown)])
     bare = Layers({k: p for k, p in loaded.parts.items() if k.layer != "occupancy"}, loaded.datum, loaded.levels)
     derived_layers = derive.run(derive.with_parameters([step], request.values), bare, notes)

@@ -36,7 +36,7 @@ def check(request: DerivationRequest) -> None:
     derivations = derive.all_derivations()
     if request.method not in derivations:
         near = did_you_mean(request.method, derivations)
-        raise NotFound(f"unknown derivation {request.method!r}{near}; derivations: {', '.join(derivations)}")
+        raise NotFound(f"unknown derivation {request.method!r:.80}{near}; available: {', '.join(derivations)}")
     method_values = {n: v for n, v in request.values.items() if n in derive.parameter_names(request.method)}
     parameters.parse(derivations[request.method].parameters, method_values, f"parameter of {request.method}")
     everything = frozenset().union(*(derive.parameter_names(name) for name in derivations))
@@ -44,7 +44,7 @@ def check(request: DerivationRequest) -> None:
         if name not in everything:
             accepted = ", ".join(sorted(derive.parameter_names(request.method))) or "none"
             near = did_you_mean(name, derive.parameter_names(request.method))
-            problem = f"no such parameter of {request.method}{near}; accepted: {accepted}"
+            problem = f"unknown parameter of {request.method}{near}; accepted: {accepted}"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 

@@ -129,10 +129,10 @@ class _Session:
             "cells": {"op", "grid", "level", "polygon", "crs", "value"},
         }
         if operation not in members_by_operation:
-            raise Invalid(f"op must be put, delete or cells, got {operation!r}")
+            raise Invalid(f"op must be put, delete or cells, got {operation!r:.80}")
         extra = set(change) - members_by_operation[operation]
         if extra:
-            raise Invalid(f"unknown member {sorted(extra)[0]!r} of {operation}")
+            raise Invalid(f"unknown member {sorted(extra)[0]!r:.80} of {operation}")
         {"put": self._apply_put, "delete": self._apply_delete, "cells": self._apply_cells}[operation](change)
 
     def dangling(self) -> list[Problem]:
@@ -245,7 +245,7 @@ class _Session:
         for layer in VECTOR_LAYERS:
             if layer == layer_name:
                 return layer
-        raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {layer_name!r}")
+        raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {layer_name!r:.80}")
 
     def _apply_put(self, change: Mapping[str, Any]) -> None:
         layer, feature = self._layer(change), change.get("feature")
@@ -359,7 +359,7 @@ class _Session:
         key = self._find_part(layer, item, change)
         draft = self._draft(key)
         if not draft.has_item(item):
-            raise NotFound(f"feature {item!r} not found in {layer}")
+            raise NotFound(f"feature {item!r:.80} not found in {layer}")
         draft.puts.pop(item, None)
         if item in draft.place:
             draft.deletes.add(item)
@@ -375,7 +375,7 @@ class _Session:
         holding = [k for k in fitting if self._draft(k).has_item(item)]
         if len(holding) > 1:
             choices = ", ".join(f"level {k.level} name {k.name}" for k in holding)
-            raise Invalid(f"several parts of {layer} contain {item!r}: give 'level' and 'name', one of: {choices}")
+            raise Invalid(f"several parts of {layer} contain {item!r:.80}: give 'level' and 'name', one of: {choices}")
         if holding:
             return holding[0]
         usual = PartKey(layer, level or GROUND, name or _DEFAULT_NAME[layer])
@@ -394,7 +394,7 @@ class _Session:
     def _is_local(self, change: Mapping[str, Any]) -> bool:
         crs = change.get("crs") or ("wgs84" if self._base.datum is not None else "local")
         if crs not in ("local", "wgs84"):
-            raise Invalid(f"crs must be local or wgs84, got {crs!r}")
+            raise Invalid(f"crs must be local or wgs84, got {crs!r:.80}")
         return bool(crs == "local")
 
     def _apply_cells(self, change: Mapping[str, Any]) -> None:
@@ -405,7 +405,7 @@ class _Session:
             self._grids[key] = stored
         grid, value = self._grids[key], change.get("value")
         if isinstance(value, bool) or not isinstance(value, int) or not (0 <= value <= OCCUPIED or value == UNKNOWN):
-            raise Invalid(f"value must be 0 to 100, or 255 for unknown, got {value!r}")
+            raise Invalid(f"value must be 0 to 100, or 255 for unknown, got {value!r:.80}")
         polygon = parse_geometry(change.get("polygon"))
         if polygon.geom_type not in ("Polygon", "MultiPolygon") or not polygon.is_valid:
             reason = shapely.is_valid_reason(polygon)
@@ -438,12 +438,12 @@ class _Session:
         if not fitting:
             grid_names = sorted(k.name for k in self._keys if k.layer == "occupancy")
             near = did_you_mean(name or "", grid_names)
-            raise NotFound(f"unknown grid {name!r}{near}; stored grids: {', '.join(grid_names) or 'none'}")
+            raise NotFound(f"unknown grid {name!r:.80}{near}; available: {', '.join(grid_names) or 'none'}")
         if len(fitting) == 1:
             return fitting[0]
         if name is None and len(by_name["map"]) == 1:
             return by_name["map"][0]
-        raise Invalid(f"several grids match: name one with 'grid' (and 'level'): {', '.join(k.name for k in fitting)}")
+        raise Invalid(f"several grids match ({', '.join(k.name for k in fitting)}): name one with 'grid' (and 'level')")
 
 
 def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -508,7 +508,7 @@ def _check_shape(kind: str, item: str, geometry: Any) -> None:
 def _network_item(item: str, properties: Mapping[str, Any]) -> Mapping[str, Any]:
     kind = properties.get("kind") or ("edge" if "source" in properties else "node")
     if kind not in ("node", "edge"):
-        raise Invalid(f"kind of a topology feature must be node or edge, got {kind!r}")
+        raise Invalid(f"kind of a topology feature must be node or edge, got {kind!r:.80}")
     if kind == "edge" and not all(isinstance(properties.get(e), str) for e in ("source", "target")):
         raise Invalid(f"edge {item} needs 'source' and 'target', the ids of its nodes")
     return {**properties, "kind": kind}

@@ -151,7 +151,7 @@ def check_free(base: Version, chosen: Parameters, *, replace: bool) -> None:
     old = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
     if old is not None and not replace and (old.provenance.information != "derived" or old.provenance.is_edited):
         raise Conflict(
-            f"the picture {chosen.level}/{chosen.picture} is {old.provenance.information}: set replace=true to replace "
+            f"the image {chosen.level}/{chosen.picture} is {old.provenance.information}: set replace=true to replace "
             "it, or choose another name with picture"
         )
 
@@ -199,7 +199,7 @@ def plan_mosaic(provider: Provider, box: tuple[float, float, float, float], reso
     if count > MAX_REQUESTS or width * height > MAX_PIXELS:
         cost = f"{width} × {height} pixels and about {count} requests"
         raise Invalid(
-            f"the picture would take {cost}, the maximum is {MAX_PIXELS} pixels and {MAX_REQUESTS} requests: set a "
+            f"the image would take {cost}; the limit is {MAX_PIXELS} pixels and {MAX_REQUESTS} requests: set a "
             "coarser resolution",
             [Problem("too fine for a site of this size", where="resolution")],
         )
@@ -340,12 +340,12 @@ class Fetcher:
                         continue
                     return self._body(answer, deadline, room)
         except httpx.TimeoutException:
-            raise _RetryableError("does not respond in time") from None
+            raise _RetryableError("did not respond in time") from None
         except httpx.InvalidURL:
-            raise self._provider_error("redirects to an invalid URL") from None
+            raise self._provider_error("redirected to an invalid URL") from None
         except httpx.HTTPError as error:
             raise _RetryableError(f"cannot be reached ({type(error).__name__})") from None
-        raise self._provider_error(f"redirects more than {MAX_REDIRECTS} times")
+        raise self._provider_error(f"redirected more than {MAX_REDIRECTS} times")
 
     def _address(self, url: str) -> str:
         """Insert the token into a URL."""
@@ -358,7 +358,7 @@ class Fetcher:
         target = urljoin(url, location)
         old, new = urlsplit(url), urlsplit(target)
         if (old.scheme, old.netloc) != (new.scheme, new.netloc):
-            raise self._provider_error("redirects to another host, which is not allowed")
+            raise self._provider_error("redirected to another host, which is not allowed: check FLEETMAP_IMAGERY_URL")
         return target
 
     def _body(self, answer: httpx.Response, deadline: float, room: _ByteBudget) -> bytes | None:
@@ -366,19 +366,22 @@ class Fetcher:
         if status == 404:
             return None
         if status in (401, 403):
-            raise self._provider_error(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and its permissions")
+            raise self._provider_error(
+                f"rejected the request ({status}): check FLEETMAP_IMAGERY_TOKEN and its permissions"
+            )
         if status == 429 or status >= 500:
             retry_after = answer.headers.get("retry-after", "")
             raise _RetryableError(
-                f"returns {status}", float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0
+                f"returned status {status}",
+                float(retry_after) if retry_after.isascii() and retry_after.isdigit() else 0.0,
             )
         if status != 200:
-            raise self._provider_error(f"returns {status}")
+            raise self._provider_error(f"returned status {status}")
         kind = answer.headers.get("content-type", "").partition(";")[0].strip().lower()[:80]
         if kind and not kind.startswith("image/") and kind != "application/octet-stream":
-            raise self._provider_error(f"sends {kind!r} instead of a picture: check FLEETMAP_IMAGERY_URL")
+            raise self._provider_error(f"sent {kind!r} instead of an image: check FLEETMAP_IMAGERY_URL")
         if answer.headers.get("content-encoding", "identity").lower() != "identity":
-            raise self._provider_error("sends a compressed response although none was requested")
+            raise self._provider_error("sent a compressed response, which was not requested")
         length = answer.headers.get("content-length", "")
         if length.isascii() and length.isdigit() and int(length) > self.provider.max_bytes:
             raise self._too_large()
@@ -389,10 +392,10 @@ class Fetcher:
                 raise self._too_large()
             out += chunk
             if time.monotonic() > deadline:
-                raise _RetryableError(f"has not sent everything within {self.provider.seconds:g} s")
+                raise _RetryableError(f"did not complete its response within {self.provider.seconds:g} s")
         data = bytes(out)
         if not any(data.startswith(magic) for magic in MAGIC):
-            raise self._provider_error("sends what is neither PNG nor JPEG: check FLEETMAP_IMAGERY_URL")
+            raise self._provider_error("sent data that is neither PNG nor JPEG: check FLEETMAP_IMAGERY_URL")
         return data
 
     def _provider_error(self, problem: str) -> CannotDerive:
@@ -401,7 +404,7 @@ class Fetcher:
     def _too_large(self) -> CannotDerive:
         max_bytes = self.provider.max_bytes
         return self._provider_error(
-            f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): set a coarser resolution"
+            f"sent more than FLEETMAP_IMAGERY_MAX_BYTES ({max_bytes}): set a coarser resolution"
         )
 
     # --- cache ---
@@ -489,7 +492,7 @@ def prepare_picture(
     picture, missing = assemble_image(fetched.sheet, fetched.answers, fetched.attribution, limits)
     warnings = []
     if missing:
-        why = f"the provider has no picture for {missing} of {len(fetched.answers)} tiles; they are transparent"
+        why = f"the provider has no image for {missing} of {len(fetched.answers)} tiles; they are transparent"
         warnings.append(Problem(why))
     inputs = (*fetched.site, {"datum": base.datum.as_dict() if base.datum else None})
     provenance = Provenance("derived", None, (), None, (dict(fetched.provenance_step),), fetched.attribution, inputs)
@@ -515,7 +518,7 @@ def assemble_image(
         inner = shown[row - block.row : end - block.row, column - block.column : right - block.column]
         pixels[row:end, column:right] = inner
     if missing == len(mosaic.blocks):
-        raise CannotDerive("the imagery provider has no picture of this place at this resolution", step=METHOD)
+        raise CannotDerive("the imagery provider has no image of this place at this resolution", step=METHOD)
     properties = {"attribution": list(attribution)} if attribution else {}
     image = pixels if (pixels[..., 3] < 255).any() else np.ascontiguousarray(pixels[..., :3])
     return GeoImage(image, mosaic.transform, MERCATOR, properties), missing
@@ -529,12 +532,12 @@ def _decode_tile(block: TileRequest, data: bytes, limits: Limits) -> NDArray[np.
     try:
         (part,) = upload_reader.read({name: data}, hints, EnvironmentContext(), limits).layers(None).parts.values()
     except (BadUpload, ValueError) as error:
-        raise CannotDerive(f"the imagery provider sends a picture that cannot be read: {error}", step=METHOD) from error
+        raise CannotDerive(f"the imagery provider sent an image that cannot be read: {error}", step=METHOD) from error
     assert isinstance(part, GeoImage)
     height, width, bands = part.pixels.shape
     if (height, width) != (block.height, block.width) or part.pixels.dtype != np.uint8:
         raise CannotDerive(
-            f"the imagery provider sends pictures of {width} × {height} pixels instead of {block.width} × "
+            f"the imagery provider sent images of {width} × {height} pixels instead of {block.width} × "
             f"{block.height}: check FLEETMAP_IMAGERY_TILE_SIZE",
             step=METHOD,
         )

@@ -206,11 +206,11 @@ class Ingest:
             step, lines = provider.provenance_step(chosen), tuple(map(input_line, fences))
             fetched = online.FetchedImagery(sheet, fetches[-1][1], chosen, step, provider.attribution, lines)
             prepared, warnings = self._run_in_worker(
-                online.prepare_picture, base, fetched, self._limits, failure="the fetched picture could not be read"
+                online.prepare_picture, base, fetched, self._limits, failure="the fetched image could not be read"
             )
             return self._commit(environment, base, prepared, described, key, warnings)
 
-        return self._commit_on_head(environment, key, commit.if_match, once, "commit the fetched picture")
+        return self._commit_on_head(environment, key, commit.if_match, once, "commit the fetched image")
 
     def align(self, environment: str, request: AlignmentRequest, commit: CommitRequest) -> CommitResult:
         """Align a grid with another map and commit it as one version, unless it is a dry run.
@@ -355,7 +355,7 @@ class Ingest:
             return None
         fingerprint, number = record
         if fingerprint.removeprefix(UNCHANGED) != key.fingerprint:
-            raise Conflict(f"Idempotency-Key {key.key!r} was already used for another request: choose a new one")
+            raise Conflict(f"the Idempotency-Key {key.key!r} was already used for another request: use a new one")
         version = self._store.versions.get(environment, number)
         same = fingerprint.startswith(UNCHANGED)
         return CommitResult("unchanged" if same else "replayed", version, version.as_dict())
@@ -423,8 +423,8 @@ def check_if_match(header: str | None, head: Version) -> None:
     tags = [t.strip().removeprefix("W/").strip('"') for t in header.split(",")]
     if "*" not in tags and str(head.number) not in tags and head.root not in tags:
         raise StaleParent(
-            f"the head of {head.environment} is version {head.number} (root {head.root}), not {header}: "
-            "fetch it, check what changed, and repeat the change on top of it"
+            f"the head of {head.environment} is version {head.number} (root {head.root}), which If-Match "
+            f"{header[:80]} does not include: review the changes in between and send it again"
         )
 
 

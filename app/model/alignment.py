@@ -98,7 +98,7 @@ def align_grids(
     moving_points, onto_points = _outline(moving), _outline(onto)
     for points, role in ((moving_points, "that is moved"), (onto_points, "that it is moved onto")):
         if len(points) < 3:
-            raise CannotConvert(f"the grid {role} has {len(points)} occupied border cells: it cannot be aligned")
+            raise CannotConvert(f"the grid {role} has {len(points)} occupied border cells, and at least 3 are required")
     middle = moving_points.mean(axis=0)
     search = _Search(moving_points - middle, onto_points, near)
     limit = math.inf if reach is None else reach

@@ -57,7 +57,7 @@ class Datum:
         ):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-                raise Invalid(f"datum {name} must be a finite number, got {value!r}")
+                raise Invalid(f"datum {name} must be a finite number, got {value!r:.80}")
             if not low <= value <= high:
                 raise Invalid(f"datum {name} must be between {low:g} and {high:g}, got {value:g}")
             object.__setattr__(self, name, float(value) + 0.0)
@@ -81,7 +81,9 @@ class Level:
 
     def __post_init__(self) -> None:
         if not self.name or len(self.name) > 256 or not is_writable(self.name):
-            raise Invalid(f"a level's name must have 1 to 256 characters and no control characters, got {self.name!r}")
+            raise Invalid(
+                f"a level's name must have 1 to 256 characters and no control characters, got {self.name!r:.80}"
+            )
         if not math.isfinite(self.elevation) or abs(self.elevation) > MAX_METRES:
             raise Invalid(f"level {self.name}: elevation must be a finite number of metres, got {self.elevation!r}")
         object.__setattr__(self, "elevation", float(self.elevation) + 0.0)

@@ -78,7 +78,7 @@ class LocalFrame:
         if far.any():
             longitude, latitude = lonlat[np.flatnonzero(far)[0], :2]
             raise Invalid(
-                f"the place {latitude:g}, {longitude:g} (latitude, longitude) is too far from the datum "
+                f"the position {latitude:g}, {longitude:g} (latitude, longitude) is too far from the datum "
                 f"{self.datum.latitude:g}, {self.datum.longitude:g} for the local frame: correct it or the datum"
             )
         return out
@@ -201,7 +201,7 @@ def check_crs(crs: str) -> None:
     try:
         CRS.from_user_input(crs)
     except ProjError as error:
-        raise Invalid(f"the CRS {_short(crs)!r} does not exist: use a code such as EPSG:32632") from error
+        raise Invalid(f"unknown CRS {_short(crs)!r}: use a code such as EPSG:32632") from error
 
 
 @lru_cache(maxsize=64)

@@ -71,7 +71,7 @@ def resample(
     height, width = picture.pixels.shape[:2]
     outline = to_target(_transform_points(picture.outline(STEPS), forth))
     if not np.isfinite(outline).all() or (crs == LOCAL and np.abs(outline).max() > MAX_METRES):
-        raise Invalid("the picture extends beyond the target CRS: it is too large, or too far from the datum")
+        raise Invalid("the image extends beyond the target CRS: it is too large, or too far from the datum")
     if resolution is None:
         u, v = width / 2, height / 2
         near = pixel_positions(base, np.array([u, u + 1, u]), np.array([v, v, v + 1]))
@@ -79,13 +79,13 @@ def resample(
         area = abs((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
         resolution = float(f"{math.sqrt(area):.9g}")
     if not (math.isfinite(resolution) and resolution > 0.0):
-        raise Invalid("the picture has no area in the target CRS")
+        raise Invalid("the image has no area in the target CRS")
     low = np.floor(outline.min(axis=0) / resolution + 1e-6)
     high = np.maximum(np.ceil(outline.max(axis=0) / resolution - 1e-6), low + 1)
     columns, rows = (float(n) for n in high - low)
     if columns * rows > most_pixels:
         raise Invalid(
-            f"the picture would have {columns:.0f} × {rows:.0f} pixels, more than the maximum of "
+            f"the image would have {columns:.0f} × {rows:.0f} pixels; the limit is "
             f"{most_pixels}: set a coarser resolution"
         )
     grid = (resolution, 0.0, float(low[0]) * resolution, 0.0, -resolution, float(high[1]) * resolution)

@@ -23,7 +23,7 @@ def parts_with_name(parts: Mapping[PartKey, P], name: str, label: str) -> dict[P
     if not matches:
         names = sorted({key.name for key in parts})
         listing = ", ".join(names) or "none"
-        raise NotFound(f"unknown {label} {name!r}{did_you_mean(name, names)}; available: {listing}")
+        raise NotFound(f"unknown {label} {name!r:.80}{did_you_mean(name, names)}; available: {listing}")
     return matches
 
 
@@ -38,7 +38,7 @@ def select_per_level(parts: Mapping[PartKey, P], usual: str, label: str, option:
         chosen = {key: part for key, part in level_parts.items() if key.name == usual} or level_parts
         if len(chosen) > 1:
             listing = ", ".join(key.name for key in chosen)
-            raise Ambiguous(f"level {level!r} has several {label}s ({listing}): name one with {option}=")
+            raise Ambiguous(f"level {level!r} has several {label}s ({listing}): name one with {option}=…")
         out.update(chosen)
     return out
 

@@ -387,7 +387,7 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], location: str) -> Array
     """
     file = shape.get("file")
     if not isinstance(file, str) or not file:
-        _raise_invalid("must be the path of a picture among the files of the objects", f"{location}.file")
+        _raise_invalid("must be the path of an image among the files of the objects", f"{location}.file")
     extent = _vector(shape, "size", 3, location, (1.0, 1.0, 1.0))
     position = _vector(shape, "position", 3, location, (0.0, 0.0, 0.0), minimum=-MAX_METRES)
     grey = _highest(_picture(solids.file(file), file))
@@ -441,9 +441,9 @@ def _picture(data: bytes, file: str) -> Array:
             deep = picture.mode in ("I", "F") or picture.mode.startswith("I;16")
             grey = np.asarray(picture if deep else picture.convert("L"), np.float64)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise Invalid(f"{file} cannot be read as a picture: {error}", [Problem(str(error), file)]) from error
+        raise Invalid(f"{file} cannot be read as an image: {error}", [Problem(str(error), file)]) from error
     if grey.ndim != 2 or min(grey.shape) < 2 or not bool(np.isfinite(grey).all()):
-        _raise_invalid("must be a picture of at least 2 × 2 pixels", file)
+        _raise_invalid("must be an image of at least 2 × 2 pixels", file)
     return grey
 
 

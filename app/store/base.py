@@ -75,7 +75,7 @@ def environment_row(connection: Connection, name: str, *, lock: bool = False, de
     query = select(tables.environment).where(tables.environment.c.name == name)
     row = connection.execute(query.with_for_update() if lock else query).one_or_none()
     if row is None:
-        raise NotFound(f"there is no environment {name[:80]!r}")
+        raise NotFound(f"unknown environment {name[:80]!r}")
     if row.deleted is not None and not deleted:
         raise Gone(f"the environment {name!r} is deleted: restore it with POST /api/v1/environments/{name}/restore")
     return row

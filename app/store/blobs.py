@@ -272,7 +272,7 @@ class Blobs:
         out: dict[str, bytes] = {}
         for name in names:
             if name not in rows:
-                raise NotFound(f"there is no stored file {name}")
+                raise NotFound(f"unknown stored file {name}")
             data = self._read(name, rows[name])
             if data is None:  # it was moved to another pack between the query and the read
                 data = self._read(name, self._row(name))
@@ -332,7 +332,7 @@ class Blobs:
         with self._database.read() as connection:
             row = self._rows(connection, [name]).get(name)
         if row is None:
-            raise NotFound(f"there is no stored file {name}")
+            raise NotFound(f"unknown stored file {name}")
         return row
 
     @staticmethod
@@ -478,16 +478,16 @@ class _Unreadable(Unavailable):
 
 
 def _unreadable_error(error: OSError) -> _Unreadable:
-    return _Unreadable(f"the blob folder cannot be read: {system_reason(error)}. Try again later")
+    return _Unreadable(f"the blob folder cannot be read ({system_reason(error)}): try again later")
 
 
 def _unavailable_error(error: OSError) -> Unavailable:
     if error.errno in DISK_FULL_ERRNOS:
         return NoRoom(
-            f"the server has no disk space left for files ({system_reason(error)}); nothing was stored. Try again "
-            "after its operator has freed space"
+            f"the server has no disk space left for files ({system_reason(error)}), and nothing was stored: try again "
+            "when its operator has freed space"
         )
-    return Unavailable(f"the blob folder cannot be written: {system_reason(error)}. Try again later")
+    return Unavailable(f"the blob folder cannot be written ({system_reason(error)}): try again later")
 
 
 def _upsert(connection: Connection, rows: Sequence[Mapping[str, object]]) -> None:

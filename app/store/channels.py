@@ -95,7 +95,7 @@ class Channels:
                 ).one_or_none()
                 if channel_row is None or channel_row.version is None:
                     near = nearest_channel(connection, row, ref)
-                    raise NotFound(f"{environment} has no channel {ref!r} that points to a version{near}")
+                    raise NotFound(f"{environment} has no channel {ref!r:.80} that points to a version{near}")
                 number, sequence = channel_row.version, channel_row.sequence
             stored_version, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
@@ -166,7 +166,7 @@ class Channels:
             write = _ChannelWrite(connection, row, channel, self._database.now())
             channel_row = write.read_row()
             if channel_row is None or channel_row.planned_version is None:
-                raise NotFound(f"channel {channel!r} of {environment} has no planned move")
+                raise NotFound(f"channel {channel!r:.80} of {environment} has no planned move")
             why, author_name = "the plan was cancelled", checked_text(author, "an author")
             if channel_row.rollout_state == "waiting":
                 _end_rollout(write, channel_row, "cancelled", why, author_name)
@@ -256,7 +256,7 @@ class _ChannelWrite:
         row = self.read_row()
         if row is None:
             near = nearest_channel(self.connection, self.environment, self.name)
-            raise NotFound(f"{self.environment.name} has no channel {self.name!r}{near}")
+            raise NotFound(f"{self.environment.name} has no channel {self.name!r:.80}{near}")
         root = None if row.version is None else self.read_version(row.version).root
         planned = None if row.planned_version is None else self.read_version(row.planned_version).root
         return _as_channel(row, root, planned, self.environment, read_closures(self.connection, self.environment))

@@ -315,13 +315,13 @@ class Database:
         full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE
         if full or (code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and self._is_full()):
             return NoRoom(
-                f"the server has no disk space left for its database ({_short(error)}); nothing was stored. Try again "
-                "after its operator has freed space"
+                f"the server has no disk space left for its database ({_short(error)}), and nothing was stored: try "
+                "again when its operator has freed space"
             )
         if code == sqlite3.SQLITE_READONLY:
             return Unavailable(
-                f"the database {self._name} cannot be written ({_short(error)}); nothing was stored. Its operator "
-                "must make the file and its folder writable"
+                f"the database {self._name} cannot be written ({_short(error)}), and nothing was stored: its "
+                "operator must make the file and its folder writable"
             )
         if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
             return Unavailable(

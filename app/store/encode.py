@@ -155,13 +155,13 @@ def pack_value(value: Any, location: str) -> bytes:
     try:
         packed = ormsgpack.packb(value, default=_plain, option=OPTIONS)
     except (TypeError, ValueError, RecursionError) as error:
-        reason = f"this cannot be stored: {error}"
+        reason = f"the value cannot be stored: {error}"
         raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)]) from error
     if _BINARY.search(packed):
         try:
             orjson.dumps(value, default=_plain)
         except TypeError as error:
-            reason = f"this cannot be stored: {error}"
+            reason = f"the value cannot be stored: {error}"
             raise Invalid(f"{location}: {reason}", [Problem(reason, where=location)]) from error
     if _SUSPECT.search(packed):
         packed = ormsgpack.packb(_normalise(value, location), default=_plain, option=OPTIONS)

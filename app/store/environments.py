@@ -177,14 +177,16 @@ class Environments:
     def _rename(self, connection: Connection, row: Row[Any], new_name: str, author: str, now: datetime) -> None:
         table = tables.environment
         if connection.execute(select(table.c.id).where(table.c.name == new_name)).first():
-            raise Conflict(f"the name {new_name!r} is taken, or its environment is deleted and not yet purged")
+            raise Conflict(
+                f"the environment {new_name!r} already exists, or is deleted and not yet purged: choose another name"
+            )
         ended = row.sequence + 1
         _retire(connection, row.name, ended)
         begun = max(ended, _last_sequence(connection, new_name)) + 1
         try:
             connection.execute(update(table).where(table.c.id == row.id).values(name=new_name, sequence=begun))
         except IntegrityError as error:
-            raise Conflict(f"the name {new_name!r} is taken") from error
+            raise Conflict(f"the environment {new_name!r} already exists: choose another name") from error
         head = (row.head, row.root)
         # without the other name: a client may be allowed to see only one of them
         _append_event(connection, row, "environment.deleted", ended, row.name, author, now, "renamed", previous=head)
@@ -235,13 +237,13 @@ def _insert_environment(connection: Connection, name: str, values: dict[str, Any
     table = tables.environment
     taken = connection.execute(select(table.c.deleted).where(table.c.name == name)).one_or_none()
     if taken is not None:
-        why = "is taken" if taken.deleted is None else "belongs to a deleted environment: restore it, or purge it"
-        raise Conflict(f"the name {name!r} {why}")
+        why = "already exists: choose another name" if taken.deleted is None else "is deleted: restore it, or purge it"
+        raise Conflict(f"the environment {name!r} {why}")
     try:
         with connection.begin_nested():
             connection.execute(insert(table).values(values))
     except IntegrityError as error:
-        raise Conflict(f"the name {name!r} is taken") from error
+        raise Conflict(f"the environment {name!r} already exists: choose another name") from error
 
 
 def _last_sequence(connection: Connection, name: str) -> int:

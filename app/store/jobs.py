@@ -63,7 +63,7 @@ class Jobs:
         with self._database.write() as connection:
             row = connection.execute(select(table).where(table.c.id == id).with_for_update()).one_or_none()
             if row is None:
-                raise NotFound(f"there is no job {id[:80]!r}")
+                raise NotFound(f"unknown job {id[:80]!r}")
             if row.state not in ("done", "failed", "cancelled"):
                 connection.execute(update(table).where(table.c.id == id).values(updated=self._database.now(), **values))
             return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
@@ -73,7 +73,7 @@ class Jobs:
         with self._database.read() as connection:
             row = connection.execute(select(tables.job).where(tables.job.c.id == id)).one_or_none()
         if row is None:
-            raise NotFound(f"there is no job {id[:80]!r}")
+            raise NotFound(f"unknown job {id[:80]!r}")
         return _as_job(row)
 
     def all(self, *, state: State | None = None) -> list[Job]:
@@ -89,7 +89,7 @@ class Jobs:
         """Delete a job. Raises NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.job).where(tables.job.c.id == id)).rowcount:
-                raise NotFound(f"there is no job {id[:80]!r}")
+                raise NotFound(f"unknown job {id[:80]!r}")
 
 
 def _as_job(row: Row[Any]) -> Job:

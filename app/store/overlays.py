@@ -135,7 +135,7 @@ class Overlays:
             row = environment_row(connection, environment, lock=True)
             stored = _read(connection, row, id)
             if stored.state != before:
-                raise Conflict(f"overlay {id} is {stored.state}, not {before}")
+                raise Conflict(f"overlay {id} is {stored.state}: only {before} overlays can be {state}")
             if state == "accepted":
                 _require_room(connection, row, stored)
             values: dict[str, Any] = {"state": state, "decided_by": checked_text(author, "an author"), "decided": now}
@@ -215,7 +215,8 @@ def _require_room(connection: Connection, environment: Row[Any], overlay: Overla
     if len(polygons) >= MAX_IN_FORCE or size > MAX_IN_FORCE_BYTES:
         reason = f"{MAX_IN_FORCE} overlays" if len(polygons) >= MAX_IN_FORCE else f"{MAX_IN_FORCE_BYTES} bytes of areas"
         raise Conflict(
-            f"{reason} of {environment.name} are in force, the maximum: end or keep some first, or simplify the polygon"
+            f"{environment.name} has reached the limit of {reason} in force: end or keep some first, or "
+            "simplify the polygon"
         )
 
 
@@ -231,11 +232,14 @@ def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overla
             return str(row.id)
     if len(rows) >= MAX_PENDING_PER_REPORTER:
         raise Conflict(
-            f"{overlay.reporter} has {MAX_PENDING_PER_REPORTER} pending overlays, the maximum: wait for an editor"
+            f"{overlay.reporter} has reached the limit of {MAX_PENDING_PER_REPORTER} pending overlays: wait until an "
+            "editor accepts or rejects some"
         )
     waiting = select(func.count()).select_from(table).where(*pending)
     if connection.execute(waiting).scalar_one() >= MAX_PENDING:
-        raise Conflict(f"{environment.name} has {MAX_PENDING} pending overlays, the maximum: accept or reject some")
+        raise Conflict(
+            f"{environment.name} has reached the limit of {MAX_PENDING} pending overlays: accept or reject some"
+        )
     return None
 
 

@@ -158,7 +158,7 @@ class Areas:
                 computed[environment_id] = head.number, compute_area(self._chunks.stage(), head.parts, head.datum)
             except Damaged as error:
                 log.critical(
-                    "area: not computed, the last one stays (environment=%s, reason=%s)",
+                    "area: not computed, the previous one is kept (environment=%s, reason=%s)",
                     head.environment,
                     error.detail,
                 )
@@ -204,5 +204,5 @@ def _rank(cursor: str) -> Rank:
         guessed, size, away, name = cursor.split(" ")
         return int(guessed), float(size), float(away), name
     except ValueError:
-        problems = [Problem("from the last page's Link header", where="cursor")]
-        raise Invalid("invalid cursor: use the one in the Link header of the last page", problems) from None
+        problems = [Problem("invalid cursor", where="cursor")]
+        raise Invalid("invalid cursor: take it from the Link header of the previous page", problems) from None

@@ -90,7 +90,7 @@ class Robots:
                 if cursor is not None:
                     place, slash, robot = cursor.partition("/")
                     if not slash:
-                        raise Invalid("invalid cursor: use the one in the Link header of the last page")
+                        raise Invalid("invalid cursor: take it from the Link header of the previous page")
                     page = query.where(tuple_(owner.c.name, table.c.robot) > tuple_(place, robot))
                 robots = [_as_robot(row) for row in connection.execute(page.limit(many))]
                 out += [r for r in robots if allowed is None or fnmatchcase(r.environment, allowed)]

@@ -45,7 +45,7 @@ class Tokens:
         the role robot. token: a secret chosen by the operator. Raises Conflict if it exists already.
         """
         if role not in get_args(Role):
-            raise Invalid(f"role must be one of {', '.join(get_args(Role))}, got {role!r}")
+            raise Invalid(f"role must be one of {', '.join(get_args(Role))}, got {role!r:.80}")
         if role == "robot" and robot is None:
             raise Invalid("a token with the role robot must name its robot")
         if expires is not None and expires.tzinfo is None:
@@ -98,7 +98,7 @@ class Tokens:
         """Revoke a token. Raises NotFound."""
         with self._database.write() as connection:
             if not connection.execute(delete(tables.token).where(tables.token.c.id == id)).rowcount:
-                raise NotFound(f"there is no token {id[:80]!r}")
+                raise NotFound(f"unknown token {id[:80]!r}")
 
     def find(self, text: str) -> Token | None:
         """Find the token with this secret; None if it is unknown or expired."""

@@ -304,7 +304,10 @@ class Versions:
             if expected is not None and head.number != expected:
                 record = self.idempotent(environment, idempotency.key) if idempotency else None
                 if record is None:
-                    raise StaleParent(f"the head of {environment} is version {head.number}, not {expected}")
+                    raise StaleParent(
+                        f"the head of {environment} is version {head.number}, the change was made for version "
+                        f"{expected}: review the changes in between and send it again"
+                    )
             try:
                 return self.commit(
                     environment,
@@ -360,7 +363,7 @@ def _previous_version(connection: Connection, row: Row[Any], idempotency: Idempo
     if record is None:
         return None
     if record.fingerprint != idempotency.fingerprint:
-        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was used for another request: use a new key")
+        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was already used for another request: use a new one")
     return int(record.version)
 
 

@@ -95,7 +95,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
     """
     kind = detect_kind(data)
     if kind is None:
-        raise UnreadableFile("unknown type of picture: use PGM, PNG, BMP or JPEG")
+        raise UnreadableFile("unsupported image type: use PGM, PNG, BMP or JPEG")
     if kind == "pgm" and data[:2] in (b"P1", b"P3"):
         raise UnreadableFile("PBM and PPM in plain text are unsupported: save it as PGM (P5) or PNG")
     if kind == "pgm" and data[:2] in (b"P2", b"P5"):
@@ -117,7 +117,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
         stream.close()  # some images would keep their file's bytes
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error) as error:
         reason = str(error) or type(error).__name__
-        raise UnreadableFile(f"the {names[kind]} picture is damaged or cut short: {reason}") from error
+        raise UnreadableFile(f"the {names[kind]} image is damaged or truncated: {reason}") from error
     return image
 
 
@@ -218,13 +218,13 @@ def read_size(data: bytes, limits: Limits) -> tuple[int, int]:
         return grey.width, grey.height
     names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
     if kind is None:
-        raise UnreadableFile("unknown type of picture: use PGM, PNG, BMP or JPEG")
+        raise UnreadableFile("unsupported image type: use PGM, PNG, BMP or JPEG")
     try:
         with Image.open(io.BytesIO(data), formats=[names[kind]]) as image:
             _check_size(image.width, image.height, limits)
             return image.width, image.height
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error) as error:
-        raise UnreadableFile(f"the {names[kind]} picture is damaged: {error}") from error
+        raise UnreadableFile(f"the {names[kind]} image is damaged: {error}") from error
 
 
 def apply_table(pixels: Bytes, table: bytes) -> Bytes:
@@ -234,10 +234,10 @@ def apply_table(pixels: Bytes, table: bytes) -> Bytes:
 
 def _check_size(width: int, height: int, limits: Limits) -> None:
     if width < 1 or height < 1:
-        raise UnreadableFile(f"invalid picture size: {width} × {height} pixels")
+        raise UnreadableFile(f"invalid image size: {width} × {height} pixels")
     if width * height > limits.pixels:
         raise TooLarge(
-            f"the picture declares {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
+            f"the image declares {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
             "(FLEETMAP_MAX_PIXELS)"
         )
 
@@ -272,7 +272,7 @@ def _read_pgm(data: bytes, limits: Limits) -> Grey:
         size = count * (1 if maximum < 256 else 2)
         if len(data) - offset < size:
             raise UnreadableFile(
-                f"the PGM is cut short: {width} × {height} pixels are {size} bytes, it has {len(data) - offset}"
+                f"the PGM is truncated: {width} × {height} pixels are {size} bytes, it has {len(data) - offset}"
             )
         values = np.frombuffer(data, np.uint8 if maximum < 256 else ">u2", count, offset)
     rows = values.reshape(height, width)
@@ -308,7 +308,7 @@ def _skip_white_space(data: bytes, offset: int) -> int:
 def _parse_plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
     """Parse the first ``count`` numbers of a P2's pixels; comments may be between them."""
     if len(text) < 2 * count - 1:
-        raise UnreadableFile(f"the PGM is cut short: {count} pixels need more than {len(text)} characters")
+        raise UnreadableFile(f"the PGM is truncated: {count} pixels need more than {len(text)} characters")
     if b"#" in text:
         text = b"\n".join(line.partition(b"#")[0] for line in text.splitlines())
     stray = text.translate(None, b"0123456789 \t\r\n\v\f")
@@ -320,7 +320,7 @@ def _parse_plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
     # Without a count: fromstring returns uninitialised memory if the text has fewer numbers.
     values: NDArray[np.int32] = np.fromstring(text, np.int32, sep=" ") if text.strip() else np.empty(0, np.int32)
     if len(values) < count:
-        raise UnreadableFile(f"the PGM is cut short: it has {len(values)} of {count} pixels")
+        raise UnreadableFile(f"the PGM is truncated: it has {len(values)} of {count} pixels")
     return values[:count]
 
 
@@ -383,7 +383,7 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
             end = min(height, y + rows)
             lines = packed.send((end - y) * line)
             if len(lines) < (end - y) * line:
-                raise UnreadableFile("the PNG picture is damaged or cut short: it has too few pixels")
+                raise UnreadableFile("the PNG image is damaged or truncated: it has too few pixels")
             head = struct.pack(">IIBBBBB", width, 1 + end - y, 8, colour, 0, 0, 0)
             body = zlib.compress(before + lines, 0)
             strip = b"".join([PNG_MAGIC, _chunk(b"IHDR", head), _chunk(b"IDAT", body), _chunk(b"IEND", b"")])
@@ -391,7 +391,7 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
                 pixels[y:end] = np.asarray(image)[1:]
             before = b"\0" + pixels[end - 1].tobytes()
     except (OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
-        raise UnreadableFile(f"the PNG picture is damaged or cut short: {error}") from error
+        raise UnreadableFile(f"the PNG image is damaged or truncated: {error}") from error
     return pixels
 
 
@@ -424,16 +424,16 @@ def _check_png(data: bytes, limits: Limits) -> list[memoryview]:
     palette = False
     while True:
         if offset + 12 > len(data):
-            raise UnreadableFile("the PNG picture is cut short")
+            raise UnreadableFile("the PNG image is truncated")
         size = int.from_bytes(data[offset : offset + 4], "big")
         kind, end = data[offset + 4 : offset + 8], offset + 12 + size
         if end > len(data):
-            raise UnreadableFile("the PNG picture is cut short")
+            raise UnreadableFile("the PNG image is truncated")
         if zlib.crc32(memoryview(data)[offset + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            raise UnreadableFile(f"the PNG picture is damaged: wrong checksum of its chunk {kind!r} at byte {offset}")
+            raise UnreadableFile(f"the PNG image is damaged: wrong checksum of its chunk {kind!r} at byte {offset}")
         if len(chunks) == 1:
             if kind != b"IHDR" or size != 13:
-                raise UnreadableFile("the PNG picture does not begin with its header")
+                raise UnreadableFile("the PNG image does not start with its header")
             width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
             _check_size(width, height, limits)
         palette = palette or kind == b"PLTE"
@@ -441,15 +441,15 @@ def _check_png(data: bytes, limits: Limits) -> list[memoryview]:
             chunks.append(view[offset:end])
             packed += size if kind == b"IDAT" else 0
         elif not kind[0] & 0x20:
-            raise UnreadableFile(f"the PNG picture requires the unknown chunk {kind!r}")
+            raise UnreadableFile(f"the PNG image requires the unknown chunk {kind!r}")
         offset = end
         if kind == b"IEND":
             break
     if colour == 3 and not palette:
-        raise UnreadableFile("the PNG picture has no palette, which its pixels require")
+        raise UnreadableFile("the PNG image has no palette, which its pixels require")
     bits = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1) * depth
     if (width * bits // 8) * height > packed * DEFLATE_RATIO:
-        raise UnreadableFile(f"the PNG picture declares {width} × {height} pixels, too many for its {packed} bytes")
+        raise UnreadableFile(f"the PNG image declares {width} × {height} pixels, too many for its {packed} bytes")
     return chunks
 
 
@@ -457,9 +457,9 @@ def _check_jpeg(data: bytes) -> None:
     """Check that a JPEG has few scans (each is a pass over the image) and an end (else it would be half grey)."""
     scans = data.count(b"\xff\xda")
     if scans > MAX_JPEG_SCANS:
-        raise TooLarge(f"the JPEG picture has {scans} scans; the limit is {MAX_JPEG_SCANS}")
+        raise TooLarge(f"the JPEG image has {scans} scans; the limit is {MAX_JPEG_SCANS}")
     if data.find(b"\xff\xd9", max(2, data.rfind(b"\xff\xda"))) < 0:
-        raise UnreadableFile("the JPEG picture is cut short: its end is missing")
+        raise UnreadableFile("the JPEG image is truncated: its end is missing")
 
 
 def _check_bmp(image: Image.Image, data: bytes) -> None:
@@ -468,7 +468,7 @@ def _check_bmp(image: Image.Image, data: bytes) -> None:
     size = ((image.width * bits + 31) // 32) * 4 * image.height
     if len(data) < size:
         raise UnreadableFile(
-            f"the BMP picture is cut short: {image.width} × {image.height} pixels are {size} bytes, it has {len(data)}"
+            f"the BMP image is truncated: {image.width} × {image.height} pixels are {size} bytes, it has {len(data)}"
         )
 
 

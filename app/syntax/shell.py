@@ -121,7 +121,7 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
         at = end
     if other_lines:
         many = f"{len(other_lines)} commands are" if len(other_lines) > 1 else "a command is"
-        warnings.append(f"line {other_lines[0]}: {many} not an assignment of a literal and skipped")
+        warnings.append(f"line {other_lines[0]}: {many} skipped: only assignments of literals are read")
     if len(warnings) > MAX_WARNINGS:
         warnings = [*warnings[:MAX_WARNINGS], f"and {len(warnings) - MAX_WARNINGS} more like these"]
     return variables, warnings

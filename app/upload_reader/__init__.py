@@ -284,10 +284,10 @@ def _complete_group(
     if main_name is not None:
         names = [n for n in names if n == main_name or n.rpartition("/")[2] == main_name]
         if not names:
-            raise Invalid(f"the upload has no file {main_name!r}", [Problem("no such file", where="file")])
+            raise Invalid(f"the upload has no file {main_name[:200]!r}", [Problem("unknown file", where="file")])
     if len(names) > 1:
         reason = (
-            f"the options describe one picture, but the upload has several: select one with file=…: {', '.join(names)}"
+            f"the options describe one image, but the upload has several: select one with file=…: {', '.join(names)}"
         )
         raise Invalid(reason, [Problem(reason, where="file")])
     if not names:
@@ -382,7 +382,7 @@ def _check_options(groups: list[FileGroup], hints: UploadHints) -> None:
     for name in hints.options:
         if name not in option_names:
             accepted = ", ".join(sorted(option_names)) or "none"
-            detail = f"no format of this upload has an option {name!r}; accepted options: {accepted}"
+            detail = f"no format of this upload has the option {name[:80]!r}; accepted: {accepted}"
             raise Invalid(detail, [Problem(f"unknown option; accepted: {accepted}", where=name)])
 
 

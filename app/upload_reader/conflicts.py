@@ -18,7 +18,7 @@ _SINGLE_SOURCE_LAYERS: Mapping[str, str] = {
     "location": "location",
     "occupancy": "grid {name}",
     "voxels": "voxel map {name}",
-    "imagery": "picture {name}",
+    "imagery": "image {name}",
 }
 """Names shown to users of the layers that come from one file only."""
 

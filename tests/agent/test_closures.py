@@ -143,7 +143,7 @@ def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkey
     fake.instead = change
     one = robot()
     assert not one.once()
-    assert "other closures than its manifest" in one.detail
+    assert "have changed since its manifest" in one.detail
     assert request_count <= 2 * (agent.MAX_CLOSURE_CHANGES + 1)
     assert whole(one.into)["version"] == 1
     fake.instead = lambda _: False

@@ -84,7 +84,7 @@ def test_before_switch_delays_until_it_agrees(fake: Fake, robot: Robot, tmp_path
         assert fake.statuses[-1]["version"] == 2
         assert fake.statuses[-1]["sequence"] == 1, "of what it drives by"
         since = next(x for x in one.lines if x["event"] == "ready")["detail"]
-        assert "is ready since 20" in since
+        assert "has been ready since 20" in since
         count = len(fake.statuses)
         eventually(lambda: calls(status).count("2") >= 6)
         assert len(fake.statuses) == count, "each refusal is not another status"

@@ -149,7 +149,7 @@ def test_several_grids_require_a_name(api: Api) -> None:
     rows = {row["format"]: row for row in api.get("environments/two-grids/versions/latest/maps").json()}
     assert rows["tmap2"]["state"] == "derivable"
     assert rows["tmap2"]["chain"][0]["step"] == "occupancy_to_topology"
-    assert rows["tmap2"]["choose"].endswith("(coarse, fine): name one with grid=")
+    assert rows["tmap2"]["choose"].endswith("(coarse, fine): name one with grid=…")
     refused = api.get("/maps/two-grids/tmap2", 409)
     assert refused.json()["detail"] == rows["tmap2"]["choose"]
     assert b"- meta:" in api.get("/maps/two-grids/tmap2?grid=fine").content

@@ -239,7 +239,7 @@ def test_unknown_stored_templates_warn_and_are_ignored(api: Api, env: str) -> No
     report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
     problems = [w["problem"] for w in report["warnings"]]
     assert any("'of-tomorrow' is unknown" in p for p in problems)
-    assert any("colour: no such parameter of tmap2" in p for p in problems)
+    assert any("colour: unknown parameter of tmap2" in p for p in problems)
     line = api.get(f"environments/{env}/templates/tmap2").json()
     assert len(line["ignored"]) == 2
     assert "colour" not in line["effective"]

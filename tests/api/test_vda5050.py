@@ -86,7 +86,10 @@ def test_actions_cover_each_level(api: Api, tower: str) -> None:
     named = api.get(f"{url}?level=*&mapId=hall&grid=map").json()
     assert [m["mapId"] for m in named["maps"]][:2] == ["hall", "hall/L2"]
     assert "ground, L2, roof" in api.problem("GET", f"{url}?level=L9", 404)["detail"]
-    assert "no level has this map" in api.problem("GET", f"{url}?level=*&grid=other&derive=false", 422)["detail"]
+    assert (
+        "this map is not available on any level"
+        in api.problem("GET", f"{url}?level=*&grid=other&derive=false", 422)["detail"]
+    )
     problem = api.problem("GET", f"{url}?level=*&format=nav2_route", 422)
     assert "contains all levels" in problem["detail"]
     assert "occupancy_grid" in problem["detail"]

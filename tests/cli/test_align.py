@@ -95,7 +95,7 @@ def test_align_onto_objects_and_invalid_options(fleetmap: Fleetmap, maps: Path, 
         refused = fleetmap("align", "sliced", "--pair", text)
         assert refused.status == 1
         assert "--pair must" in refused.err
-    assert "stored grids" in fleetmap("align", "sliced", "map", "--grid", "moon").err
+    assert "available: " in fleetmap("align", "sliced", "map", "--grid", "moon").err
 
 
 def test_derive_lists_derivations_of_server(

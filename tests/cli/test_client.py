@@ -170,7 +170,7 @@ def test_missing_token_gets_hint(talk: Talk) -> None:
 
 
 def test_missing_environment_gets_hint(talk: Talk) -> None:
-    problem = {"title": "Not found", "detail": "there is no environment 'x'"}
+    problem = {"title": "Not found", "detail": "unknown environment 'x'"}
     client, _ = talk(reply(404, problem, "application/problem+json"), reply(200, [{"name": "other"}]))
     with pytest.raises(RequestFailed) as caught:
         client.get("/environments/x")
@@ -178,14 +178,14 @@ def test_missing_environment_gets_hint(talk: Talk) -> None:
 
 
 def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk) -> None:
-    problem = {"title": "Not found", "detail": "there is no environment 'fram-7'"}
+    problem = {"title": "Not found", "detail": "unknown environment 'fram-7'"}
     names = reply(200, [{"name": name} for name in ("orchard", "farm-7")])
     client, _ = talk(reply(404, problem, "application/problem+json"), names)
     with pytest.raises(RequestFailed) as caught:
         client.get("/environments/fram-7/versions/latest")
     assert caught.value.hint.startswith("Did you mean farm-7?")
     client, _ = talk(reply(404, problem, "application/problem+json"))
-    with pytest.raises(RequestFailed, match="no environment 'fram-7'"):
+    with pytest.raises(RequestFailed, match="unknown environment 'fram-7'"):
         client.get("/environments/fram-7")  # the list is refused as well: the first error is told
 
 

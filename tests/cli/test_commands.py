@@ -209,7 +209,7 @@ def test_damaged_file_is_refused_with_its_position(fleetmap: Fleetmap, tmp_path:
     problem = json.loads(fleetmap("import", bad, "-e", "damaged", "-f", "tmap2", "--json").err)
     assert problem["status"] == 422
     assert problem["errors"][0]["file"] == "bad.tmap2.yaml"
-    assert "no environment" in fleetmap("environment", "show", "damaged").err, "nothing is left behind"
+    assert "unknown environment" in fleetmap("environment", "show", "damaged").err, "nothing is left behind"
     assert fleetmap("import", bad.with_name("network.tmap2.yaml"), "-e", "damaged").status == 1
 
 

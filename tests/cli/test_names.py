@@ -96,7 +96,7 @@ def test_misspelled_environment_requires_create(fleetmap: Fleetmap, network: Pat
         assert "--create" in refused.err
     absent = fleetmap("import", network, "-e", "meadow-8", "--no-create")
     assert absent.status == 1
-    assert "no environment" in absent.err
+    assert "unknown environment" in absent.err
     assert fleetmap("import", network, "-e", "meadow-8").status == 0, "a sibling is no slip"
     assert fleetmap("import", network, "-e", "medaow-7", "--create").status == 0
 

@@ -81,8 +81,8 @@ def test_template_unset_resets_values(fleetmap: Fleetmap, farm: str) -> None:
 def test_template_errors_are_reported(fleetmap: Fleetmap, farm: str) -> None:
     wrong = fleetmap("template", farm, "tmap2", "-O", "colour=red")
     assert wrong.status == 1
-    assert "colour: no such parameter of tmap2" in wrong.err
-    assert "known sets: default, outdoor" in fleetmap("template", farm, "--set", "moon").err
+    assert "colour: unknown parameter of tmap2" in wrong.err
+    assert "available: default, outdoor" in fleetmap("template", farm, "--set", "moon").err
     assert fleetmap("template", farm, "-O", "action=x").status == 2
     assert fleetmap("template", farm, "--unset", "--set", "outdoor").status == 2
     assert fleetmap("template", farm, "moon").status == 1

@@ -158,7 +158,7 @@ def test_small_regions_are_dropped() -> None:
     part = objects(layers(local(farm())), notes, minimum_area=15.0)
     assert not of(part, "tree")
     assert len(of(part, "building")) == 1
-    assert any(d.subject == "spots" and d.count >= len(TREES) for d in notes.dropped)
+    assert any(d.subject == "small regions" and d.count >= len(TREES) for d in notes.dropped)
 
 
 def on_earth() -> GeoImage:
@@ -344,7 +344,7 @@ def test_unreadable_drawings_are_warned_of() -> None:
         ({}, "was not uploaded"),
         ({"plan.png": b"GIF89a"}, "cannot be read"),
         ({"plan.png": png(plan())[:200]}, "cannot be read"),
-        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "the maximum is"),
+        ({"plan.png": png(np.zeros((9000, 8000), np.uint8))}, "the limit is"),
     ):
         notes = DerivationNotes()
         with pytest.raises(MissingLayer, match="floor plan"):

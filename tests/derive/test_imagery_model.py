@@ -115,7 +115,7 @@ def test_boxes_become_objects_and_cells(folder: Path) -> None:
     assert things["building"][0].equals(shapely.box(10, 64 - 25, 30, 64 - 15)), "y points upward"
     assert things["building"][1] == 0.9
     assert things["tree"][0].equals(shapely.box(43, 11, 53, 21))
-    assert [d.count for d in notes.dropped if d.subject == "things"] == [1]
+    assert [d.count for d in notes.dropped if "map them to no kind" in d.why] == [1]
     # Where the model sees nothing is unknown, so a map of obstacles alone has no free cell.
     with pytest.raises(CannotConvert, match="shows no free ground"):
         imagery_to_occupancy(

@@ -214,14 +214,14 @@ def test_dropped_places_are_noted() -> None:
     notes = DerivationNotes()
     layers = Layers({PartKey("occupancy"): grid(rooms(2))})
     occupancy_to_topology(layers, Parameters(island=6.0), notes)
-    assert [(d.subject, d.count) for d in notes.dropped] == [("places", 1)]
+    assert [(d.subject, d.count) for d in notes.dropped] == [("areas of free space", 1)]
     assert not notes.warnings
     notes = DerivationNotes()
     occupancy_to_topology(layers, Parameters(island=0.0), notes)
     assert [w.problem.split(";")[0] for w in notes.warnings] == ["the network has 2 disconnected pieces"]
     assert not notes.dropped
     occupancy_to_topology(layers, Parameters(island=6.0, method="roadmap"), notes)
-    assert {d.subject for d in notes.dropped} == {"places", "samples"}
+    assert {d.subject for d in notes.dropped} == {"areas of free space", "samples"}
 
 
 def test_open_space_is_covered_without_detours() -> None:

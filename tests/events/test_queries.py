@@ -172,7 +172,7 @@ def test_file_too_large_for_zenoh_is_not_read(
     reply = next(iter(session.get("fleetmap/large/latest/maps/occupancy_grid/map.pgm", timeout=20.0)))
     problem = json.loads(bytes(reply.err.payload))
     assert (problem["status"], problem["title"]) == (413, "Too large")
-    assert "1099511627776 bytes, and the limit over Zenoh is 67108864: fetch it over HTTP" in problem["detail"]
+    assert "1099511627776 bytes; the limit over Zenoh is 67108864: fetch it over HTTP" in problem["detail"]
 
 
 def test_damaged_data_is_logged_as_critical_for_zenoh_queries(

@@ -260,7 +260,7 @@ def test_grid_directories_are_safe_in_scripts(tmp_path: Path) -> None:
     assert "config/metric/map_upstairs/map.yaml" in yamls
     values = sourced(inner, tmp_path)
     assert values["COSTMAP_YAML_FILE"] == f"{tmp_path}/config/metric/map/map.yaml"
-    assert {"levels of grids and pictures", "elevations of levels"} <= {d["what"] for d in report["dropped"]}
+    assert {"levels of grids and images", "elevations of levels"} <= {d["what"] for d in report["dropped"]}
 
 
 def test_costmap_variable_selects_grid() -> None:

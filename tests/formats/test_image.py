@@ -141,30 +141,30 @@ def test_pgm_reader_ignores_data_after_pixels() -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "unknown type"),
-        (b"GIF89a", "unknown type"),
-        (b"P9 1 1 255\n", "unknown type"),
+        (b"", "unsupported image type"),
+        (b"GIF89a", "unsupported image type"),
+        (b"P9 1 1 255\n", "unsupported image type"),
         (b"P1 1 1\n0", "PBM and PPM"),
         (b"P5 ", "width"),
         (b"P5 2", "height"),
         (b"P5 2 2", "highest value"),
         (b"P5 2 2 255", "ends after its header"),
         (b"P5 2 2 255x....", "damaged"),
-        (b"P5 2 2 255\n...", "cut short"),
+        (b"P5 2 2 255\n...", "truncated"),
         (b"P5 2 2 0\n....", "highest value is 0"),
         (b"P5 2 2 65536\n........", "highest value is 65536"),
         (b"P5 0 2 255\n", "0 × 2"),
         (b"P5 -1 2 255\n", "width"),
         (b"P5 1 1 100\n\xff", "above its declared maximum"),
         (b"P2 1 1 255\n256", "above its declared maximum"),
-        (b"P2 2 1 255\n1", "cut short"),
-        (b"P2 2 1 255\n1 # 2 3 4", "cut short"),
+        (b"P2 2 1 255\n1", "truncated"),
+        (b"P2 2 1 255\n1 # 2 3 4", "truncated"),
         (b"P2 2 1 255\n1 -2", "whole numbers"),
         (b"P2 2 1 255\n1 4294967298", "9 digits"),
         (b"P5 1" + b"0" * 5000, "width"),
         (b"P5 2 2 # no end" + b" " * 100, "highest value"),
         (b"BM" + b"\0" * 60, "damaged"),
-        (b"\xff\xd8\xff\xe0", "cut short"),
+        (b"\xff\xd8\xff\xe0", "truncated"),
     ],
 )
 def test_bad_images_are_refused_with_reason(data: bytes, reason: str) -> None:
@@ -224,7 +224,7 @@ def test_jpeg_with_many_scans_is_refused() -> None:
 def test_unknown_critical_chunk_and_late_header_are_refused() -> None:
     with pytest.raises(UnreadableFile, match="unknown chunk"):
         grey(png(1, 1, zlib.compress(b"\0\7"), extra=chunk(b"ABCD", b"")))
-    with pytest.raises(UnreadableFile, match="begin with its header"):
+    with pytest.raises(UnreadableFile, match="start with its header"):
         grey(images.PNG_MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
 
 

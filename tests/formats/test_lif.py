@@ -367,7 +367,7 @@ AT = {"x": 1, "y": 2}
         ({"layouts": [{}]}, "layouts[0].layoutId", "id"),
         ({"layouts": [{"layoutId": "a"}, {"layoutId": "a"}]}, "layouts[1].layoutId", "duplicate layout"),
         ({"layouts": [], "origins": [5]}, "origins[0]", "object"),
-        (layout(layoutLevelId=5), "layouts[0].layoutLevelId", "text"),
+        (layout(layoutLevelId=5), "layouts[0].layoutLevelId", "string"),
         (layout(layoutLevelId="a\nb"), "layouts[0].layoutLevelId", "control"),
         (layout(stations={}), "layouts[0].stations", "array"),
         (layout([5]), "layouts[0].nodes[2]", "object"),

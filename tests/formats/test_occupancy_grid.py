@@ -344,7 +344,7 @@ def test_alias_bomb_raises_unreadable_file() -> None:
 
 
 def test_damaged_image_raises_an_error_with_its_name() -> None:
-    with pytest.raises(UnreadableFile, match=r"map.pgm: the PGM is cut short") as error:
+    with pytest.raises(UnreadableFile, match=r"map.pgm: the PGM is truncated") as error:
         read({"map.yaml": YAML, "map.pgm": PGM[:-1]})
     assert error.value.problems[0].file == "map.pgm"
     with pytest.raises(TooLarge) as large:

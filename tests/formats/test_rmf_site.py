@@ -233,7 +233,7 @@ def test_unknown_members_give_a_warning_and_round_trip() -> None:
     ("changes", "reason"),
     [
         ({"format_version": "1.0"}, "format_version: version 1.0 is not supported"),
-        ({"format_version": 1}, "format_version: must be a text"),
+        ({"format_version": 1}, "format_version: must be a string"),
         ({"levels": {}}, "levels: a site needs at least one level"),
         ({"levels__1__anchors__10": {"Translate2D": [1.0]}}, "levels.1.anchors.10: must be a list of 2 numbers"),
         ({"levels__1__anchors__10": {"Spline": []}}, "levels.1.anchors.10: must be Translate2D"),

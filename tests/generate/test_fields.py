@@ -196,15 +196,19 @@ def test_one_way_aisles_alternate_directions() -> None:
         ("orchard", {"rows": 0}, "at least 2"),
         ("orchard", {"rows": 10**9}, "at most 500"),
         ("orchard", {"row_spacing": "wide"}, "must be a number"),
-        ("orchard", {"colour": "red"}, "no such parameter of orchard"),
-        ("orchard", {"robot_radius": 1.7}, r"row_spacing: 3.60 m .* at least 3.91 m are needed"),
-        ("orchard", {"headland": 1.5, "robot_radius": 0.8}, "headland: 1.5 m are too few to turn"),
+        ("orchard", {"colour": "red"}, "unknown parameter of orchard"),
+        ("orchard", {"robot_radius": 1.7}, r"row_spacing: rows 3.60 m apart .* at least 3.91 m are needed"),
+        (
+            "orchard",
+            {"headland": 1.5, "robot_radius": 0.8},
+            "headland: must be at least .* for robots to turn, got 1.5",
+        ),
         ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "must be at least trunk_diameter"),
         ("orchard", {"rows": 500, "row_length": 1000, "tree_spacing": 0.5, "resolution": 1}, "row_spacing|trees"),
         ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* use a coarser"),
         ("orchard", {"docks": 20, "row_length": 10}, "docks: the lane of 15"),
         ("orchard", {"datum": "95,0"}, "datum latitude must be between"),
-        ("crop_rows", {"aisle": 0.5}, "aisle: 1.30 m from row to row"),
+        ("crop_rows", {"aisle": 0.5}, "aisle: rows 1.30 m apart"),
         ("crop_rows", {"plant_spacing": 0.05, "row_length": 300, "beds": 20}, "plant_spacing: there would be"),
         ("polytunnels", {"tunnel_height": 2, "side_height": 3}, "must be above side_height"),
         (
@@ -215,7 +219,7 @@ def test_one_way_aisles_alternate_directions() -> None:
         ("vineyard", {"canopy_base": 2, "canopy_top": 1}, "must be above canopy_base"),
         ("vineyard", {"rows": 100, "row_length": 700}, "node_spacing: there would be"),
         ("warehouse", {"docks": 30}, "docks: 34 docks, chargers and parking places need 105 m"),
-        ("warehouse", {"robot_radius": 1.5}, "aisle: 4.80 m from row to row"),
+        ("warehouse", {"robot_radius": 1.5}, "aisle: rows 4.80 m apart"),
     ],
 )
 def test_invalid_field_parameters_raise_before_work(name: str, values: dict[str, Any], why: str) -> None:

@@ -155,7 +155,7 @@ def test_turned_objects_keep_shape_and_do_not_collide() -> None:
         assert shapely.hausdorff_distance(seen, g) < 0.01, "pose and outline agree"
     for k, a in enumerate(part.geometry):
         assert not any(a.intersects(b) for b in part.geometry[k + 1 :])
-    assert any(d.subject == "shifts" for d in notes.dropped)
+    assert any(d.subject == "moves of objects" for d in notes.dropped)
 
 
 def room(cells: Any = None, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyGrid:
@@ -300,7 +300,7 @@ def test_invalid_perturbations_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CannotGenerate, match="these parameters disturb nothing"):
         disturbed(full, **{**ALONE, "obstacles": 3})
     monkeypatch.setattr("app.generate.perturbation.MAX_CELLS", 1000)
-    with pytest.raises(CannotGenerate, match="the maximum is 1000"):
+    with pytest.raises(CannotGenerate, match="the limits are 1000"):
         disturbed(before)
 
 

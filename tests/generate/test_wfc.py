@@ -179,7 +179,7 @@ def test_wfc_of_same_seed_gives_same_cells() -> None:
         ({"width": 0}, "at least 0.5"),
         ({"width": 1e9}, "at most 10000"),
         ({"width": 10_000, "depth": 10_000}, "more than 67108864 cells"),
-        ({"width": 400, "depth": 400}, "tiles are more than 4194304"),
+        ({"width": 400, "depth": 400}, "tiles; the limit is 4194304"),
         ({"sample": "nave"}, "use one of warehouse, office, pillars, or a grid"),
         ({"model": "tiled", "pattern": 3}, "pattern: applies only to model=overlapping"),
         ({"tile": 64, "width": 50, "depth": 50, "border": "open"}, "does not contain"),
@@ -188,7 +188,7 @@ def test_wfc_of_same_seed_gives_same_cells() -> None:
         ({"free": (1.0, 2.0, 3.0)}, "even number"),
         ({"free": (99.0, 2.0)}, "outside"),
         ({"free": (0.01, 2.0)}, "is on a wall"),
-        ({"width": 0.5, "depth": 0.5, "tile": 4}, "too few"),
+        ({"width": 0.5, "depth": 0.5, "tile": 4}, "has only"),
         ({"pattern": 9}, "at most 8"),
     ],
 )

@@ -65,7 +65,7 @@ ROWS = [
     Row("ffr_network/yard.ffr.yaml", "surface:", "surfacing:", warned="network_lines[].surfacing"),
     Row("prm/meadow/prm.yaml", r"weight: 3\.0", "weight: -3.0", refused="from 0 to"),
     Row("prm/meadow/prm.yaml", "surface:", "surfacing:", warned="edges[].surfacing"),
-    Row("openrmf/yard/yard.building.yaml", "EPSG:", "EPSG:9", refused="does not exist", where="generate_crs"),
+    Row("openrmf/yard/yard.building.yaml", "EPSG:", "EPSG:9", refused="unknown CRS", where="generate_crs"),
     Row("openrmf/clinic/clinic.building.yaml", r"alpha: \[3, [\d.]+", "alpha: [3, 200", refused="from 0 to 1"),
     Row("openrmf/clinic/clinic.building.yaml", r"speed_limit: \[3, [\d.]+", "speed_limit: [3, -1.0", refused="m/s"),
     Row("openrmf/clinic/clinic.building.yaml", r"type: \[1, \w+", "type: [1, portcullis", warned="'portcullis'"),

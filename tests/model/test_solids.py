@@ -224,7 +224,7 @@ def test_mesh_shared_by_many_objects_is_read_once(monkeypatch: pytest.MonkeyPatc
         ([{"type": "polyline", "points": [[[0, 0], [1]]], "height": 1}], "list of rings"),
         ([{"type": "polyline", "points": [[[0, 0], [1, 1], [0, "a"]]], "height": 1}], "finite"),
         ([{"type": "heightmap", "file": "h.svg"}], "is missing"),
-        ([{"type": "heightmap", "file": "bad.png"}], "bad.png cannot be read as a picture"),
+        ([{"type": "heightmap", "file": "bad.png"}], "bad.png cannot be read as an image"),
         ([{"type": "heightmap", "file": "dot.png"}], "2 × 2"),
         ([BOX] * 10_001, "the limit is 10000"),
     ],

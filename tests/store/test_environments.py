@@ -39,7 +39,7 @@ def test_environment_create_describe_and_find(store: Store):
     for name in ("a" * 64, "", "Farm", "-a", "ä", "a/b", "robots", "server", "a b", "**"):
         with pytest.raises(Invalid):
             store.environments.create(name)
-    with pytest.raises(Conflict, match="taken"):
+    with pytest.raises(Conflict, match="already exists"):
         store.environments.create("farm-1")
     with pytest.raises(NotFound):
         store.environments.get("farm-2")
@@ -243,7 +243,7 @@ def test_renamed_environment_keeps_its_history(store: Store):
     assert tail == [(5, "farm", "environment.deleted"), (6, "field", "environment.created")]
     store.environments.create("farm")
     assert [e.sequence for e in store.events.page("farm")] == [6]
-    with pytest.raises(Conflict, match="taken"):
+    with pytest.raises(Conflict, match="already exists"):
         store.environments.update("farm", new_name="field")
     with pytest.raises(Invalid):
         store.environments.update("farm", new_name="NO")

@@ -86,7 +86,7 @@ def test_editor_creates_accepted_overlay_with_one_event(farm: Store, monkeypatch
     one, _ = farm.overlays.add(blocked(state="accepted", decided_by="ann", decided=NOW))
     assert [e.body["type"] for e in farm.events.page("farm", 1)] == ["overlay.accepted"]
     assert [c.id for c in farm.overlays.closures("farm").items] == [one.id]
-    with pytest.raises(Conflict, match="1 overlays of farm are in force"):
+    with pytest.raises(Conflict, match="farm has reached the limit of 1 overlays in force"):
         farm.overlays.add(blocked(state="accepted"))
     waits, _ = farm.overlays.add(blocked(reporter="r9"))
     with pytest.raises(Conflict, match="in force"):

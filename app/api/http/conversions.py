@@ -74,7 +74,7 @@ class ConversionJobs:
             running = self._running.get(recipe.key)
             if running is None:
                 if len(self._running) >= MAX_CONCURRENT_CONVERSIONS + MAX_QUEUED_CONVERSIONS:
-                    raise Unavailable("too many conversions are queued: try again in a few seconds")
+                    raise Unavailable("too many conversions are waiting: try again in a few seconds")
                 running = self._start(recipe)
             running.waiters += 1
         try:

@@ -31,7 +31,9 @@ class FormFields:
         """Take a boolean field; False if it is missing."""
         text = self.take(name)
         if text.lower() not in _TRUTH:
-            raise Invalid(f"{name} must be true or false, got {text[:80]!r}", [Problem("true or false", where=name)])
+            raise Invalid(
+                f"{name} must be true or false, got {text[:80]!r}", [Problem("must be true or false", where=name)]
+            )
         return _TRUTH[text.lower()]
 
     def take_format(self, name: str) -> str | None:

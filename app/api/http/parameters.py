@@ -31,7 +31,7 @@ def parse_box(text: str, parameter: str = "bbox") -> Box:
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
         raise Invalid(
             f"{parameter} must be west, south, east, north in degrees, with south ≤ north",
-            [Problem("W,S,E,N", where=parameter)],
+            [Problem("must be west, south, east, north", where=parameter)],
         )
     return west, south, east, north
 
@@ -42,7 +42,7 @@ def parse_position(text: str, parameter: str = "contains") -> tuple[float, float
     if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
         raise Invalid(
             f"{parameter} must be LAT,LON in degrees: the latitude comes first, within ±90",
-            [Problem("LAT,LON", where=parameter)],
+            [Problem("must be LAT,LON", where=parameter)],
         )
     return latitude, longitude
 
@@ -76,7 +76,9 @@ def parse_options(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]
         values[name] = value
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
-        raise Invalid(f"derive must be true or false, got {derive[:80]!r}", [Problem("true or false", where="derive")])
+        raise Invalid(
+            f"derive must be true or false, got {derive[:80]!r}", [Problem("must be true or false", where="derive")]
+        )
     return values, derive == "true", closure_mode(values.pop("closures", None))
 
 

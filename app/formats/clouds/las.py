@@ -52,7 +52,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     cloud = source.cloud()
     if source.form not in ENDINGS:
         if cloud.height > 1:
-            context.drop("rows and columns of the cloud", 1, "LAS points are one list: request pcd instead")
+            context.drop("rows and columns of the cloud", 1, "LAS cannot store them: request pcd instead")
         context.drop(
             "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "LAS cannot store it: request pcd instead"
         )

@@ -231,7 +231,7 @@ def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: b
 
     places = np.stack([columns[axis].astype(np.float64) for axis in AXES], axis=1)
     valid = np.isfinite(places).all(axis=1)
-    context.drop("points", int(np.count_nonzero(~valid)), "LAS has no points without finite coordinates")
+    context.drop("points", int(np.count_nonzero(~valid)), "LAS cannot store points without finite coordinates")
     places = places[valid]
     coloured = all(name in columns for name in RGB)
     header = laspy.LasHeader(version="1.4", point_format=7 if coloured else 6)

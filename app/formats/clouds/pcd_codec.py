@@ -78,7 +78,7 @@ def parse(data: bytes, context: ReadContext) -> Cloud:
     check_count(count, context)
     record = sum(f.dtype.itemsize * f.count for f in header.fields)
     if record > RECORD_BYTES:
-        raise unreadable_error(f"a point has {record} bytes: the maximum is {RECORD_BYTES}", where="SIZE")
+        raise unreadable_error(f"a point has {record} bytes; the limit is {RECORD_BYTES}", where="SIZE")
     if header.data == "ascii":
         columns = _from_text(data, header, count, context)
     elif header.data == "binary":
@@ -119,7 +119,7 @@ def _header(data: bytes, context: ReadContext) -> _Header:
     (kind, *_), line_number = entries["DATA"][0] or [""], entries["DATA"][1]
     data_kind = next((k for k in KINDS if k == kind), None)
     if data_kind is None:
-        raise unreadable_error(f"DATA must be one of {', '.join(KINDS)}, not {kind[:40]!r}", line_number, "DATA")
+        raise unreadable_error(f"DATA must be one of {', '.join(KINDS)}, got {kind[:40]!r}", line_number, "DATA")
     user_comments = [c for c in comments if not c.startswith("# .PCD")]
     return _Header(fields, width, height, _viewpoint(entries), tuple(user_comments), data_kind, position, number)
 
@@ -142,7 +142,7 @@ def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
             raise unreadable_error(f"field {name[:40]}: unknown type {kind[:8]} of {size[:8]} bytes", type_line, "TYPE")
         if not re.fullmatch(r"[1-9][0-9]{0,4}", count):
             raise unreadable_error(
-                f"field {name[:40]}: COUNT must be a number from 1 to 99999, not {count[:8]!r}", count_line, "COUNT"
+                f"field {name[:40]}: COUNT must be a number from 1 to 99999, got {count[:8]!r}", count_line, "COUNT"
             )
         if name != PADDING and name in seen:
             raise unreadable_error(f"duplicate field {name[:40]!r}", line, key)
@@ -154,7 +154,7 @@ def _fields(entries: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
 def _integer(entries: Mapping[str, tuple[list[str], int]], key: str) -> int:
     values, line = entries[key]
     if len(values) != 1 or not re.fullmatch(r"[0-9]{1,12}", values[0]):
-        raise unreadable_error(f"{key} must be an integer, not {' '.join(values)[:40]!r}", line, key)
+        raise unreadable_error(f"{key} must be an integer, got {' '.join(values)[:40]!r}", line, key)
     return int(values[0])
 
 
@@ -164,7 +164,7 @@ def _viewpoint(entries: Mapping[str, tuple[list[str], int]]) -> tuple[float, ...
     values, line = entries["VIEWPOINT"]
     pattern = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
     if len(values) != 7 or not all(re.fullmatch(pattern, v, re.ASCII) for v in values):
-        raise unreadable_error(f"VIEWPOINT must be seven numbers, not {' '.join(values)[:80]!r}", line, "VIEWPOINT")
+        raise unreadable_error(f"VIEWPOINT must be seven numbers, got {' '.join(values)[:80]!r}", line, "VIEWPOINT")
     numbers = tuple(float(v) + 0.0 for v in values)
     if not all(map(math.isfinite, numbers)):
         raise unreadable_error("VIEWPOINT must be seven finite numbers", line, "VIEWPOINT")

@@ -49,7 +49,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     cloud = source.cloud()
     if source.form != NAME:
         if cloud.height > 1:
-            context.drop("rows and columns of the cloud", 1, "PLY vertices are one list: request pcd instead")
+            context.drop("rows and columns of the cloud", 1, "PLY cannot store them: request pcd instead")
         context.drop(
             "viewpoint", int(cloud.viewpoint != points.IDENTITY_VIEWPOINT), "PLY cannot store it: request pcd instead"
         )

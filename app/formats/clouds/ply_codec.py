@@ -87,7 +87,7 @@ def parse(data: bytes, context: ReadContext) -> Cloud:
     header = _header(data)
     vertices = [e for e in header.elements if e.name == VERTEX]
     if len(vertices) != 1:
-        raise unreadable_error(f"a PLY needs one element {VERTEX}, not {len(vertices)}", where=VERTEX)
+        raise unreadable_error(f"a PLY must have one element {VERTEX}, got {len(vertices)}", where=VERTEX)
     for element in header.elements:
         check_count(element.count, context)
     if vertices[0].lists:
@@ -120,12 +120,12 @@ def _header(data: bytes) -> _Header:
             kind = next((k for k in KINDS if values == [k, "1.0"]), None)
             if kind is None:
                 raise unreadable_error(
-                    f"the format must be one of {', '.join(KINDS)} in version 1.0, not {line[:80]!r}", number
+                    f"the format must be one of {', '.join(KINDS)} in version 1.0, got {line[:80]!r}", number
                 )
         elif key == "element":
             if len(values) != 2 or not re.fullmatch(r"[0-9]{1,12}", values[1]):
                 raise unreadable_error(
-                    f"an element must have a name and a number, not {line[:80]!r}", number, "element"
+                    f"an element must have a name and a number, got {line[:80]!r}", number, "element"
                 )
             elements.append(_Element(values[0], int(values[1]), [], number))
         elif key == "property":
@@ -147,10 +147,10 @@ def _add_property(element: _Element, values: list[str], line: str, number: int) 
     types = types[1:] if listed else types
     if len(types) != (2 if listed else 1) or any(t not in _TYPES for t in types):
         raise unreadable_error(
-            f"a property must have a supported type and a name, not {line[:80]!r}", number, "property"
+            f"a property must have a supported type and a name, got {line[:80]!r}", number, "property"
         )
     if listed and _TYPES[types[0]][0] == "f":
-        raise unreadable_error(f"the length of a list must have an integer type, not {types[0]}", number, name[:40])
+        raise unreadable_error(f"the length of a list must have an integer type, got {types[0]}", number, name[:40])
     if any(p.name == name for p in element.properties):
         raise unreadable_error(f"duplicate property {name[:40]!r} of {element.name[:40]}", number, name[:40])
     if len(element.properties) >= 1000:

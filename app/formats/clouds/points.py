@@ -276,7 +276,7 @@ def _to_wgs84(cloud: Cloud, options: ReadOptions, context: ReadContext) -> tuple
     if crs is None or crs == "local" or not len(cloud):
         return "", None
     if options.crs is not None and not re.fullmatch(r"[A-Za-z]{2,10}:[0-9]{1,10}", options.crs):
-        raise Invalid(f"crs must be a code like EPSG:32632, or 'local', not {options.crs[:80]!r}")
+        raise Invalid(f"crs must be a code like EPSG:32632, or 'local', got {options.crs[:80]!r}")
     try:
         earth = crs_to_wgs84(crs, cloud.places(0, len(cloud)))
     except Invalid as error:
@@ -444,7 +444,7 @@ def source(
     keys = choose(sorted(layers.parts_of("voxels")), name, level)
     voxels = layers.parts[keys[0]]
     if not isinstance(voxels, VoxelMap):
-        raise AssertionError(f"{keys[0]} is no voxel map")
+        raise AssertionError(f"{keys[0]} is not a voxel map")
     source_properties = voxels.properties.get(PROPERTY)
     data = _stored_file(layers, keys[0], voxels, source_properties) if isinstance(source_properties, Mapping) else None
     if data is None or not isinstance(source_properties, Mapping):

@@ -402,7 +402,7 @@ class _Writer:
                     part_name, count, "no format in the package can contain it, or its map cannot be written"
                 )
         levels = {k.level for k in self.reported if k.layer in ("occupancy", "voxels", "imagery")} - {GROUND}
-        self.context.drop("levels of grids and pictures", len(levels), "the template's directories have one level")
+        self.context.drop("levels of grids and images", len(levels), "the template's directories have one level")
         if self.layers.levels != (Level(),):
             more = sum(level != Level() for level in self.layers.levels)
             self.context.drop("elevations of levels", more, "the template's directories have one level")

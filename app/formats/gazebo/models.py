@@ -268,7 +268,7 @@ def _with_path(error: UnreadableFile | TooLarge, path: str) -> UnreadableFile | 
 def _pair(point: etree._Element) -> list[float]:
     values = numbers(element_text(point), point)
     if len(values) != 2:
-        raise unreadable_error(f"a point must have 2 numbers, not {len(values)}", point)
+        raise unreadable_error(f"a point must have 2 numbers, got {len(values)}", point)
     return values
 
 

@@ -163,7 +163,7 @@ def vector(element: etree._Element | None, tag: str, count: int, default: Sequen
         return list(default)
     values = numbers(element_text(child), child)
     if len(values) != count:
-        raise unreadable_error(f"<{tag}> must have {count} numbers, not {len(values)}", child)
+        raise unreadable_error(f"<{tag}> must have {count} numbers, got {len(values)}", child)
     return values
 
 
@@ -196,10 +196,10 @@ def parse_pose(parent: etree._Element) -> Pose | None:
     attributes = {k: v for k, v in xml.attributes(element).items() if v and k != "degrees"}
     if element.get("rotation_format") == "quat_xyzw":
         if len(values) not in (0, 7):
-            raise unreadable_error(f"a pose with a quaternion must have 7 numbers, not {len(values)}", element)
+            raise unreadable_error(f"a pose with a quaternion must have 7 numbers, got {len(values)}", element)
         values = [*values[:3], *_quaternion_angles(values[3:], element)] if values else [0.0] * 6
     elif len(values) > 6:
-        raise unreadable_error(f"a pose must have 6 numbers, not {len(values)}", element)
+        raise unreadable_error(f"a pose must have 6 numbers, got {len(values)}", element)
     else:
         values += [0.0] * (6 - len(values))
         if is_true(element.get("degrees", "")):

@@ -144,7 +144,7 @@ class _Writer:
             matches = [w for w in self.stored if world_name in (w.key, sdf.stem(w.key))]
             if not matches:
                 names = ", ".join(w.key for w in self.stored) or "none"
-                raise NotFound(f"unknown world {world_name!r}: choose one of {names}")
+                raise NotFound(f"unknown world {world_name!r:.80}; available: {names}")
             return matches[0]
         if len(self.stored) > 1:
             names = ", ".join(w.key for w in self.stored[1:])

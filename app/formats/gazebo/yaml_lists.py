@@ -137,7 +137,7 @@ def _unreadable_error(reason: str, location: str) -> UnreadableFile:
 
 def _number(value: Any, location: str, maximum: float = MAX_METRES) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= maximum:
-        raise _unreadable_error(f"must be a finite number within ±{maximum:g}, not {str(value)[:40]!r}", location)
+        raise _unreadable_error(f"must be a finite number within ±{maximum:g}, got {str(value)[:40]!r}", location)
     return float(value) + 0.0
 
 
@@ -359,7 +359,7 @@ class _Reader:
             for inner in node:
                 self.rows(inner, path)
         elif node is not None:
-            raise _unreadable_error(f"must be rows with coordinates, not {str(node)[:40]!r}", "/".join(path))
+            raise _unreadable_error(f"must be rows with coordinates, got {str(node)[:40]!r}", "/".join(path))
 
     def _row(self, row: Mapping[str, Any], path: tuple[str, ...]) -> None:
         location = "/".join(path)

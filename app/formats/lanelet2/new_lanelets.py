@@ -66,7 +66,7 @@ class NewLanelets:
         if self.layers.frame is None and not self.out.metric:
             raise MissingDatum(
                 "lanelet2 needs positions on earth, but the environment has no datum: set one with PATCH "
-                '/api/v1/environments/{env} "datum": {"latitude": …, "longitude": …} or upload a datum.yaml'
+                '/api/v1/environments/{env} {"datum": {"latitude": …, "longitude": …}} or upload a datum.yaml'
             )
         net = merge_networks(Layers(parts, self.layers.datum, self.layers.levels), self.context)
         new = self._make_lanelets(net)

@@ -133,7 +133,7 @@ class _Reader:
             raise_unreadable("must be an object", location)
         layout_id = row.get("layoutId")
         if not isinstance(layout_id, str) or not is_name(layout_id):
-            raise_unreadable("a layout needs a text id", f"{location}.layoutId")
+            raise_unreadable("a layout needs a string as its id", f"{location}.layoutId")
         if any(head["layoutId"] == layout_id for head in self.heads):
             raise_unreadable(f"duplicate layout {layout_id!r}: layout ids must be unique", f"{location}.layoutId")
         self.heads.append({w: v for w, v in row.items() if w not in LISTS})
@@ -141,7 +141,7 @@ class _Reader:
         if level is None or level == "":
             level = self.context.level
         elif not isinstance(level, str):
-            raise_unreadable("must be a text", f"{location}.layoutLevelId")
+            raise_unreadable("must be a string", f"{location}.layoutLevelId")
         level = check_name(level, f"{location}.layoutLevelId")
         for kind, items in self.items.items():
             for at, item in enumerate(self._list(row, f"{kind}s", location)):
@@ -153,7 +153,7 @@ class _Reader:
                     self.context.warn(f"{name!r} is not text; it is written as text", where=f"{spot}.{kind}Id")
                     name = str(name)
                 if not isinstance(name, str):
-                    raise_unreadable("needs a text id", f"{spot}.{kind}Id")
+                    raise_unreadable("needs a string as its id", f"{spot}.{kind}Id")
                 items.append(_Item(item, spot, check_name(name, f"{spot}.{kind}Id"), layout_id, at, level))
 
     def layers(self) -> Layers:

@@ -102,11 +102,11 @@ def _vehicles(item: dict[str, Any], end: str, main: str, location: str) -> Itera
             continue
         theta = one.get("theta")
         if theta is not None and not is_number(theta):
-            yield error_finding(f"must be a number, not {shown(theta)}", main, where=f"{item_location}.theta")
+            yield error_finding(f"must be a number, got {shown(theta)}", main, where=f"{item_location}.theta")
         elif theta is not None and abs(theta) > math.pi + 1e-6:
             yield warning_finding(
-                f"must be an angle in radians from -π to π, not {theta:g}", main, where=f"{item_location}.theta"
+                f"must be an angle in radians from -π to π, got {theta:g}", main, where=f"{item_location}.theta"
             )
         if one.get("orientationType") not in (None, *ORIENTATIONS):
-            reason = f"must be one of {', '.join(ORIENTATIONS)}, not {shown(one['orientationType'])}"
+            reason = f"must be one of {', '.join(ORIENTATIONS)}, got {shown(one['orientationType'])}"
             yield error_finding(reason, main, where=f"{item_location}.orientationType")

@@ -326,7 +326,9 @@ class _Writer:
                 context.fill(f"edges: {key}", getattr(self.options, option), reason, option)
         if self.filled["layouts"]:
             context.fill("layouts", f"{self.filled['layouts']}, one per level", "no source has a layout of the level")
-            context.fill("layouts: layoutVersion", self.options.layout_version, "no source has it", "layout_version")
+            context.fill(
+                "layouts: layoutVersion", self.options.layout_version, "no source specifies it", "layout_version"
+            )
         if self.filled["stations"]:
             context.fill("stations: interactionNodeIds", [], f"{self.filled['stations']} stations have no nodes")
         for noun, n in sorted(self.lost.items()):

@@ -37,7 +37,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     rows = top.get("features") if isinstance(top, dict) else None
     if not isinstance(top, dict) or not isinstance(rows, list):
         raise UnreadableFile(
-            "a route graph must be an object with an array of features", [Problem("no array", where="features")]
+            "a route graph must be an object with an array of features", [Problem("missing array", where="features")]
         )
     if len(rows) > context.limits.features:
         raise TooLarge(f"the file has {len(rows)} features; the limit is {context.limits.features}")
@@ -99,8 +99,8 @@ class _Reader:
             properties.append(p)
         if self.is_complete["integers"]:
             self.context.warn(
-                f"{self.is_complete['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, at "
-                "which Nav2 throws; they are exported as floats"
+                f"{self.is_complete['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, "
+                "which Nav2 rejects; they are exported as floats"
             )
         document: dict[str, Any] = {"members": {w: v for w, v in self.top.items() if w not in ("type", "features")}}
         credit = [self.top[w] for w in ("attribution", "license", "copyright") if isinstance(self.top.get(w), str)]

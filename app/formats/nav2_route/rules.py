@@ -53,7 +53,7 @@ def check(files: Files) -> Iterator[Problem]:
             yield error_finding("has no properties", main, where=location)
             continue
         if not _is_id(properties.get("id")):
-            reason = f"must be an integer from 0 to {MAX_ID}, is {shown(properties.get('id'))}"
+            reason = f"must be an integer from 0 to {MAX_ID}, got {shown(properties.get('id'))}"
             yield error_finding(reason, main, where=f"{location}.properties.id")
             continue
         if kind == "Point":
@@ -83,14 +83,14 @@ def _types(properties: Mapping[str, Any], main: str, location: str, *, is_node: 
     """Check the types of a node's or edge's members against the loader."""
     if is_node:
         if not isinstance(properties.get("frame", ""), str):
-            reason = f"must be a string, is {shown(properties['frame'])}"
+            reason = f"must be a string, got {shown(properties['frame'])}"
             yield error_finding(reason, main, where=f"{location}.properties.frame")
         return
     if not is_number(properties.get("cost", 0.0)):
-        reason = f"must be a number, is {shown(properties['cost'])}"
+        reason = f"must be a number, got {shown(properties['cost'])}"
         yield error_finding(reason, main, where=f"{location}.properties.cost")
     if not isinstance(properties.get("overridable", True), bool):
-        reason = f"must be true or false, is {shown(properties['overridable'])}"
+        reason = f"must be true or false, got {shown(properties['overridable'])}"
         yield error_finding(reason, main, where=f"{location}.properties.overridable")
 
 
@@ -120,7 +120,7 @@ def _graph(nodes: list[int], edges: list[tuple[int, Any, Any]], main: str) -> It
 
 def _metadata(metadata: Any, main: str, location: str) -> Iterator[Problem]:
     if not isinstance(metadata, dict):
-        yield error_finding(f"must be an object, is {shown(metadata)}", main, where=location)
+        yield error_finding(f"must be an object, got {shown(metadata)}", main, where=location)
         return
     for key, value in metadata.items():
         inside = f"{location}.{key[:60]}"
@@ -131,7 +131,7 @@ def _metadata(metadata: Any, main: str, location: str) -> Iterator[Problem]:
                 "must be a number, string, boolean or list of these: the loader reads nothing else", main, where=inside
             )
         elif key in FLOATS and isinstance(value, int):
-            reason = f"is read as a float, at which the integer {shown(value)} throws: write it with a decimal point"
+            reason = f"Nav2 reads a float here and rejects the integer {shown(value)}: write it with a decimal point"
             yield error_finding(reason, main, where=inside)
 
 
@@ -144,7 +144,7 @@ def _operations(operations: Any, main: str, location: str) -> Iterator[Problem]:
         if not isinstance(one, dict) or not isinstance(one.get("type"), str):
             yield error_finding("an operation needs a type", main, where=inside)
         elif one.get("trigger") not in TRIGGERS:
-            reason = f"trigger must be one of {', '.join(TRIGGERS)}, is {shown(one.get('trigger'))}"
+            reason = f"trigger must be one of {', '.join(TRIGGERS)}, got {shown(one.get('trigger'))}"
             yield error_finding(reason, main, where=inside)
         elif "metadata" in one:
             yield from _metadata(one["metadata"], main, f"{inside}.metadata")

@@ -135,7 +135,7 @@ class _Writer:
         if not self.document:
             title = self.options.graph_name or self.context.title
             head = {"name": title, "crs": CRS}
-            self.context.fill("name", title, "not in any source", "graph_name")
+            self.context.fill("name", title, "no source specifies it", "graph_name")
             self.context.fill("crs", CRS["properties"], "QGIS displays metres with it; the route server ignores it")
         if self.context.attribution and not head.keys() & {"attribution", "license", "copyright"}:
             head["attribution"] = "; ".join(self.context.attribution)

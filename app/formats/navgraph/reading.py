@@ -48,7 +48,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     data = files[context.main or next(iter(files))]
     top = yaml.load(data, context.limits, tags=TAGS, typed=False)
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
-        raise UnreadableFile("not a navgraph: a list of nodes is missing", [Problem("no list", where="nodes")])
+        raise UnreadableFile("not a navgraph: a list of nodes is missing", [Problem("missing list", where="nodes")])
     nodes = [_ParsedNode(item, k, context) for k, item in enumerate(top["nodes"])]
     _fields.check(top, SHAPE, context)
     names = [node.name for node in nodes]

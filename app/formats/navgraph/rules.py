@@ -66,7 +66,7 @@ def check(files: Files) -> Iterator[Problem]:
             )
         at = node.get("pos")
         if not isinstance(at, list) or len(at) != 2 or any(cpp_number(v) is None for v in at):
-            yield error_finding(f"must be [x, y], is {shown(at)}", main, where=f"{location}.pos")
+            yield error_finding(f"must be [x, y], got {shown(at)}", main, where=f"{location}.pos")
         if "properties" in node:
             yield from _properties(node["properties"], main, f"{location}.properties")
     if repeats := duplicates(called):
@@ -83,7 +83,7 @@ def _split_tag(item: Any) -> tuple[str, Any]:
 
 def _properties(properties: Any, main: str, location: str) -> Iterator[Problem]:
     if not isinstance(properties, list):
-        yield error_finding(f"must be a list of properties, is {shown(properties)}", main, where=location)
+        yield error_finding(f"must be a list of properties, got {shown(properties)}", main, where=location)
         return
     for k, one in enumerate(properties):
         values = one.values() if isinstance(one, dict) else [one]

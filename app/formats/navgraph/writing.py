@@ -115,7 +115,7 @@ class _Writer:
         if not isinstance(top.get("graph-name"), str) or not top["graph-name"]:
             source_value = getattr(self.context.options, "graph_name", None)
             top["graph-name"] = source_value or self.context.title
-            self.context.fill("graph-name", top["graph-name"], "not in any source", "graph_name")
+            self.context.fill("graph-name", top["graph-name"], "no source specifies it", "graph_name")
         first = {key: top.pop(key) for key in ("graph-name", "root") if key in top}
         out = [yaml.mapping({key: value}, 0) for key, value in first.items()]
         if top:

@@ -138,13 +138,13 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         if key not in missing:
             parameters[key] = number = _number(document[key])
             if number is None or not low <= number <= high:
-                add_problem(key, f"{key} must be a number between {low:g} and {high:g}, not {_shown(document[key])}")
+                add_problem(key, f"{key} must be a number between {low:g} and {high:g}, got {_shown(document[key])}")
     if "origin" not in missing:
         origin = document["origin"]
         numbers = [_number(v) for v in origin] if isinstance(origin, list) else []
         if len(numbers) != 3 or any(v is None or abs(v) > MAX_METRES for v in numbers):
             add_problem(
-                "origin", f"origin must be three numbers [x, y, yaw] within ±{MAX_METRES:g}, not {_shown(origin)}"
+                "origin", f"origin must be three numbers [x, y, yaw] within ±{MAX_METRES:g}, got {_shown(origin)}"
             )
         parameters["origin"] = tuple(numbers)
     if "negate" not in missing:
@@ -153,12 +153,12 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         if isinstance(negate, bool) or number in (0.0, 1.0):
             parameters["negate"] = bool(negate if isinstance(negate, bool) else number)
         else:
-            add_problem("negate", f"negate must be 0, 1, true or false, not {_shown(negate)}")
+            add_problem("negate", f"negate must be 0, 1, true or false, got {_shown(negate)}")
     if parameters["mode"] not in MODES:
-        add_problem("mode", f"mode must be trinary, scale or raw, not {_shown(parameters['mode'])}")
+        add_problem("mode", f"mode must be trinary, scale or raw, got {_shown(parameters['mode'])}")
     image = document.get("image")
     if "image" not in missing and not (isinstance(image, str) and image):
-        add_problem("image", f"image must be the name of an image file, not {_shown(image)}")
+        add_problem("image", f"image must be the name of an image file, got {_shown(image)}")
     if problems:
         raise UnreadableFile("; ".join(f"{p.file}: {p.problem}" for p in problems), problems)
     picture = _picture_name(str(image), files, main, context)

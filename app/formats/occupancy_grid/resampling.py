@@ -87,5 +87,5 @@ def normalize(grid: OccupancyGrid) -> OccupancyGrid:
 def _check_count(count: int, location: str) -> None:
     maximum = Limits().pixels
     if count > maximum:
-        reason = f"the map would have {count} cells, the maximum is {maximum}: request a coarser resolution"
+        reason = f"the map would have {count} cells; the limit is {maximum}: request a coarser resolution"
         raise Invalid(reason, [Problem(reason, where=location)])

@@ -50,7 +50,7 @@ def check(files: Files) -> Iterator[Problem]:
         if members.get(key) is not None:
             number = cpp_number(members[key])
             if number is None or not math.isfinite(number):
-                yield error_finding(f"must be a finite number, not {shown(members[key])}", main, where=key)
+                yield error_finding(f"must be a finite number, got {shown(members[key])}", main, where=key)
                 continue
             thresholds[key] = number
             yield from _for_python(members[key], main, key)
@@ -59,10 +59,10 @@ def check(files: Files) -> Iterator[Problem]:
     yield from _origin(members.get("origin"), main)
     mode = members.get("mode", "trinary")
     if mode not in MODES:
-        yield error_finding(f"must be one of {', '.join(MODES)}, not {shown(mode)}", main, where="mode")
+        yield error_finding(f"must be one of {', '.join(MODES)}, got {shown(mode)}", main, where="mode")
     negate = _negate(members.get("negate"))
     if members.get("negate") is not None and negate is None:
-        yield error_finding(f"must be 0, 1, true or false, not {shown(members['negate'])}", main, where="negate")
+        yield error_finding(f"must be 0, 1, true or false, got {shown(members['negate'])}", main, where="negate")
     free, occupied = thresholds.get("free_thresh", 0.0), thresholds.get("occupied_thresh", 1.0)
     for key in ("free_thresh", "occupied_thresh"):
         if not 0.0 <= thresholds.get(key, 0.0) <= 1.0:
@@ -92,7 +92,7 @@ def _origin(origin: Any, main: str) -> Iterator[Problem]:
         return
     pose = [cpp_number(v) for v in origin] if isinstance(origin, list) else []
     if len(pose) != 3 or any(v is None or not math.isfinite(v) for v in pose):
-        yield error_finding(f"must be three finite numbers [x, y, yaw], not {shown(origin)}", main, where="origin")
+        yield error_finding(f"must be three finite numbers [x, y, yaw], got {shown(origin)}", main, where="origin")
         return
     for text in origin:
         yield from _for_python(text, main, "origin")
@@ -108,7 +108,7 @@ def _picture(
 ) -> Iterator[Problem]:
     image = members["image"]
     if not isinstance(image, str) or not image:
-        yield error_finding(f"must be the name of an image file, not {shown(image)}", main, where="image")
+        yield error_finding(f"must be the name of an image file, got {shown(image)}", main, where="image")
         return
     if image.startswith("/"):
         reason = "absolute path: each robot needs the image there. Use a file name next to the YAML file"

@@ -160,16 +160,16 @@ def _header_from_ids(
         context.warn("the id 1 is obsolete; it is read as OcTree", line=line, where="id")
         name = OCTREE
     if kind == "ot" and name not in FULL_TYPES:
-        reason = f"unsupported .ot type {name[:80]!r}, must be one of {', '.join(FULL_TYPES)}: save it as .bt"
+        reason = f"unsupported .ot type {name[:80]!r}: must be one of {', '.join(FULL_TYPES)}: save it as .bt"
         raise _unreadable_error(reason, line, "id")
     if not re.fullmatch(r"\w{1,80}", name, re.ASCII):
-        raise _unreadable_error(f"the tree's type must be a word, not {name[:80]!r}", line, "id")
+        raise _unreadable_error(f"the tree's type must be a word, got {name[:80]!r}", line, "id")
     size, line = entries["size"]
     if not re.fullmatch(r"\d{1,12}", size, re.ASCII):
-        raise _unreadable_error(f"size must be the number of nodes, not {size[:40]!r}", line, "size")
+        raise _unreadable_error(f"size must be the number of nodes, got {size[:40]!r}", line, "size")
     resolution, line = entries["res"]
     if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", resolution, re.ASCII):
-        raise _unreadable_error(f"res must be a number of metres, not {resolution[:40]!r}", line, "res")
+        raise _unreadable_error(f"res must be a number of metres, got {resolution[:40]!r}", line, "res")
     _check_resolution(float(resolution), line)
     is_default = comments == COMMENTS
     user_comments = () if is_default else tuple(c for c in comments if is_writable(c.replace("\t", " ")))
@@ -180,7 +180,7 @@ def _header_from_ids(
 
 def _check_resolution(resolution: float, line: int | None = None) -> None:
     if not 1e-6 <= resolution <= 1e4:
-        raise _unreadable_error(f"the resolution must be between 1e-6 and 1e4 metres, not {resolution!r}", line, "res")
+        raise _unreadable_error(f"the resolution must be between 1e-6 and 1e4 metres, got {resolution!r}", line, "res")
 
 
 def _legacy_header(data: bytes, context: ReadContext) -> _Header:
@@ -274,7 +274,7 @@ def _read_full(
     if body_size % record.itemsize:
         size = record.itemsize
         raise _unreadable_error(
-            f"the tree has {body_size} bytes: must be a multiple of {size}, the bytes of a node of {header.id}",
+            f"the tree has {body_size} bytes: must be a multiple of {size}, the size of a node of {header.id}",
             location="data",
         )
     nodes = np.frombuffer(data, record, body_size // record.itemsize, header.body)
@@ -368,7 +368,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     key = choose(sorted(layers.parts_of("voxels")), options)[0]
     voxels = layers.parts[key]
     if not isinstance(voxels, VoxelMap):
-        raise AssertionError(f"{key} is no voxel map")
+        raise AssertionError(f"{key} is not a voxel map")
     kind: Kind = options.kind or ("bt" if voxels.binary else "ot")
     if options.bbox is not None:
         before = len(voxels)

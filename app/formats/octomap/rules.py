@@ -53,11 +53,11 @@ def check(files: Files) -> Iterator[Problem]:
     if tree not in NODE_BYTES:
         yield error_finding(f"tree type {shown(tree)} is unknown to OctoMap", main, where="id")
     if size is None or not size.isdigit():
-        yield error_finding(f"must be the number of nodes, not {shown(size)}", main, where="size")
+        yield error_finding(f"must be the number of nodes, got {shown(size)}", main, where="size")
     try:
         yield from _resolution(float(res or "nan"), main)
     except ValueError:
-        yield error_finding(f"must be a number, not {shown(res)}", main, where="res")
+        yield error_finding(f"must be a number, got {shown(res)}", main, where="res")
     body = data[start.end() :]
     count = int(size) if size is not None and size.isdigit() else None
     if kind == BINARY:
@@ -72,7 +72,7 @@ def check(files: Files) -> Iterator[Problem]:
 
 def _resolution(value: float, main: str) -> Iterator[Problem]:
     if not math.isfinite(value) or value <= 0:
-        yield error_finding(f"must be a length above 0, not {value:g}", main, where="res")
+        yield error_finding(f"must be a length above 0, got {value:g}", main, where="res")
 
 
 def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:

@@ -40,7 +40,7 @@ def check(files: Files) -> Iterator[Problem]:
         yield error_finding(f"the root is <{root.tag}>, not <osm>", main, line=root.sourceline)
         return
     if root.get("version") != "0.6":
-        yield error_finding(f"must be 0.6, is {root.get('version')!r}", main, line=root.sourceline, where="version")
+        yield error_finding(f"must be 0.6, got {root.get('version')!r}", main, line=root.sourceline, where="version")
     elements = _ElementScan()
     try:
         elements.read_element(root)

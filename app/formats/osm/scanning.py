@@ -114,7 +114,7 @@ def _count_elements(data: bytes, limits: Limits) -> dict[bytes, int] | None:
     if len(opened) and int(np.diff(opened, append=len(data)).max()) > limits.xml_attribute_bytes:
         return None
     if len(opened) > 8 * limits.features:
-        raise TooLarge(f"the file has {len(opened)} elements, more than a limit of {limits.features} features allows")
+        raise TooLarge(f"the file has {len(opened)} elements, too many for the limit of {limits.features} features")
     codes = np.bincount(buffer[opened + 1].astype(np.int32) * 256 + buffer[opened + 2], minlength=65536)
     if (
         not {int(c) for c in np.flatnonzero(codes)} <= _TAG_STARTS

@@ -120,7 +120,7 @@ class _StrictParser:
             elif child.tag == "member" and element.tag == "relation":
                 kind = child_attributes.get("type", "")
                 if kind not in ("node", "way", "relation"):
-                    _raise_unreadable(f"a member's type must be node, way or relation, not {kind!r}", child)
+                    _raise_unreadable(f"a member's type must be node, way or relation, got {kind!r}", child)
                 members.append(
                     (kind, _integer(child_attributes.get("ref"), child, "ref"), child_attributes.get("role", ""))
                 )
@@ -199,13 +199,13 @@ def _raise_unreadable(reason: str, element: etree._Element) -> NoReturn:
 
 def _integer(text: str | None, element: etree._Element, name: str) -> int:
     if text is None or not _INTEGER.fullmatch(text):
-        _raise_unreadable(f"<{element.tag}> needs an integer as its {name}, not {str(text)[:40]!r}", element)
+        _raise_unreadable(f"<{element.tag}> needs an integer as its {name}, got {str(text)[:40]!r}", element)
     return int(text)
 
 
 def _degrees(text: str, element: etree._Element) -> float:
     if len(text) > 64 or not _DECIMAL.fullmatch(text):
-        _raise_unreadable(f"a node's position must be a finite number of degrees, not {text[:40]!r}", element)
+        _raise_unreadable(f"a node's position must be a finite number of degrees, got {text[:40]!r}", element)
     return float(text)
 
 

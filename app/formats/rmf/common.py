@@ -281,7 +281,9 @@ class Robots:
             context.fill(f"vertices: {ROBOT}", names if len(names) <= 20 else [*names[:20], "…"], why, "robot_name")
             context.fill(f"vertices: {ROBOT_TYPE}", self._options.robot_type, why, "robot_type")
         if self._unknown:
-            context.warn(f"unknown nodes: {', '.join(self._unknown[:5])}; they become no chargers", where="chargers")
+            context.warn(
+                f"unknown nodes: {', '.join(self._unknown[:5])}; they do not become chargers", where="chargers"
+            )
 
 
 def _vertex_parameters(p: Properties) -> dict[str, Any]:

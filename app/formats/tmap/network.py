@@ -189,8 +189,8 @@ def parse_number(value: Any, location: str) -> float:
         number = None
     if isinstance(number, bool) or not isinstance(number, (int, float)):
         raise UnreadableFile(
-            f"{location}: must be a number, not {value!r}",
-            [Problem(f"must be a number, not {value!r}", where=location)],
+            f"{location}: must be a number, got {value!r}",
+            [Problem(f"must be a number, got {value!r}", where=location)],
         )
     return float(number)
 

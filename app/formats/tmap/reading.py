@@ -174,7 +174,7 @@ def _name(raw_name: Any, k: int, context: ReadContext) -> str:
         not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
     ):
         reason = f"a name must have 1 to {MAX_NAME} characters and no control characters"
-        raise UnreadableFile(f"{location}: {reason}", [Problem(f"{reason}, not {name[:60]!r}", where=location)])
+        raise UnreadableFile(f"{location}: {reason}", [Problem(f"{reason}, got {name[:60]!r}", where=location)])
     return name
 
 

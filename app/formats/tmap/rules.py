@@ -56,7 +56,7 @@ def check(files: Files) -> Iterator[Problem]:
     data = files[main]
     if is_brief(data):
         if not _is_dated(data[:HEAD_BYTES]):
-            yield error_finding("must be a text like 2024-05-01_10-00-00", main, where="meta.last_updated")
+            yield error_finding("must be a string like 2024-05-01_10-00-00", main, where="meta.last_updated")
         return
     network = _regular(data)
     if network is None:
@@ -111,15 +111,15 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
         yield error_finding("the schema requires this key", main, where=key)
     for key in ("metric_map", "name", "pointset"):
         if top.get(key) is not None and not isinstance(top[key], str):
-            yield error_finding(f"must be a text, not {shown(top[key])}", main, where=key)
+            yield error_finding(f"must be a string, got {shown(top[key])}", main, where=key)
     time = top["meta"].get("last_updated") if isinstance(top.get("meta"), dict) else None
     if not isinstance(time, str) or not LAST_UPDATED.fullmatch(time):
-        reason = f"must be a text like 2024-05-01_10-00-00, not {shown(time)}"
+        reason = f"must be a string like 2024-05-01_10-00-00, got {shown(time)}"
         yield error_finding(reason, main, where="meta.last_updated")
     rows = top.get("nodes")
     if not isinstance(rows, list):
         if rows is not None:
-            yield error_finding(f"must be a list, not {shown(rows)}", main, where="nodes")
+            yield error_finding(f"must be a list, got {shown(rows)}", main, where="nodes")
         return
     for k, row in enumerate(rows):
         location = f"nodes[{k}]"
@@ -134,7 +134,7 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
             yield error_finding("a node needs a pose, which localisation reads", main, where=f"{location}.node.pose")
         for key in ("name", "parent_frame"):
             if node.get(key) is not None and not isinstance(node[key], str):
-                yield error_finding(f"must be a text, not {shown(node[key])}", main, where=f"{location}.node.{key}")
+                yield error_finding(f"must be a string, got {shown(node[key])}", main, where=f"{location}.node.{key}")
         name = str(node.get("name"))
         if isinstance(meta, dict) and meta.get("node") not in (None, node.get("name")):
             yield warning_finding(
@@ -143,7 +143,7 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
         nodes.append(name)
         listed = node.get("edges")
         if listed is not None and not isinstance(listed, list):
-            yield error_finding(f"must be a list, not {shown(listed)}", main, where=f"{location}.node.edges")
+            yield error_finding(f"must be a list, got {shown(listed)}", main, where=f"{location}.node.edges")
             continue
         for j, edge in enumerate(listed or ()):
             if absent := missing(edge, EDGE):

@@ -99,7 +99,7 @@ class _Writer:
         updated = meta.get("last_updated")
         if not (isinstance(updated, str) and LAST_UPDATED.match(updated)):
             meta["last_updated"] = EPOCH
-            self.context.fill("meta.last_updated", EPOCH, "no source has it in the form that the schema requires")
+            self.context.fill("meta.last_updated", EPOCH, "no source specifies it in the form that the schema requires")
             if updated is not None:
                 self.context.warn(
                     f"last_updated {updated!r} is not a time; {EPOCH} is written", where="meta.last_updated"
@@ -401,10 +401,10 @@ class _Writer:
         fill, filled, options = self.context.fill, self.filled, self.options
         if filled["edges"]:
             why = f"{filled['edges']} edges come from a format without it"
-            reason = f"{why}, if they have none"
+            reason = f"{why}; used for those without one"
             fill("edges: action", options.action, reason, "action")
             if isinstance(options, ListOptions):
-                fill("edges: top_vel", options.top_vel, f"{why}, if they have no speed limit", "top_vel")
+                fill("edges: top_vel", options.top_vel, f"{why}; used for those without a speed limit", "top_vel")
                 fill("edges: inflation_radius", options.inflation_radius, why, "inflation_radius")
                 fill("edges: map_2d", self.document["metric_map"], why)
             else:
@@ -412,11 +412,11 @@ class _Writer:
                 fill("edges: fail_policy", options.fail_policy, why, "fail_policy")
                 fill("edges: fluid_navigation", options.fluid_navigation, why, "fluid_navigation")
                 fill("edges: restrictions", options.restrictions, why, "restrictions")
-                fill("edges: config, goal", "the default ones", why)
+                fill("edges: config, goal", "the defaults", why)
             fill("edges: recovery_behaviours_config", options.recovery, why, "recovery")
         if filled["nodes"]:
             why = f"{filled['nodes']} nodes come from a format without it"
-            reason = f"{why}, if they have none"
+            reason = f"{why}; used for those without one"
             fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", reason, "verts_radius")
             fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, reason, "xy_goal_tolerance")
             fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")

@@ -105,7 +105,7 @@ def read_pgm(data: bytes) -> tuple[int, int, int, bytes]:
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_CELLS):
         raise ValueError(f"image size {width} × {height} must be from 1 to {MAX_SIDE} on each side")
     if not 0 < largest <= 255:
-        raise ValueError(f"the image has {largest + 1} grey values: the maximum is 256")
+        raise ValueError(f"the image has {largest + 1} grey values; the limit is 256")
     if kind == b"P5":
         pixels = data[start : start + width * height]
     else:

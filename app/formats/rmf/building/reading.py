@@ -81,7 +81,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise_unreadable("a building needs at least one level", "levels")
     system = top.get("coordinate_system", IMAGE)
     if system not in SYSTEMS:
-        raise_unreadable(f"must be one of {', '.join(SYSTEMS)}, not {str(system)[:80]!r}", "coordinate_system")
+        raise_unreadable(f"must be one of {', '.join(SYSTEMS)}, got {str(system)[:80]!r}", "coordinate_system")
     levels = {name: _level(name, k, one) for k, (name, one) in enumerate(raw_value.items())}
     if context.level != GROUND:
         context.warn(f"the file names its own levels; level={context.level} is ignored", where="levels")
@@ -184,7 +184,7 @@ def _node_ids(level: _Level, taken: set[str]) -> list[str]:
     for k, row in enumerate(level.rows):
         name = row[3] if len(row) > 3 else ""
         if isinstance(name, (list, dict)):
-            raise_unreadable("the name of a vertex must be a text", f"{level.location_of('vertices', k)}[3]")
+            raise_unreadable("the name of a vertex must be a string", f"{level.location_of('vertices', k)}[3]")
         names.append(common.short(plain_text(name)) or f"{common.short(level.name, 200)}/{k}")
     return unique_ids(names, taken)
 

@@ -57,7 +57,7 @@ def check(files: Files) -> Iterator[Problem]:
     system = top.get("coordinate_system", SYSTEMS[0])
     if system not in SYSTEMS:
         yield error_finding(
-            f"must be one of {', '.join(SYSTEMS)}, not {shown(system)}", main, where="coordinate_system"
+            f"must be one of {', '.join(SYSTEMS)}, got {shown(system)}", main, where="coordinate_system"
         )
     yield from _parameters(top.get("parameters"), main, "parameters")
     levels = top.get("levels")
@@ -85,12 +85,12 @@ def _parameters(parameters: Any, main: str, location: str) -> Iterator[Problem]:
     if not parameters:
         return
     if not isinstance(parameters, dict):
-        yield error_finding(f"must be a mapping, not {shown(parameters)}", main, where=location)
+        yield error_finding(f"must be a mapping, got {shown(parameters)}", main, where=location)
         return
     for key, value in parameters.items():
         item_location = f"{location}.{key}"
         if not isinstance(value, list) or len(value) != 2 or value[0] not in KINDS or isinstance(value[0], bool):
-            reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 boolean), not {shown(value)}"
+            reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 boolean), got {shown(value)}"
             yield error_finding(reason, main, where=item_location)
         elif not isinstance(value[1], KINDS[value[0]]) or (value[0] in (2, 3) and isinstance(value[1], bool)):
             yield error_finding(
@@ -107,7 +107,7 @@ def _level(level: dict[str, Any], main: str, location: str, files: Files, *, mea
         elif image and posixpath.normpath(posixpath.join(posixpath.dirname(main), image)) not in files:
             yield warning_finding(f"drawing file {shown(image)} not found", main, where=f"{location}.drawing.filename")
     if "elevation" in level and not is_number(level["elevation"]):
-        yield error_finding(f"must be a number, not {shown(level['elevation'])}", main, where=f"{location}.elevation")
+        yield error_finding(f"must be a number, got {shown(level['elevation'])}", main, where=f"{location}.elevation")
     vertices = level.get("vertices") or []
     if not isinstance(vertices, list):
         yield error_finding("must be a list", main, where=f"{location}.vertices")

@@ -507,7 +507,7 @@ class _Writer:
         if self.created_ids["lanes"]:
             why = f"{self.created_ids['lanes']} edges come from another format"
             self.context.fill("lanes: graph_idx", self.options.graph, why, "graph")
-            limited = f"{why}, if they have none"
+            limited = f"{why}; used for those without one"
             self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
             self.context.fill("lanes: orientation", LANE_TEMPLATE["orientation"][1], why)
         self.robots.report(self.context)

@@ -84,11 +84,11 @@ def _lane(row: Any, count: int, main: str, location: str) -> Iterator[Problem]:
         yield error_finding("a lane needs a mapping of options: write {} if there are none", main, where=location)
         return
     if options.get("orientation_constraint", CONSTRAINTS[0]) not in CONSTRAINTS:
-        reason = f"must be forward or backward, not {shown(options['orientation_constraint'])}"
+        reason = f"must be forward or backward, got {shown(options['orientation_constraint'])}"
         yield error_finding(reason, main, where=f"{location}.orientation_constraint")
     if not is_number(options.get("speed_limit", 0.0)):
         yield error_finding(
-            f"must be a number, not {shown(options['speed_limit'])}", main, where=f"{location}.speed_limit"
+            f"must be a number, got {shown(options['speed_limit'])}", main, where=f"{location}.speed_limit"
         )
 
 
@@ -96,7 +96,7 @@ def _things(top: dict[str, Any], main: str) -> Iterator[Problem]:
     for section, keys in (("doors", ("endpoints", "map")), ("lifts", ("position", "dims"))):
         items = top.get(section)
         if items is not None and not isinstance(items, dict):
-            yield error_finding(f"must be a mapping, not {shown(items)}", main, where=section)
+            yield error_finding(f"must be a mapping, got {shown(items)}", main, where=section)
             continue
         for name, one in (items or {}).items():
             if absent := missing(one, keys):

@@ -145,7 +145,7 @@ class _Writer:
             why = f"{self.new_lanes} edges come from another format"
             self.context.fill("lanes: graph", self.options.graph, why, "graph")
             if self.options.speed_limit:
-                limited = f"{why}, if they have none"
+                limited = f"{why}; used for those without one"
                 self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
         self.robots.report(self.context)
         for item, count in sorted(self.lost.items()):

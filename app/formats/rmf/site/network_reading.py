@@ -229,7 +229,7 @@ class NetworkReader:
         forward = mapping(element.get("forward"), f"{location}.forward")
         name, content = variant(element.get("reverse", "Same"), f"{location}.reverse")
         if name not in ("Same", "Disable", "Different"):
-            raise_unreadable(f"must be Same, Disable or Different, not {name[:40]!r}", f"{location}.reverse")
+            raise_unreadable(f"must be Same, Disable or Different, got {name[:40]!r}", f"{location}.reverse")
         back = forward if name == "Same" else mapping(content, f"{location}.reverse")
         forth_words, back_words = (motion_properties(motion, location) for motion in (forward, back))
         both = name != "Disable" and back_words == (common.reverse_orientation(forth_words[0]), forth_words[1])

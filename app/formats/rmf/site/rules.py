@@ -47,7 +47,7 @@ def check(files: Files) -> Iterator[Problem]:
         return
     version = top.get("format_version")
     if not isinstance(version, str) or not version.startswith("0.") or not version[2:].isdigit():
-        yield error_finding(f'must be "0.MINOR", not {shown(version)}', main, where="format_version")
+        yield error_finding(f'must be "0.MINOR", got {shown(version)}', main, where="format_version")
     properties = top.get("properties")
     if not isinstance(properties, dict) or not isinstance(properties.get("name"), str):
         yield error_finding("a site needs a name", main, where="properties.name")

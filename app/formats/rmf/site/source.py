@@ -98,7 +98,7 @@ class Source:
         version = self.top.get("format_version")
         match = _VERSION.fullmatch(version) if isinstance(version, str) else None
         if match is None:
-            raise_unreadable(f'must be a text "major.minor", is {str(version)[:40]!r}', "format_version")
+            raise_unreadable(f'must be a string "major.minor", got {str(version)[:40]!r}', "format_version")
         if int(match[1]) > 0:
             raise_unreadable(
                 f"version {version} is not supported, only 0.x: save the site with a release that writes 0.x",

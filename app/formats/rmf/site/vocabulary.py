@@ -152,7 +152,7 @@ def variant(value: Any, location: str) -> tuple[str, Any]:
     if isinstance(value, str):
         return value, None
     if not isinstance(value, dict) or len(value) != 1:
-        raise_unreadable('must be a variant: a text or {"Variant": content}', location)
+        raise_unreadable('must be a variant: a string or {"Variant": content}', location)
     return next(iter(value.items()))
 
 
@@ -171,7 +171,7 @@ def text(value: Any, where: str) -> str:
     if value is None:
         return ""
     if not isinstance(value, str):
-        raise_unreadable("must be a text", where)
+        raise_unreadable("must be a string", where)
     return value
 
 
@@ -179,7 +179,7 @@ def angle(value: Any, location: str) -> float:
     """Radians."""
     name, content = variant(value, location)
     if name not in ("deg", "rad"):
-        raise_unreadable(f"must be deg or rad, not {name[:40]!r}", location)
+        raise_unreadable(f"must be deg or rad, got {name[:40]!r}", location)
     amount = number(content, location)
     if abs(amount) > MAX_METRES:
         raise_unreadable(f"must be within ±{MAX_METRES:g}", location)
@@ -198,7 +198,7 @@ def pose(value: Any, location: str) -> list[float]:
             raise_unreadable("must be three angles", f"{location}.rot")
         return [*at, *(angle(v, f"{location}.rot[{k}]") for k, v in enumerate(content))]
     if name != "quat":
-        raise_unreadable(f"must be yaw, euler_xyz or quat, not {name[:40]!r}", f"{location}.rot")
+        raise_unreadable(f"must be yaw, euler_xyz or quat, got {name[:40]!r}", f"{location}.rot")
     x, y, z, w = vector(content, 4, f"{location}.rot")
     length = x * x + y * y + z * z + w * w
     if not 1e-12 < length < 1e12:
@@ -235,7 +235,7 @@ def place(anchor: Any, category: str, location: str) -> list[float]:
         members = mapping(content, location)
         return [*vector(members.get(category, members.get("General")), 2, location), 0.0]
     if name != "Pose3D":
-        raise_unreadable(f"must be Translate2D, CategorizedTranslate2D or Pose3D, not {name[:40]!r}", location)
+        raise_unreadable(f"must be Translate2D, CategorizedTranslate2D or Pose3D, got {name[:40]!r}", location)
     return pose(content, location)[:3]
 
 
@@ -278,7 +278,7 @@ def height(value: Any, location: str) -> float | None:
         return None
     name, content = variant(value, location)
     if name not in ("fixed", "level_height_ratio"):
-        raise_unreadable(f"must be fixed or level_height_ratio, not {name[:40]!r}", location)
+        raise_unreadable(f"must be fixed or level_height_ratio, got {name[:40]!r}", location)
     amount = number(content, location)
     return amount if name == "fixed" else None
 
@@ -397,7 +397,7 @@ def rectangle(properties: Mapping[str, Any], location: str) -> dict[str, Any]:
     """Return the parameters of a lift's cabin."""
     name, content = variant(properties.get("cabin"), f"{location}.cabin")
     if name != "Rect":
-        raise_unreadable(f"must be Rect, not {name[:40]!r}", f"{location}.cabin")
+        raise_unreadable(f"must be Rect, got {name[:40]!r}", f"{location}.cabin")
     return mapping(content, f"{location}.cabin")
 
 
@@ -487,7 +487,7 @@ def parse_graphs(choice: Any, numbers_by_id: Mapping[str, int], location: str) -
     """Return (first graph of an element, number of its graphs). numbers_by_id: graph numbers by id, ascending."""
     name, content = variant("All" if choice is None else choice, location)
     if name not in ("All", "Only", "AllExcept"):
-        raise_unreadable(f"must be All, Only or AllExcept, not {name[:40]!r}", location)
+        raise_unreadable(f"must be All, Only or AllExcept, got {name[:40]!r}", location)
     ids = set() if name == "All" else set(references(content, location)) & numbers_by_id.keys()
     if name == "Only":
         return min((numbers_by_id[i] for i in ids), default=0), len(ids)

@@ -154,7 +154,7 @@ class _Writer:
             why = f"{draft.created['lanes']} edges come from another format"
             draft.context.fill("lanes: graphs", draft.options.graph, why, "graph")
             draft.context.fill(
-                "lanes: speed_limit", draft.options.speed_limit, f"{why}, if they have none", "speed_limit"
+                "lanes: speed_limit", draft.options.speed_limit, f"{why}; used for those without one", "speed_limit"
             )
         draft.robots.report(draft.context)
         if draft.created["lifts"]:
