@@ -318,7 +318,7 @@ def test_entries_carry_parameters(api: Api, house: str) -> None:
         ("formats=occupancy_grid&optional=occupancy_grid%3Flevel=L2", "duplicate format"),
         ("formats=occupancy_grid%3Fcolour=red", "colour"),
         ("formats=occupancy_grid%3Flevel=a%26level=b", "duplicate parameter"),
-        ("formats=occupancy_grid&optional=nothing", "no format"),
+        ("formats=occupancy_grid&optional=nothing", "unknown format"),
         ("formats=&optional=occupancy_grid", "list 1 to"),
         ("formats=occupancy_grid%3Flevel=L9", "occupancy_grid: "),
     ],

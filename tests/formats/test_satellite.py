@@ -621,7 +621,7 @@ def test_image_is_selected_by_name_and_level() -> None:
     keys = [PartKey("imagery", name="a"), PartKey("imagery", name="b")]
     with pytest.raises(MissingLayer, match="GeoTIFF"):
         fmt.selection.choose([], WriteOptions())
-    with pytest.raises(Ambiguous, match="picture=…: a, b"):
+    with pytest.raises(Ambiguous, match=r"\(a, b\): name one with picture=…"):
         fmt.selection.choose(keys, WriteOptions())
     assert fmt.selection.choose(keys, WriteOptions(picture="b")) == keys[1:]
     usual = PartKey("imagery", name="satellite")
