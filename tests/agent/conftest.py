@@ -20,6 +20,7 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.agent.fake import Fake
 from tests.api import samples
 from tests.events.conftest import eventually, free_port
 
@@ -177,6 +178,15 @@ def whole(into: Path) -> dict[str, Any]:
     expected = {f"{f['format']}/{f['name']}" for f in manifest["files"]}
     assert files == expected | {"manifest.json", "manifest.sig", "environment.sh", "closures.json", "levels.json"}
     return manifest
+
+
+@pytest.fixture
+def fake(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Fake]:
+    """A test server of signed maps; version 1 has the files ``A`` of the test's module."""
+    server = Fake(tmp_path / "keys")
+    server.put(request.module.A)
+    yield server
+    server.close()
 
 
 Start = Callable[..., Robot]

@@ -9,7 +9,7 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,6 @@ from tests.agent.fake import PLACE, Fake, One, run, send
 from tests.events.conftest import eventually, free_port
 
 A, B = {"kml/map.kml": b"a" * 5000}, {"kml/map.kml": b"b" * 6000}
-
-
-@pytest.fixture
-def fake(tmp_path: Path) -> Iterator[Fake]:
-    server = Fake(tmp_path / "keys")
-    server.put(A)
-    yield server
-    server.close()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pathlib
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,6 @@ from tests.agent.fake import PLACE, Fake, One, run
 from tests.events.conftest import eventually
 
 A, B = {"kml/map.kml": b"a" * 5000}, {"kml/map.kml": b"b" * 6000}
-
-
-@pytest.fixture
-def fake(tmp_path: Path) -> Iterator[Fake]:
-    server = Fake(tmp_path / "keys")
-    server.put(A)
-    yield server
-    server.close()
 
 
 @pytest.fixture

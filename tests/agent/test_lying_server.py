@@ -8,7 +8,7 @@ import hashlib
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -30,14 +30,6 @@ A, B = {"kml/map.kml": b"a" * 50_000}, {"kml/map.kml": b"b" * 60_000}
 
 Robot = Callable[..., One]
 Attack = Callable[[Fake, Path], None]
-
-
-@pytest.fixture
-def fake(tmp_path: Path) -> Iterator[Fake]:
-    server = Fake(tmp_path / "keys")
-    server.put(A)
-    yield server
-    server.close()
 
 
 @pytest.fixture

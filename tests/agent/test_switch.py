@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,6 @@ from tests.events.conftest import eventually
 A, B, C = ({"kml/map.kml": letter * 5000} for letter in (b"a", b"b", b"c"))
 
 Robot = Callable[..., One]
-
-
-@pytest.fixture
-def fake(tmp_path: Path) -> Iterator[Fake]:
-    server = Fake(tmp_path / "keys")
-    server.put(A)
-    yield server
-    server.close()
 
 
 @pytest.fixture
