@@ -16,6 +16,9 @@ SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen 
 ROBOT := app/__init__.py app/errors.py app/event_types.py app/events/__init__.py app/events/credentials.py \
   app/events/messages.py app/model/__init__.py app/model/frame.py app/model/names.py app/signing.py app/agent app/cli
 
+# Sources of the web page. Installing builds it (app/web/build.py) with Node 20.19 or newer, which pip brings if there is none.
+PAGE := $(shell find app/web -path app/web/node_modules -prune -o -path app/web/dist -prune -o -type f -not -name openapi.json -not -name schema.d.ts -print)
+
 .PHONY: run test lint docs bench chaos fuzz figures install install-dev clean
 
 run: install
@@ -31,6 +34,8 @@ lint: install-dev
 	$(BIN)/mypy --python-version 3.10 --follow-imports silent $(ROBOT)
 	$(BIN)/vermin --target=3.10- --violations --no-tips --exclude compression --exclude compression.zstd $(ROBOT)
 	$(BIN)/lint-imports
+	$(BIN)/python -c 'import json; from app.main import create_app; from app.config import Settings; print(json.dumps(create_app(Settings()).openapi()))' > app/web/openapi.json
+	cd app/web && npm run --silent types >/dev/null && npm run --silent check
 	UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) lock --check --no-python-downloads
 
 # The documentation, into build/docs: warnings are errors, links and anchors are checked.
@@ -67,14 +72,14 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "this Python has no venv module (Debian: apt install python3-venv)"; exit 1; }
 	@test "$(UV)" = uv || $(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
 
-$(VENV)/.installed: pyproject.toml uv.lock | $(BIN)/python
-	@echo "installing the packages of uv.lock ..."
-	@$(SYNC) --no-dev
+$(VENV)/.installed: pyproject.toml uv.lock $(PAGE) | $(BIN)/python
+	@echo "installing the packages of uv.lock, and building the web page ..."
+	@$(SYNC) --no-dev --reinstall-package fleet-map-server
 	@touch $@
 
-$(VENV)/.installed-dev: pyproject.toml uv.lock | $(BIN)/python
-	@echo "installing the packages of uv.lock ..."
-	@$(SYNC)
+$(VENV)/.installed-dev: pyproject.toml uv.lock $(PAGE) | $(BIN)/python
+	@echo "installing the packages of uv.lock, and building the web page ..."
+	@$(SYNC) --reinstall-package fleet-map-server
 	@touch $@ $(VENV)/.installed
 
 clean:

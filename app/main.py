@@ -24,7 +24,7 @@ from starlette.exceptions import HTTPException
 
 from app import __version__, derive, logs
 from app import formats as every_format
-from app.api import events, health, maps, ros2, routers
+from app.api import events, health, maps, page, ros2, routers
 from app.api.http import openapi, problems
 from app.api.http.application import FleetMapApp
 from app.api.http.auth import Authenticator
@@ -91,7 +91,7 @@ def create_app(settings: Settings) -> FleetMapApp:
     app.add_middleware(Guard)
     maps.add_routes(app)
     openapi.add_pages(app)
-    for router in (*routers(), health.root_router):
+    for router in (*routers(), health.root_router, page.root_router):
         app.router.routes.extend(router.routes)  # include_router() would build each route a second time, 10 ms each
     return app
 

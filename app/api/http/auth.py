@@ -43,8 +43,8 @@ MAX_CACHED_TOKENS = 4096
 MAX_SOURCES = 10_000
 MAX_TOKEN = 512
 
-OPEN = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json"})
-"""Paths that need no token, besides all below /docs/ (files of the documentation page)."""
+OPEN = frozenset({"/", "/icon.svg", "/service-worker.js", "/healthz", "/readyz", "/docs", "/openapi.json"})
+"""Paths that need no token, besides all below /docs/ and /assets/ (files of the documentation and of the web page)."""
 
 PROVE = "prove"
 """Key in a request scope's ``state``: callback for the first valid token or link of a connection."""
@@ -116,7 +116,7 @@ ANONYMOUS_ADMIN = Principal("", "anonymous", "admin")
 
 def is_open(path: str) -> bool:
     """Test if a path needs no token."""
-    return path in OPEN or path.startswith("/docs/")
+    return path in OPEN or path.startswith(("/docs/", "/assets/"))
 
 
 def environment_in_path(path: str) -> str | None:

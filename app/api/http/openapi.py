@@ -10,7 +10,7 @@ import orjson
 from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
-from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, Response
 
 from app import formats, parameters
 from app.api.http.auth import is_open
@@ -110,10 +110,6 @@ def add_pages(app: FastAPI) -> None:
         data = resources.files(_PACKAGE).joinpath("static", name).read_bytes()
         return Response(data, headers={"cache-control": "public, max-age=86400"}, media_type=ASSETS[name])
 
-    async def front(_: Request) -> Response:
-        return RedirectResponse("/docs", 307)  # the server has no other page
-
-    app.router.add_route("/", front, methods=["GET"], include_in_schema=False)
     app.router.add_route("/openapi.json", schema, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs", docs, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs/{name}", asset, methods=["GET"], include_in_schema=False)

@@ -1,0 +1,108 @@
+"""The web page: its built files, and the headers that confine it."""
+
+from __future__ import annotations
+
+import hashlib
+import mimetypes
+from functools import cache
+from pathlib import Path
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from app.api.http.caching import none_match
+from app.errors import NotFound, Unavailable
+
+FOLDER = Path(__file__).resolve().parents[1] / "web" / "dist"
+
+POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' blob:",
+        "connect-src 'self'",
+        "worker-src 'self'",
+        "manifest-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+"""Content-Security-Policy: nothing from elsewhere, nothing inline, in no frame."""
+
+HEADERS = {
+    "content-security-policy": POLICY,
+    "cross-origin-opener-policy": "same-origin",
+    "permissions-policy": "camera=(), geolocation=(), microphone=()",
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+}
+FOREVER = "public, max-age=31536000, immutable"
+"""For files whose names contain their hash."""
+
+root_router = APIRouter()
+
+
+@root_router.get("/", include_in_schema=False)
+def front(request: Request) -> Response:
+    """Return the page."""
+    return _file(request, "index.html", "no-cache")
+
+
+@root_router.get("/icon.svg", include_in_schema=False)
+def icon(request: Request) -> Response:
+    """Return the page's icon."""
+    return _file(request, "icon.svg", "public, max-age=86400")
+
+
+@root_router.get("/service-worker.js", include_in_schema=False)
+def service_worker(request: Request) -> Response:
+    """Return the script that keeps the page and the last map readable while the server does not answer."""
+    return _file(request, "service-worker.js", "no-cache")
+
+
+@root_router.get("/assets/{name}", include_in_schema=False)
+def asset(request: Request, name: str) -> Response:
+    """Return a script or style sheet of the page."""
+    return _file(request, f"assets/{name}", FOREVER)
+
+
+def _file(request: Request, name: str, cache_control: str) -> Response:
+    """Return a built file, compressed if the client accepts that."""
+    if not (FOLDER / "index.html").is_file():
+        raise Unavailable(
+            "the web page is not built: run `make run`, or install a wheel; /docs describes the HTTP calls"
+        )
+    content = _read(name)
+    if content is None:
+        raise NotFound("no such file of the page: open /")
+    plain, packed, etag = content
+    headers = {**HEADERS, "cache-control": cache_control, "etag": etag, "vary": "accept-encoding"}
+    if none_match(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    body = plain
+    if packed is not None and "gzip" in request.headers.get("accept-encoding", ""):
+        body = packed
+        headers["content-encoding"] = "gzip"
+    return Response(body, headers=headers, media_type=mimetypes.guess_type(name)[0] or "application/octet-stream")
+
+
+@cache
+def _read(name: str) -> tuple[bytes, bytes | None, str] | None:
+    """Return a file's bytes, its gzip form if that is smaller, and its weak ETag; None if there is no such file."""
+    import gzip
+
+    path = FOLDER / name
+    if name not in _names() or not path.is_file():
+        return None
+    plain = path.read_bytes()
+    packed = gzip.compress(plain, 9, mtime=0)
+    etag = f'W/"{hashlib.sha256(plain).hexdigest()[:32]}"'
+    return plain, packed if len(packed) < len(plain) else None, etag
+
+
+@cache
+def _names() -> frozenset[str]:
+    """List the files of the build: nothing else is served, whatever the address."""
+    return frozenset(path.relative_to(FOLDER).as_posix() for path in FOLDER.rglob("*") if path.is_file())

@@ -1,0 +1,118 @@
+/** Typed calls of the server's API. The types come from its OpenAPI document (`npm run types`). */
+import { effect, signal } from "@preact/signals";
+import createClient from "openapi-fetch";
+import type { components, paths } from "./schema";
+
+export type Schemas = components["schemas"];
+export type Environment = Schemas["EnvironmentOut"];
+export type Version = Schemas["VersionOut"];
+export type LayerPart = Schemas["LayerOut"];
+export type Channel = Schemas["ChannelOut"];
+export type Robot = Schemas["RobotOut"];
+export type Problem = Schemas["ProblemOut"];
+export type Role = "viewer" | "robot" | "editor" | "admin";
+
+/** Whether the server answered the last request. */
+export const online = signal(true);
+
+/** Number of 401 responses: the session watches it. */
+export const unauthenticated = signal(0);
+
+const ASK_AGAIN = 3000;
+
+effect(() => {
+  if (online.value) return;
+  const timer = setInterval(() => {
+    fetch("/healthz", { cache: "no-store" }).then(
+      (response) => {
+        if (response.ok) online.value = true;
+      },
+      () => undefined,
+    );
+  }, ASK_AGAIN);
+  return () => clearInterval(timer);
+});
+
+export const api = createClient<paths>({ credentials: "same-origin", fetch: watchedFetch });
+
+/** A failed request: the server's problem, or that it did not answer. */
+export class ApiError extends Error {
+  constructor(readonly problem: Problem) {
+    super(problem.detail);
+    this.name = "ApiError";
+  }
+
+  get status(): number {
+    return this.problem.status;
+  }
+
+  /** Whether there was no answer: the request may be repeated later. */
+  get isOffline(): boolean {
+    return this.problem.status === 0;
+  }
+}
+
+/** Waits for a call and returns its body. Throws ApiError. */
+export async function ask<T>(call: Promise<{ data?: T; error?: unknown; response: Response }>): Promise<T> {
+  const { data, error, response } = await call;
+  if (error !== undefined || !response.ok) throw new ApiError(asProblem(error, response));
+  return data as T;
+}
+
+/** Fetches a path that OpenAPI gives no JSON type, such as a map. Throws ApiError. */
+export async function request(path: string, init: RequestInit = {}): Promise<Response> {
+  const response = await watchedFetch(new Request(path, { credentials: "same-origin", ...init }));
+  if (!response.ok) throw new ApiError(asProblem(await response.json().catch(() => undefined), response));
+  return response;
+}
+
+export async function requestJson<T>(path: string, init: RequestInit = {}): Promise<T> {
+  return (await request(path, init)).json() as Promise<T>;
+}
+
+/** Builds a path below the API; parts are quoted, empty values of the query left out. */
+export function apiPath(
+  parts: (string | number)[],
+  query: Record<string, string | number | boolean | null | undefined> = {},
+) {
+  const search = new URLSearchParams();
+  for (const [name, value] of Object.entries(query)) {
+    if (value !== null && value !== undefined && value !== "") search.set(name, String(value));
+  }
+  const text = search.toString();
+  return `/api/v1/${parts.map((part) => encodeURIComponent(part)).join("/")}${text ? `?${text}` : ""}`;
+}
+
+export function asApiError(error: unknown): ApiError {
+  if (error instanceof ApiError) return error;
+  const detail = error instanceof Error ? error.message : String(error);
+  return new ApiError({ type: "about:blank", title: "The page failed", status: -1, detail });
+}
+
+export function isAbort(error: unknown): boolean {
+  return error instanceof DOMException && error.name === "AbortError";
+}
+
+async function watchedFetch(input: Request): Promise<Response> {
+  let response: Response;
+  try {
+    response = await fetch(input);
+  } catch (error) {
+    if (isAbort(error)) throw error;
+    online.value = false;
+    throw new ApiError({
+      type: "urn:fleetmap:problem:offline",
+      title: "Offline",
+      status: 0,
+      detail: "the server does not answer: check the network; nothing is lost",
+    });
+  }
+  online.value = response.headers.get("fleetmap-offline") === null; // the service worker marks what it kept
+  if (response.status === 401) unauthenticated.value += 1;
+  return response;
+}
+
+function asProblem(body: unknown, response: Response): Problem {
+  if (typeof body === "object" && body !== null && "detail" in body) return body as Problem;
+  return { type: "about:blank", title: response.statusText, status: response.status, detail: response.statusText };
+}

@@ -1,0 +1,258 @@
+/** Features drawn by class: all lines of a class are one path, so that ten thousand cost as much as ten. */
+import { apply } from "ol/transform";
+import { type Box, boxOf, centreOf, type Feature, isArea, linesOf, nameOf, pointsOf } from "./features";
+import { PaintedLayer, type PaintedView } from "./painted";
+
+/** How a class of features is drawn. Sizes are in CSS pixels. */
+export interface Paint {
+  stroke?: string;
+  width?: number;
+  dash?: number[];
+  fill?: string;
+  /** Diameter of points. */
+  dot?: number;
+  /** Colour of points; default: that of lines. */
+  dotColour?: string;
+  /** Sign of points for those who cannot tell colours: drawn at any zoom. */
+  sign?: "plus" | "cross" | "triangle" | "square" | "ring";
+  arrows?: boolean;
+  labels?: boolean;
+  /** Coarsest resolution, in metres per pixel, at which points are drawn. Default: any. */
+  dotsBelow?: number;
+}
+
+export interface FeatureStyle {
+  /** Name of a feature's class; empty: not drawn. */
+  classOf: (feature: Feature) => string;
+  /** Classes in the order in which they are drawn. Called at each painting, so that a theme may change. */
+  paints: () => Record<string, Paint>;
+}
+
+interface Group {
+  features: Feature[];
+  lines: Path2D;
+  areas: Path2D;
+  dots: Path2D;
+  hasLines: boolean;
+  hasAreas: boolean;
+  hasDots: boolean;
+}
+
+const MAX_LABELS = 250;
+const ARROW = 5;
+const MIN_ARROW_EDGE = 22;
+const MAX_ARROWS = 3000;
+const FONT = "500 12px system-ui, sans-serif";
+
+export class FeatureLayer extends PaintedLayer {
+  private groups = new Map<string, Group>();
+  private features: readonly Feature[] = [];
+  /** Paths are float32: they are drawn from here, so that millimetres last. */
+  private anchor: [number, number] = [0, 0];
+  private hidden = new Set<string>();
+
+  constructor(
+    private readonly style: FeatureStyle,
+    zIndex: number,
+  ) {
+    super({ zIndex });
+  }
+
+  setFeatures(features: readonly Feature[]): void {
+    this.features = features;
+    this.build();
+  }
+
+  /** Leaves features out, because something else draws them (while they are dragged). */
+  hide(ids: Iterable<string>): void {
+    this.hidden = new Set(ids);
+    this.build();
+  }
+
+  private build(): void {
+    this.groups = new Map();
+    const first = this.features[0];
+    this.anchor = first ? centreOf(first.geometry) : [0, 0];
+    const [x0, y0] = this.anchor;
+    for (const feature of this.features) {
+      if (this.hidden.has(feature.id)) continue;
+      const name = this.style.classOf(feature);
+      if (!name) continue;
+      const group = this.groups.get(name) ?? newGroup();
+      this.groups.set(name, group);
+      group.features.push(feature);
+      const isFilled = isArea(feature.geometry);
+      for (const line of linesOf(feature.geometry)) {
+        const path = isFilled ? group.areas : group.lines;
+        if (isFilled) group.hasAreas = true;
+        else group.hasLines = true;
+        line.forEach(([x = 0, y = 0], index) => {
+          if (index) path.lineTo(x - x0, y - y0);
+          else path.moveTo(x - x0, y - y0);
+        });
+        if (isFilled) path.closePath();
+      }
+      for (const [x = 0, y = 0] of pointsOf(feature.geometry)) {
+        group.hasDots = true;
+        group.dots.moveTo(x - x0, y - y0);
+        group.dots.lineTo(x - x0 + 1e-3, y - y0); // a line of no length would not be drawn
+      }
+    }
+    this.repaint();
+  }
+
+  protected override paint(context: CanvasRenderingContext2D, view: PaintedView): void {
+    const pixel = view.resolution; // metres in a CSS pixel
+    const paints = this.style.paints();
+    const labels: [Feature, Paint][] = [];
+    context.lineJoin = "round";
+    for (const [name, paint] of Object.entries(paints)) {
+      const group = this.groups.get(name);
+      if (!group) continue;
+      this.toLocal(context, view);
+      context.setLineDash((paint.dash ?? []).map((length) => length * pixel));
+      context.lineCap = "butt";
+      context.lineWidth = (paint.width ?? 1) * pixel;
+      if (group.hasAreas && paint.fill) {
+        context.fillStyle = paint.fill;
+        context.fill(group.areas, "evenodd");
+      }
+      if (paint.stroke) {
+        context.strokeStyle = paint.stroke;
+        if (group.hasAreas) context.stroke(group.areas);
+        if (group.hasLines) context.stroke(group.lines);
+      }
+      context.setLineDash([]);
+      if (paint.arrows && group.hasLines) this.drawArrows(context, view, group, paint);
+      const near = !paint.dotsBelow || pixel < paint.dotsBelow;
+      if (group.hasDots && paint.dot && near) {
+        context.lineCap = "round";
+        context.lineWidth = paint.dot * pixel;
+        context.strokeStyle = paint.dotColour ?? paint.stroke ?? "#000";
+        context.stroke(group.dots);
+      }
+      if (paint.sign) this.drawSigns(context, view, group, paint);
+      if (paint.labels && near) for (const feature of group.features) labels.push([feature, paint]);
+    }
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    drawLabels(context, view, labels);
+  }
+
+  private toLocal(context: CanvasRenderingContext2D, view: PaintedView): void {
+    const [a = 1, b = 0, c = 0, d = 1] = view.transform;
+    const [x, y] = apply(view.transform, [...this.anchor]);
+    context.setTransform(a, b, c, d, x ?? 0, y ?? 0);
+  }
+
+  private drawArrows(context: CanvasRenderingContext2D, view: PaintedView, group: Group, paint: Paint): void {
+    const pixel = view.resolution;
+    const size = ARROW * pixel;
+    const [x0, y0] = this.anchor;
+    const path = new Path2D();
+    let count = 0;
+    for (const feature of group.features) {
+      if (count > MAX_ARROWS) break;
+      for (const line of linesOf(feature.geometry)) {
+        const end = line.at(-1);
+        const start = line.at(-2);
+        if (!end || !start) continue;
+        const [dx, dy] = [(end[0] ?? 0) - (start[0] ?? 0), (end[1] ?? 0) - (start[1] ?? 0)];
+        const length = Math.hypot(dx, dy);
+        const [x, y] = [(start[0] ?? 0) + dx / 2, (start[1] ?? 0) + dy / 2];
+        if (length < MIN_ARROW_EDGE * pixel || !isIn(view.extent, x, y)) continue;
+        const [ux, uy] = [(dx / length) * size, (dy / length) * size];
+        path.moveTo(x - x0 + ux, y - y0 + uy);
+        path.lineTo(x - x0 - ux - uy, y - y0 - uy + ux);
+        path.lineTo(x - x0 - ux + uy, y - y0 - uy - ux);
+        path.closePath();
+        count += 1;
+      }
+    }
+    context.fillStyle = paint.stroke ?? "#000";
+    context.fill(path);
+  }
+
+  private drawSigns(context: CanvasRenderingContext2D, view: PaintedView, group: Group, paint: Paint): void {
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    const size = 6 * view.ratio;
+    context.lineWidth = 2 * view.ratio;
+    context.strokeStyle = context.fillStyle = paint.dotColour ?? paint.stroke ?? "#000";
+    for (const feature of group.features) {
+      const centre = centreOf(feature.geometry);
+      if (!isIn(view.extent, ...centre)) continue;
+      const [x = 0, y = 0] = apply(view.transform, centre);
+      context.beginPath();
+      if (paint.sign === "plus") cross(context, x, y, size, 0);
+      else if (paint.sign === "cross") cross(context, x, y, size, Math.PI / 4);
+      else if (paint.sign === "triangle") polygon(context, x, y, size, 3);
+      else if (paint.sign === "square") polygon(context, x, y, size, 4);
+      else context.arc(x, y, size, 0, 2 * Math.PI);
+      context.stroke();
+    }
+  }
+}
+
+function newGroup(): Group {
+  return {
+    features: [],
+    lines: new Path2D(),
+    areas: new Path2D(),
+    dots: new Path2D(),
+    hasLines: false,
+    hasAreas: false,
+    hasDots: false,
+  };
+}
+
+function isIn(box: Box, x: number, y: number): boolean {
+  return x >= box[0] && x <= box[2] && y >= box[1] && y <= box[3];
+}
+
+function cross(context: CanvasRenderingContext2D, x: number, y: number, size: number, turn: number): void {
+  for (const angle of [turn, turn + Math.PI / 2]) {
+    const [dx, dy] = [Math.cos(angle) * size, Math.sin(angle) * size];
+    context.moveTo(x - dx, y - dy);
+    context.lineTo(x + dx, y + dy);
+  }
+}
+
+function polygon(context: CanvasRenderingContext2D, x: number, y: number, size: number, corners: number): void {
+  for (let index = 0; index < corners; index++) {
+    const angle = (2 * Math.PI * index) / corners - Math.PI / 2 + (corners === 4 ? Math.PI / 4 : 0);
+    const [px, py] = [x + Math.cos(angle) * size, y + Math.sin(angle) * size];
+    if (index) context.lineTo(px, py);
+    else context.moveTo(px, py);
+  }
+  context.closePath();
+}
+
+/** Writes names beside their features, where they do not cover each other. */
+function drawLabels(context: CanvasRenderingContext2D, view: PaintedView, labels: [Feature, Paint][]): void {
+  const visible = labels.filter(([feature]) => isIn(view.extent, ...centreOf(feature.geometry)));
+  if (visible.length > MAX_LABELS * 4) return;
+  const { ratio } = view;
+  const taken: Box[] = [];
+  context.scale(ratio, ratio);
+  context.font = FONT;
+  context.textBaseline = "middle";
+  context.lineWidth = 3;
+  const halo = getComputedStyle(document.documentElement).getPropertyValue("--map-halo") || "#fff";
+  const ink = getComputedStyle(document.documentElement).getPropertyValue("--map-ink") || "#000";
+  for (const [feature] of visible) {
+    if (taken.length >= MAX_LABELS) break;
+    const box = boxOf(feature.geometry);
+    const anchor = [(box[0] + box[2]) / 2, (box[1] + box[3]) / 2];
+    const [px = 0, py = 0] = apply(view.transform, anchor);
+    const text = nameOf(feature).slice(0, 40);
+    const [x, y] = [px / ratio + 7, py / ratio];
+    const place: Box = [x - 2, y - 8, x + context.measureText(text).width + 2, y + 8];
+    if (taken.some((other) => place[0] < other[2] && place[2] > other[0] && place[1] < other[3] && place[3] > other[1]))
+      continue;
+    taken.push(place);
+    context.strokeStyle = halo;
+    context.strokeText(text, x, y);
+    context.fillStyle = ink;
+    context.fillText(text, x, y);
+  }
+  context.setTransform(1, 0, 0, 1, 0, 0);
+}

@@ -1,0 +1,197 @@
+/** Features of the vector layers in local metres, and their index by place. */
+import RBush from "ol/structs/RBush";
+
+export type LayerName = "topology" | "objects" | "zones" | "location";
+export type Position = [number, number];
+
+export type Geometry =
+  | { type: "Point"; coordinates: number[] }
+  | { type: "MultiPoint" | "LineString"; coordinates: number[][] }
+  | { type: "MultiLineString" | "Polygon"; coordinates: number[][][] }
+  | { type: "MultiPolygon"; coordinates: number[][][][] }
+  | { type: "GeometryCollection"; geometries: Geometry[] };
+
+export interface Feature {
+  id: string;
+  layer: LayerName | "closures" | "robots" | "drawn";
+  level: string;
+  part: string;
+  geometry: Geometry;
+  properties: Record<string, unknown>;
+}
+
+/** A feature as the API sends it: `place` holds local metres (JSON-FG), or `geometry` does with `crs=local`. */
+export interface WireFeature {
+  id: string | number;
+  geometry: Geometry | null;
+  place?: Geometry | null;
+  properties: Record<string, unknown> | null;
+  level?: string;
+  part?: string;
+}
+
+export function fromWire(layer: Feature["layer"], wire: WireFeature): Feature | null {
+  const geometry = wire.place ?? wire.geometry;
+  if (!geometry) return null;
+  return {
+    id: String(wire.id),
+    layer,
+    level: wire.level ?? "ground",
+    part: wire.part ?? "",
+    geometry,
+    properties: wire.properties ?? {},
+  };
+}
+
+export type Box = [number, number, number, number];
+
+export const EMPTY_BOX: Box = [Infinity, Infinity, -Infinity, -Infinity];
+
+export function boxOf(geometry: Geometry, box: Box = [...EMPTY_BOX]): Box {
+  visitPositions(geometry, (x, y) => {
+    if (x < box[0]) box[0] = x;
+    if (y < box[1]) box[1] = y;
+    if (x > box[2]) box[2] = x;
+    if (y > box[3]) box[3] = y;
+  });
+  return box;
+}
+
+export function joinBoxes(boxes: Iterable<readonly number[]>): Box | null {
+  const out: Box = [...EMPTY_BOX];
+  for (const [a = Infinity, b = Infinity, c = -Infinity, d = -Infinity] of boxes) {
+    out[0] = Math.min(out[0], a);
+    out[1] = Math.min(out[1], b);
+    out[2] = Math.max(out[2], c);
+    out[3] = Math.max(out[3], d);
+  }
+  return Number.isFinite(out[0]) ? out : null;
+}
+
+export function centreOf(geometry: Geometry): Position {
+  const box = boxOf(geometry);
+  return [(box[0] + box[2]) / 2, (box[1] + box[3]) / 2];
+}
+
+export function visitPositions(geometry: Geometry, visit: (x: number, y: number) => void): void {
+  if (geometry.type === "GeometryCollection") {
+    for (const one of geometry.geometries) visitPositions(one, visit);
+    return;
+  }
+  const walk = (value: unknown): void => {
+    const list = value as number[] | unknown[];
+    if (typeof list[0] === "number") visit(list[0], list[1] as number);
+    else for (const one of list) walk(one);
+  };
+  if (geometry.coordinates.length) walk(geometry.coordinates);
+}
+
+/** Lines of a geometry, rings included; a polygon's are closed. */
+export function linesOf(geometry: Geometry): number[][][] {
+  switch (geometry.type) {
+    case "LineString":
+      return [geometry.coordinates];
+    case "MultiLineString":
+    case "Polygon":
+      return geometry.coordinates;
+    case "MultiPolygon":
+      return geometry.coordinates.flat();
+    case "GeometryCollection":
+      return geometry.geometries.flatMap(linesOf);
+    default:
+      return [];
+  }
+}
+
+export function pointsOf(geometry: Geometry): number[][] {
+  switch (geometry.type) {
+    case "Point":
+      return [geometry.coordinates];
+    case "MultiPoint":
+      return geometry.coordinates;
+    case "GeometryCollection":
+      return geometry.geometries.flatMap(pointsOf);
+    default:
+      return [];
+  }
+}
+
+export function isArea(geometry: Geometry): boolean {
+  return geometry.type === "Polygon" || geometry.type === "MultiPolygon";
+}
+
+export function nameOf(feature: Feature): string {
+  const name = feature.properties.name;
+  return typeof name === "string" && name ? name : feature.id;
+}
+
+/** Index of features by place. */
+export class FeatureIndex {
+  private readonly tree = new RBush<Feature>(12);
+  readonly byId = new Map<string, Feature>();
+
+  constructor(features: readonly Feature[]) {
+    const known = features.filter((feature) => Number.isFinite(boxOf(feature.geometry)[0]));
+    this.tree.load(
+      known.map((feature) => boxOf(feature.geometry)),
+      known,
+    );
+    for (const feature of features) this.byId.set(feature.id, feature);
+  }
+
+  inBox(box: Box): Feature[] {
+    return this.tree.getInExtent(box);
+  }
+
+  /** Returns the features within `reach` metres of a point, nearest first; points come before lines, areas last. */
+  near(point: Position, reach: number): Feature[] {
+    const [x, y] = point;
+    const out: { feature: Feature; rank: number }[] = [];
+    for (const feature of this.inBox([x - reach, y - reach, x + reach, y + reach])) {
+      const distance = distanceTo(feature.geometry, point);
+      if (distance > reach) continue;
+      const kind = isArea(feature.geometry) ? 2 : linesOf(feature.geometry).length ? 1 : 0;
+      out.push({ feature, rank: kind * 1e9 + (kind === 2 ? areaOf(feature.geometry) : distance) });
+    }
+    return out.sort((one, other) => one.rank - other.rank).map(({ feature }) => feature);
+  }
+}
+
+/** Distance in metres; 0 inside an area. */
+export function distanceTo(geometry: Geometry, point: Position): number {
+  if (isArea(geometry) && contains(geometry, point)) return 0;
+  let best = Infinity;
+  for (const [x = 0, y = 0] of pointsOf(geometry)) best = Math.min(best, Math.hypot(x - point[0], y - point[1]));
+  for (const line of linesOf(geometry)) {
+    for (let index = 1; index < line.length; index++) {
+      best = Math.min(best, nearestOnSegment(line[index - 1] as Position, line[index] as Position, point).distance);
+    }
+  }
+  return best;
+}
+
+export function nearestOnSegment(from: Position, to: Position, point: Position) {
+  const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
+  const squared = dx * dx + dy * dy;
+  const along = squared ? ((point[0] - from[0]) * dx + (point[1] - from[1]) * dy) / squared : 0;
+  const share = Math.max(0, Math.min(1, along));
+  const at: Position = [from[0] + share * dx, from[1] + share * dy];
+  return { at, share, distance: Math.hypot(at[0] - point[0], at[1] - point[1]) };
+}
+
+function contains(geometry: Geometry, [x, y]: Position): boolean {
+  let inside = false;
+  for (const ring of linesOf(geometry)) {
+    for (let index = 0, before = ring.length - 1; index < ring.length; before = index++) {
+      const [ax = 0, ay = 0] = ring[index] ?? [];
+      const [bx = 0, by = 0] = ring[before] ?? [];
+      if (ay > y !== by > y && x < ((bx - ax) * (y - ay)) / (by - ay) + ax) inside = !inside;
+    }
+  }
+  return inside;
+}
+
+function areaOf(geometry: Geometry): number {
+  const [a, b, c, d] = boxOf(geometry);
+  return (c - a) * (d - b);
+}

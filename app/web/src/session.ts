@@ -1,0 +1,62 @@
+/** The signed-in user. The token stays in an HttpOnly cookie that scripts cannot read. */
+import { effect, signal } from "@preact/signals";
+import { ApiError, type Role, request, requestJson, unauthenticated } from "./api/client";
+
+export interface Session {
+  name: string;
+  role: Role;
+  environments: string | null;
+  robot: string | null;
+  expires: string | null;
+}
+
+const ROLES: Role[] = ["viewer", "robot", "editor", "admin"];
+
+/** undefined: not yet asked; null: nobody is signed in. */
+export const session = signal<Session | null | undefined>(undefined);
+
+/** Whether a session ended while the page was in use: views stay as they are behind the sign-in dialog. */
+export const expired = signal(false);
+
+effect(() => {
+  if (unauthenticated.value > 0 && session.peek()) expired.value = true;
+});
+
+/** Reads the session at start, or takes the one-time code of the address, which is then removed from it. */
+export async function start(): Promise<void> {
+  const code = /^#sign-in=([\w-]+)$/.exec(location.hash)?.[1];
+  if (code) {
+    history.replaceState(null, "", location.pathname + location.search);
+    if (await signIn({ code }).catch(() => false)) return;
+  }
+  try {
+    session.value = await requestJson<Session>("/api/v1/session");
+  } catch (error) {
+    if (!(error instanceof ApiError)) throw error;
+    if (error.status === 401) session.value = null;
+    else throw error;
+  }
+}
+
+/** Throws ApiError if the server refuses the token or code. */
+export async function signIn(credentials: { token: string } | { code: string }): Promise<boolean> {
+  session.value = await requestJson<Session>("/api/v1/session", {
+    method: "POST",
+    headers: { "content-type": "application/json" },
+    body: JSON.stringify(credentials),
+  });
+  expired.value = false;
+  return true;
+}
+
+export async function signOut(): Promise<void> {
+  await request("/api/v1/session", { method: "DELETE" }).catch(() => undefined);
+  for (const name of await caches.keys().catch(() => [])) await caches.delete(name);
+  session.value = null;
+}
+
+/** Whether the user has at least this role. It decides what is shown; the server decides what is allowed. */
+export function can(role: Role): boolean {
+  const own = session.value?.role;
+  return own !== undefined && ROLES.indexOf(own) >= ROLES.indexOf(role) && (role !== "editor" || own !== "robot");
+}

@@ -1,0 +1,46 @@
+import { X } from "lucide-preact";
+import type { ComponentChildren } from "preact";
+import { useEffect, useId, useRef } from "preact/hooks";
+import { Button } from "./button";
+
+interface DialogProps {
+  open: boolean;
+  title: string;
+  onClose: () => void;
+  children: ComponentChildren;
+  /** Buttons at the end, the main one last. */
+  actions?: ComponentChildren;
+  wide?: boolean;
+}
+
+/** A modal dialog: the browser keeps the focus inside, and Escape closes it. */
+export function Dialog({ open, title, onClose, children, actions, wide }: DialogProps) {
+  const element = useRef<HTMLDialogElement>(null);
+  const id = useId();
+  useEffect(() => {
+    const dialog = element.current;
+    if (!dialog) return;
+    if (open && !dialog.open) dialog.showModal();
+    if (!open && dialog.open) dialog.close();
+  }, [open]);
+  return (
+    <dialog
+      ref={element}
+      class={wide ? "dialog wide" : "dialog"}
+      aria-labelledby={id}
+      onClose={onClose}
+      onCancel={onClose}
+    >
+      {open && (
+        <>
+          <header>
+            <h2 id={id}>{title}</h2>
+            <Button icon={X} label="Close" quiet onClick={onClose} />
+          </header>
+          <div class="dialog-body">{children}</div>
+          {actions && <footer>{actions}</footer>}
+        </>
+      )}
+    </dialog>
+  );
+}

@@ -1,0 +1,6 @@
+import { Empty } from "../../ui/states";
+import type { ViewProps } from "../registry";
+
+export default function View({ site }: ViewProps) {
+  return <Empty title={`checks of ${site.name}`} />;
+}

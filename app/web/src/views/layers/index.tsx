@@ -1,0 +1,258 @@
+/** What is on the map: layers on and off, opacity, legend, and the selected feature. */
+import { Crosshair, Eye, EyeOff } from "lucide-preact";
+import type { LayerPart } from "../../api/client";
+import { cssOf } from "../../map/palette";
+import { isHidden, isMask, rasterKey, toggleHidden } from "../../map/site-map";
+import { type PaletteName, palette, theme } from "../../theme";
+import { Button } from "../../ui/button";
+import { Empty } from "../../ui/states";
+import { count } from "../../ui/text";
+import type { ViewProps } from "../registry";
+import { FeatureCard } from "./feature-card";
+import { FeatureList } from "./feature-list";
+
+const NAMES: Record<string, string> = {
+  topology: "Network",
+  objects: "Objects",
+  zones: "Zones",
+  location: "Fence",
+  occupancy: "Occupancy",
+  imagery: "Picture",
+  voxels: "Voxels",
+};
+const ORDER = ["topology", "objects", "zones", "location", "occupancy", "voxels", "imagery"];
+
+interface Row {
+  key: string;
+  layer: string;
+  title: string;
+  detail: string;
+  information: string;
+  part: LayerPart;
+}
+
+export default function LayersView({ site, map }: ViewProps) {
+  const level = site.level.value;
+  const rows = rowsOf(site.parts.value.filter((part) => part.level === level && part.count > 0));
+  const partial = site.partial.value;
+  if (!site.loading.value && site.version.value && rows.length === 0) {
+    return (
+      <Empty title="This version has no map yet">
+        <p>Open Upload and drop files: a map.yaml with its image, OSM, KML, a building.yaml, a Gazebo world …</p>
+      </Empty>
+    );
+  }
+  return (
+    <div class="stack">
+      {map.selected.value && (
+        <FeatureCard key={map.selected.value.id} site={site} map={map} feature={map.selected.value} />
+      )}
+      <ul class="layer-list">
+        {rows.map((row) => (
+          <LayerRow key={row.key} row={row} map={map} />
+        ))}
+      </ul>
+      {partial.length > 0 && (
+        <p class="note" role="note">
+          Too many features to show at once: {partial.map((layer) => NAMES[layer]).join(", ")}{" "}
+          {partial.length > 1 ? "are" : "is"} loaded for the visible part of the map only. Zoom in to see all.
+        </p>
+      )}
+      {map.rasterProblems.value.map((text) => (
+        <p key={text} class="note" role="alert">
+          {text}
+        </p>
+      ))}
+      <Legend parts={rows.map(({ part }) => part)} />
+      <FeatureList site={site} map={map} />
+    </div>
+  );
+}
+
+function rowsOf(parts: LayerPart[]): Row[] {
+  const rows = new Map<string, Row>();
+  for (const part of parts) {
+    if (part.layer === "resources" || !ORDER.includes(part.layer)) continue;
+    const isRaster = ["occupancy", "imagery", "voxels"].includes(part.layer);
+    const key = isRaster ? rasterKey(part) : part.layer;
+    const before = rows.get(key);
+    const total = part.count + (before && !isRaster ? before.part.count : 0);
+    rows.set(key, {
+      key,
+      layer: part.layer,
+      title: isRaster ? `${NAMES[part.layer]} “${part.name}”` : (NAMES[part.layer] ?? part.layer),
+      detail: isRaster ? "" : count(total, "feature"),
+      information: before && before.information !== part.information ? "several sources" : part.information,
+      part: { ...part, count: total },
+    });
+  }
+  return [...rows.values()].sort(
+    (a, b) => ORDER.indexOf(a.layer) - ORDER.indexOf(b.layer) || a.key.localeCompare(b.key),
+  );
+}
+
+function LayerRow({ row, map }: { row: Row; map: ViewProps["map"] }) {
+  const hidden = isHidden(row.key);
+  const opacity = map.opacity.value[row.key] ?? 1;
+  return (
+    <li class={hidden ? "layer-row off" : "layer-row"}>
+      <Button
+        quiet
+        icon={hidden ? EyeOff : Eye}
+        label={`${hidden ? "Show" : "Hide"} ${row.title}`}
+        pressed={!hidden}
+        onClick={() => toggleHidden(row.key)}
+      />
+      <span class="grow">
+        {row.title}
+        <small>
+          <span class={`information ${row.information}`}>{row.information}</span>
+          {row.detail && ` · ${row.detail}`}
+        </small>
+      </span>
+      <input
+        type="range"
+        min="0.1"
+        max="1"
+        step="0.05"
+        value={opacity}
+        aria-label={`Opacity of ${row.title}`}
+        disabled={hidden}
+        onInput={(event) => {
+          map.opacity.value = { ...map.opacity.value, [row.key]: Number(event.currentTarget.value) };
+        }}
+      />
+      <Button
+        quiet
+        icon={Crosshair}
+        label={`Zoom to ${row.title}`}
+        onClick={() => {
+          const box = row.part.bounds.local;
+          if (box) map.fit(box as [number, number, number, number]);
+        }}
+      />
+      {row.layer === "voxels" && !hidden && <Slice map={map} part={row.part} />}
+    </li>
+  );
+}
+
+/** Heights of the voxels that are shown. */
+function Slice({ map }: { map: ViewProps["map"]; part: LayerPart }) {
+  const [low, high] = map.slice.value ?? [0, 2];
+  const set = (next: [number, number]) => {
+    if (next[0] < next[1]) map.slice.value = next;
+  };
+  return (
+    <fieldset class="slice">
+      <legend>Height, metres</legend>
+      <input
+        type="number"
+        step="0.1"
+        aria-label="From"
+        value={low}
+        onChange={(event) => set([Number(event.currentTarget.value), high])}
+      />
+      <span>to</span>
+      <input
+        type="number"
+        step="0.1"
+        aria-label="To"
+        value={high}
+        onChange={(event) => set([low, Number(event.currentTarget.value)])}
+      />
+      {map.slice.value && (
+        <Button
+          quiet
+          onClick={() => {
+            map.slice.value = null;
+          }}
+        >
+          All
+        </Button>
+      )}
+    </fieldset>
+  );
+}
+
+function Legend({ parts }: { parts: LayerPart[] }) {
+  const hasGrid = parts.some((part) => (part.layer === "occupancy" && !isMask(part)) || part.layer === "voxels");
+  const has = (layer: string) => parts.some((part) => part.layer === layer) && !isHidden(layer);
+  return (
+    <section class="legend" aria-label="Legend">
+      <h2>Legend</h2>
+      <ul>
+        {has("topology") && (
+          <>
+            <li>
+              <i class="key edge" /> two-way
+            </li>
+            <li>
+              <i class="key edge one-way" /> one-way
+            </li>
+            <li>
+              <i class="key node" /> node
+            </li>
+          </>
+        )}
+        {has("objects") && (
+          <li>
+            <i class="key object" /> object
+          </li>
+        )}
+        {has("zones") && (
+          <>
+            <li>
+              <i class="key keepout" /> keepout
+            </li>
+            <li>
+              <i class="key speed" /> speed
+            </li>
+          </>
+        )}
+        {has("location") && (
+          <li>
+            <i class="key fence" /> fence
+          </li>
+        )}
+        {hasGrid &&
+          (
+            [
+              [0, "free"],
+              [100, "occupied"],
+              [255, "unknown"],
+            ] as const
+          ).map(([value, name]) => (
+            <li key={name}>
+              <Swatch value={value} /> {name}
+            </li>
+          ))}
+      </ul>
+      {hasGrid && (
+        <label class="field inline">
+          <span>Grid colours</span>
+          <select
+            value={palette.value}
+            onChange={(event) => {
+              palette.value = event.currentTarget.value as PaletteName;
+            }}
+          >
+            <option value="plain">Plain</option>
+            <option value="contrast">For all colour vision</option>
+            <option value="costmap">Costmap (RViz)</option>
+          </select>
+        </label>
+      )}
+    </section>
+  );
+}
+
+function Swatch({ value }: { value: number }) {
+  return (
+    <i
+      class="key"
+      ref={(element) => {
+        if (element) element.style.background = cssOf(palette.value, theme.value, value);
+      }}
+    />
+  );
+}
