@@ -506,9 +506,3 @@ def test_settings_reach_the_pool(tmp_path: Path) -> None:
         answer = api.upload("farm", {"n.tmap2.yaml": samples.tmap2()}, expect=413)
         assert "5" in problem(answer)["detail"]
     assert API == "/api/v1"
-
-
-def test_root_redirects_to_the_documentation(api: Api) -> None:
-    answer = api.as_(None).http.get("/")
-    assert answer.status_code == 307
-    assert answer.headers["location"] == "/docs"

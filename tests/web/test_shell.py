@@ -1,0 +1,140 @@
+"""Frame of the page: sign-in, sites, the map of a site, offline, session's end."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility
+
+VIEWS = ("Layers", "History", "Upload", "Edit", "Coverage", "Fleet", "Checks")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def orchard(server: WebServer) -> str:
+    return server.make_site("orchard")
+
+
+def test_sign_in_by_token_stays_out_of_scripts_and_address(open_page: Open, server: WebServer) -> None:
+    page = open_page("/", token=None)
+    page.get_by_label("Token").fill("wrong-token-of-a-guess")
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("alert")).to_contain_text("unknown or expired", ignore_case=True)
+    page.get_by_label("Token").fill(server.token)
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("heading", name="Sites")).to_be_visible()
+    assert page.evaluate("document.cookie") == ""
+    assert server.token not in page.url
+    assert server.token not in page.evaluate("JSON.stringify([{...localStorage}, {...sessionStorage}])")
+
+
+def test_site_is_found_and_drawn(open_page: Open) -> None:
+    page = open_page("/")
+    page.get_by_label("Search").fill("orch")
+    page.get_by_role("link", name="Orchard").click()
+    expect(page.get_by_role("heading", name="Orchard")).to_be_visible()
+    expect(page.get_by_text("v1", exact=False).first).to_be_visible()
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+    assert distinct_colours(page) > 5
+
+
+def distinct_colours(page: Page) -> int:
+    """Count the colours on the painted layers of the map, when all have been drawn."""
+    page.wait_for_function("document.querySelectorAll('.painted-layer canvas').length >= 4")
+    page.wait_for_load_state("networkidle")
+    return int(
+        page.evaluate(
+            """() => { const seen = new Set();
+            for (const canvas of document.querySelectorAll('.painted-layer canvas')) {
+              const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+              const words = new Uint32Array(data.buffer);
+              for (let i = 0; i < words.length; i += 7) if (words[i]) seen.add(words[i]);
+            } return seen.size; }"""
+        )
+    )
+
+
+def test_map_is_selected_by_pointer_and_by_list_and_link(open_page: Open, server: WebServer) -> None:
+    page = open_page("/?site=orchard")
+    page.get_by_text("Features (").click()
+    page.get_by_placeholder("Search by name, id or kind").fill("Dock1")
+    page.get_by_role("button", name="Dock1", exact=False).first.click()
+    expect(page.get_by_role("article")).to_contain_text("Dock1")
+    assert "feature=Dock1" in page.url
+    again = open_page(page.url.removeprefix(server.address))
+    expect(again.get_by_role("article")).to_contain_text("Dock1")
+    page.get_by_role("button", name="Clear the selection").click()
+    expect(page.get_by_role("article")).to_have_count(0)
+
+
+@pytest.mark.parametrize(("role", "upload", "tokens"), [("viewer", 0, 0), ("editor", 1, 0), ("admin", 1, 1)])
+def test_role_decides_what_is_shown(open_page: Open, server: WebServer, role: str, upload: int, tokens: int) -> None:
+    page = open_page("/?site=orchard", token=server.make_token(role)["token"])
+    expect(page.get_by_role("link", name="Fleet")).to_be_visible()
+    expect(page.get_by_role("link", name="Upload", exact=True)).to_have_count(upload)
+    expect(page.get_by_role("button", name="Tokens")).to_have_count(tokens)
+
+
+def test_revoked_token_asks_to_sign_in_and_loses_nothing(open_page: Open, server: WebServer) -> None:
+    token = server.make_token("editor")
+    page = open_page("/?site=orchard", token=token["token"])
+    page.get_by_text("Features (").click()
+    page.get_by_placeholder("Search by name, id or kind").fill("Yard")
+    server.call("DELETE", f"tokens/{token['id']}", 204)
+    page.get_by_role("link", name="History").click()
+    page.get_by_role("link", name="Layers").click()
+    page.evaluate("fetch('/api/v1/session').then(() => 1)")
+    page.reload()
+    expect(page.get_by_label("Token")).to_be_visible()
+    page.get_by_label("Token").fill(server.token)
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("heading", name="Orchard")).to_be_visible()
+
+
+def test_last_map_stays_readable_offline(open_page: Open) -> None:
+    page = open_page("/?site=orchard")
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+    page.evaluate("navigator.serviceWorker.ready.then(() => 1)")
+    page.reload()  # now through the service worker, which keeps what it sees
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+    page.wait_for_load_state("networkidle")
+    page.context.set_offline(True)
+    page.reload()
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+    expect(page.get_by_text("Offline", exact=False)).to_be_visible()
+    page.context.set_offline(False)
+    expect(page.get_by_text("Offline", exact=False)).to_have_count(0)
+
+
+def test_markup_in_names_is_text(open_page: Open, server: WebServer) -> None:
+    text = "<img src=x onerror=alert(1)>\u202egnp"
+    server.call("POST", "environments", json={"name": "markup", "title": text})
+    feature = {
+        "type": "Feature",
+        "id": "n1",
+        "place": {"type": "Point", "coordinates": [1, 2]},
+        "geometry": None,
+        "properties": {"kind": "node", "name": text + "x" * 200, "note": "<script>alert(1)</script>"},
+    }
+    change = {"op": "put", "layer": "topology", "feature": feature}
+    server.call("POST", "environments/markup/edits", json={"message": text, "changes": [change]})
+    page = open_page("/?site=markup&feature=n1")
+    page.on("dialog", lambda dialog: pytest.fail(f"a script ran: {dialog.message}"))
+    expect(page.get_by_role("article")).to_contain_text("<script>alert(1)</script>")
+    expect(page.get_by_role("heading", level=1)).to_contain_text("<img src=x")
+    assert page.locator("#page img[src=x]").count() == 0
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESKTOP, TABLET, {"width": 360, "height": 740}], ids=["desktop", "tablet", "phone"])
+def test_accessible(open_page: Open, axe: str, theme: str, size: dict[str, int]) -> None:
+    page = open_page("/", size=size, color_scheme=theme)
+    expect(page.get_by_role("link", name="Orchard")).to_be_visible()
+    check_accessibility(page, axe)
+    page.goto("/?site=orchard")
+    for view in VIEWS:
+        page.get_by_role("link", name=view, exact=True).click()
+        expect(page.get_by_role("region", name=view)).to_be_visible()
+        expect(page.locator(".panel [aria-busy=true]")).to_have_count(0)
+        check_accessibility(page, axe)
+    assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
