@@ -52,6 +52,17 @@ def format_size(size: int) -> str:
     return str(size)
 
 
+def parse_networks(text: str) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
+    """Parse comma-separated addresses and CIDRs. Raises ValueError."""
+    out = []
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        try:
+            out.append(ipaddress.ip_network(part))
+        except ValueError as error:
+            raise ValueError(f"{error}: use networks such as 192.168.7.0/24, comma-separated") from None
+    return out
+
+
 class Settings(BaseSettings):
     """Settings of the server. Times are in seconds. Sizes (``…_bytes``) are in bytes, or a number with a unit."""
 
@@ -184,6 +195,13 @@ class Settings(BaseSettings):
         le=10_000,
         description="Number of invalid tokens per minute from one address after which further ones get 429. A valid "
         "token is always accepted.",
+    )
+
+    anonymous_networks: str = Field(
+        default="",
+        description="Networks whose clients may read everything without a token, as role `viewer`: addresses or CIDRs, "
+        "comma-separated (`192.168.7.0/24,fd00::/8`). Behind a proxy, the address is that in `X-Forwarded-For` if "
+        "`FORWARDED_ALLOW_IPS` trusts the proxy, else the proxy's own. Unset: none.",
     )
 
     zenoh_mode: Literal["router", "client", "off"] = Field(
@@ -391,6 +409,12 @@ class Settings(BaseSettings):
         sized = isinstance(value, str) and str(info.field_name).endswith("_bytes")
         return parse_size(value) if sized else value
 
+    @field_validator("anonymous_networks")
+    @classmethod
+    def _is_networks(cls, value: str) -> str:
+        parse_networks(value)
+        return value
+
     @field_validator("blob_url")
     @classmethod
     def _is_folder(cls, value: str | None) -> str | None:
@@ -476,6 +500,11 @@ class Settings(BaseSettings):
         """Limits of uploads and conversions."""
         names = [f.name for f in dataclasses.fields(Limits)]
         return Limits(**{name: getattr(self, f"max_{name}") for name in names})
+
+    @property
+    def anonymous_list(self) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
+        """Networks whose clients may read without a token."""
+        return parse_networks(self.anonymous_networks)
 
     @property
     def database(self) -> str:

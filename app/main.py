@@ -256,7 +256,13 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes, run_trial=run_trial
     )
     service.cache.on_damage = metrics.cache_damaged.inc
-    access = Authenticator(store.tokens.find, failures=settings.token_failures, insecure=settings.insecure_no_auth)
+    access = Authenticator(
+        store.tokens.find,
+        failures=settings.token_failures,
+        find_session=store.sessions.find,
+        anonymous=settings.anonymous_list,
+        insecure=settings.insecure_no_auth,
+    )
 
     keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
     with contextlib.suppress(OSError):  # create now: later the disk may be full
@@ -458,7 +464,7 @@ def _note_time(newest: datetime) -> datetime:
 
 
 async def _run_housekeeping(services: Services) -> None:
-    """Run periodic tasks: expiry of tokens and overlays, channel moves, rollouts, heartbeats, garbage collection."""
+    """Run periodic tasks: expiry of tokens, sessions and overlays, channel moves, rollouts, garbage collection."""
     beat = 0.0
     newest = datetime.now(UTC)
     collect = newest + COLLECT_EVERY
@@ -469,12 +475,14 @@ async def _run_housekeeping(services: Services) -> None:
             services.response_cache.flush_counters()
             newest = _note_time(newest)
             await run_in_threadpool(services.store.tokens.end_expired)
+            await run_in_threadpool(services.store.sessions.store_uses)
             await run_in_threadpool(services.store.channels.apply_due_moves, datetime.now(UTC))
             await run_in_threadpool(services.store.channels.advance_rollouts, datetime.now(UTC), next_step)
             await run_in_threadpool(services.store.overlays.end_due, datetime.now(UTC))
             if beat >= HEARTBEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(services.jobs.send_heartbeats)
+                await run_in_threadpool(services.store.sessions.sweep)
             if datetime.now(UTC) >= collect:
                 collect = datetime.now(UTC) + COLLECT_EVERY
                 await run_in_threadpool(services.store.garbage.collect, COLLECT_GRACE)

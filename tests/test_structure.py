@@ -49,6 +49,7 @@ VAGUE_NAMES = {
 """Participles and question words, which are not allowed as names."""
 
 PUBLIC_NAMES = {
+    "app/api/search.py:where": "a member of a hit, as clients see it",
     "app/api/http/schemas.py:where": "a member of problems, as clients see them",
     "app/errors.py:where": "the same member, and what sets it:",
     "app/formats/_rules.py:where": "",

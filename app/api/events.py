@@ -1,7 +1,7 @@
 """Events as resumable server-sent events, and replies to Zenoh queries.
 
 The ids of a stream are the ``sequence`` of one environment, or log positions if the stream has several. Streams at
-the same position share each read of the log. A stream ends soon after its token expires or is revoked.
+the same position share each read of the log. A stream ends soon after its token or session.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
 from app.api.environments import as_dict
-from app.api.http.auth import Authenticator, Principal, Viewer
+from app.api.http.auth import Authenticator, Credentials, Principal, Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import closure_mode, parse_position, parse_version_ref
 from app.api.http.problems import Throttled
@@ -39,7 +39,7 @@ COMMIT_POLL_SECONDS = 0.02
 POLL_SECONDS = 1.0
 KEEP_ALIVE_SECONDS = 15.0
 RECHECK_SECONDS = 5.0
-"""Seconds until a stream's token is checked again; a token revoked in this process ends its streams at once."""
+"""Seconds until a stream's token or session is checked again; what ends in this process ends its streams at once."""
 
 PAGE = 200
 MAX_ENVIRONMENTS = 100
@@ -66,7 +66,7 @@ class EventFeed:
     def __init__(self, services: Services) -> None:
         self._services = services
         self._poll_task: SingleFlight[tuple[str | None, int, int], list[StreamEvent]] = SingleFlight()
-        self._checks: SingleFlight[tuple[bytes | None, str | None, int], Principal] = SingleFlight()
+        self._checks: SingleFlight[tuple[Credentials, int], Principal] = SingleFlight()
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self.streams = 0
@@ -98,10 +98,10 @@ class EventFeed:
             out.append(StreamEvent(number, event.environment, _line(event, number)))
         return out
 
-    async def check(self, header: bytes | None, client: str | None) -> None:
-        """Check a token. Raises Unauthenticated, Throttled or Unavailable."""
-        key = (header, client, self._services.store.generation())
-        await self._checks.run(key, self._services.access.authenticate, header, client)
+    async def check(self, credentials: Credentials) -> Principal:
+        """Check a token or session. Raises Unauthenticated, Throttled or Unavailable."""
+        key = (credentials, self._services.store.generation())
+        return await self._checks.run(key, self._services.access.authenticate, credentials)
 
     def close(self) -> None:
         """End all streams, since the server stops; clients reconnect later."""
@@ -174,8 +174,7 @@ async def stream_events(
     if state.get("head"):
         return StreamingResponse(_empty_stream(), media_type="text/event-stream", headers=headers)
     state[ON_STOP] = feed.close
-    client = request.client.host if request.client else None
-    bearer = _StreamAuth(services.access, feed, principal, request.headers.get("authorization"), client)
+    bearer = _StreamAuth(services.access, feed, principal, Credentials.from_scope(request.scope))
     stream = _stream(feed, bearer, environment, start, follow=follow)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
@@ -211,14 +210,11 @@ async def _empty_stream() -> AsyncIterator[bytes]:
 
 
 class _StreamAuth:
-    """Check of a stream's token while the stream runs."""
+    """Check of a stream's token or session while the stream runs."""
 
-    def __init__(
-        self, access: Authenticator, feed: EventFeed, principal: Principal, header: str | None, client: str | None
-    ) -> None:
+    def __init__(self, access: Authenticator, feed: EventFeed, principal: Principal, credentials: Credentials) -> None:
         self.principal = principal
-        self._access, self._feed, self._client = access, feed, client
-        self._header = None if header is None else header.encode("latin-1")
+        self._access, self._feed, self._credentials = access, feed, credentials
         self._invalidated_at, self._checked = access.is_invalidated, time.monotonic()
 
     async def is_valid(self) -> bool:
@@ -231,8 +227,10 @@ class _StreamAuth:
         if forgotten == self._invalidated_at and now - self._checked < RECHECK_SECONDS:
             return True
         try:
-            await self._feed.check(self._header, self._client)
+            principal = await self._feed.check(self._credentials)
         except (Unauthenticated, Throttled):
+            return False
+        if principal.id != self.principal.id:  # the session has ended, and its client may only read anonymously
             return False
         self._invalidated_at, self._checked = forgotten, now
         return True

@@ -13,6 +13,7 @@ from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import ApiTime, RequestModel, problem_responses
+from app.api.session import sign_in_path
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
 from app.store.values import Token, rfc3339
@@ -63,6 +64,14 @@ class NewTokenOut(TokenOut):
     """New token with its secret, which is returned only once."""
 
     token: str
+
+
+class SignInCodeOut(BaseModel):
+    """One-time code to sign in a browser."""
+
+    code: str
+    path: str = Field(description="Address of the page that signs in with the code, without scheme and host.")
+    expires: datetime
 
 
 TokenPath = Annotated[str, Path(max_length=100, description="Id of the token.")]
@@ -150,6 +159,19 @@ def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Respon
     services.store.tokens.delete(id)
     services.access.invalidate()
     return Response(status_code=204)
+
+
+@router.post(
+    "/{id}/sign-in-code",
+    status_code=201,
+    responses=problem_responses(SignInCodeOut, 404, 409, ok=201, description="The code"),
+    summary="Create a sign-in code",
+)
+def create_sign_in_code(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Response:
+    """Create a code that signs in one browser with this token, without typing it. It is valid once, for 10 minutes."""
+    code, expires = services.store.sessions.make_sign_in_code(id)
+    out = {"code": code, "path": sign_in_path(code), "expires": rfc3339(expires)}
+    return json_response(out, 201, {"cache-control": "no-store"})
 
 
 def _is_full_admin(token: Token) -> bool:

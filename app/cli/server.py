@@ -43,7 +43,9 @@ START_SECONDS = 60.0
 
 PANELS: Mapping[str, str] = {
     **dict.fromkeys(("data", "database", "blob", "cache", "memory"), "Data"),
-    **dict.fromkeys(("host", "port", "tls", "admin", "insecure", "token", "header", "body"), "Network and access"),
+    **dict.fromkeys(
+        ("host", "port", "tls", "admin", "insecure", "token", "anonymous", "header", "body"), "Network and access"
+    ),
     "zenoh": "Events over Zenoh",
     "ros2": "Maps as ROS 2 topics",
     **dict.fromkeys(("imagery", "models"), "Satellite pictures and models"),
@@ -89,10 +91,11 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         main.check_bus(settings)
         _compile(settings.data_dir / "native")
         output.print_result(f"Fleet Map Server: {address} · documentation: {address}/docs")
-        sys.stdout.flush()
         if demo:
-            token = settings.admin_token.get_secret_value() if settings.admin_token else None
-            threading.Thread(target=_bring_demo, args=(address, token), daemon=True).start()
+            threading.Thread(target=_bring_demo, args=(address, settings), daemon=True).start()
+        else:
+            output.print_result(f"open {address}/")
+        sys.stdout.flush()
         _run(settings, listener)
     finally:
         gc.enable()
@@ -375,15 +378,17 @@ def _stop_with_parent(parent: Any) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _bring_demo(address: str, token: str | None) -> None:
-    """Wait until the server is ready, install the demo and print example commands."""
+def _bring_demo(address: str, settings: Settings) -> None:
+    """Wait until the server is ready, install the demo, print example commands and a link that signs in."""
     from app.cli import demo as orchard
     from app.cli.client import Client
 
+    token = settings.admin_token.get_secret_value() if settings.admin_token else None
     try:
         wait_ready(address)
         with Client(address, token) as client:
             result = orchard.install(client)
+        path = "/" if token is None or settings.insecure_no_auth else _sign_in_path(settings, token)
     except (FleetMapError, RequestFailed, OSError) as error:
         output.print_status(f"could not install the demo: {error}", style="yellow")
         return
@@ -393,7 +398,17 @@ def _bring_demo(address: str, token: str | None) -> None:
     output.print_result("try:")
     for line in orchard.curl_lines(address, token):
         output.print_result(f"  {line}")
+    output.print_result(f"open {address}{path}")
     sys.stdout.flush()
+
+
+def _sign_in_path(settings: Settings, token: str) -> str:
+    """Create a one-time code for a token; return the path of the page with it."""
+    from app.api.session import sign_in_path
+
+    with _store(settings) as store:
+        found_token = store.tokens.find(token)
+        return "/" if found_token is None else sign_in_path(store.sessions.make_sign_in_code(found_token.id)[0])
 
 
 def wait_ready(address: str, *, seconds: float = START_SECONDS) -> None:

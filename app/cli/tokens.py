@@ -55,6 +55,27 @@ def create(
     output.print_result(result["token"])
 
 
+@commands.command("link")
+def link(
+    identifier: Annotated[str, typer.Argument(metavar="ID", help="Id of the token, see `fleetmap token list`.")],
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Create a link that signs in one browser with a token, without typing it. It is valid once, for 10 minutes.
+
+    Example: `fleetmap token link 3f9a…`
+    """
+    with Client(server, token) as client:
+        result = client.post(quote_path("tokens", identifier, "sign-in-code"), {})
+        result = {**result, "url": f"{client.server}{result['path']}"}
+    if as_json:
+        output.show_json(result)
+        return
+    output.print_status(f"valid once, until {result['expires']}:")
+    output.print_result(result["url"])
+
+
 @commands.command("list")
 def show(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
     """List all tokens, without their secrets.

@@ -26,6 +26,8 @@ from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
 from app.store.robots import Robots
+from app.store.search import Search
+from app.store.sessions import Sessions
 from app.store.tokens import Tokens
 from app.store.verify import Progress, Verifier
 from app.store.versions import Versions
@@ -67,7 +69,9 @@ class Store:
         self.events = Outbox(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)
+        self.search = Search(database, self.chunks)
         self.tokens = Tokens(database)
+        self.sessions = Sessions(database, self.tokens)
         self.jobs = Jobs(database)
         self.audit = Audit(database)
         self.garbage = GarbageCollector(database, self.chunks, self.blobs)

@@ -315,6 +315,30 @@ token = Table(
     Column("ended", UtcDateTime, nullable=True),
 )
 
+
+def _token() -> Column[str]:
+    return Column("token_id", String(32), ForeignKey("token.id", ondelete="CASCADE"), nullable=False, index=True)
+
+
+session = Table(
+    "session",
+    metadata,
+    Column("hash", String(64), primary_key=True),
+    _token(),
+    Column("created", UtcDateTime, nullable=False),
+    Column("used", UtcDateTime, nullable=False, index=True),
+)
+"""Sessions of browsers, by the SHA-256 of their secret. used: time of the last use, stored at most once a minute."""
+
+sign_in_code = Table(
+    "sign_in_code",
+    metadata,
+    Column("hash", String(64), primary_key=True),
+    _token(),
+    Column("expires", UtcDateTime, nullable=False),
+)
+"""One-time codes that start a session, by their SHA-256."""
+
 job = Table(
     "job",
     metadata,

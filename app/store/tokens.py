@@ -109,14 +109,22 @@ class Tokens:
             row = connection.execute(select(tables.token).where(tables.token.c.hash == digest)).one_or_none()
         if row is None or not hmac.compare_digest(row.hash, digest):
             return None
+        return self.check_row(row)
+
+    def check_row(self, row: Row[Any], *, store_end: bool = True) -> Token | None:
+        """Convert a token's row; None if the token has ended. store_end: store that it was found expired."""
         token = _as_token(row)
         if token.ended is None and token.expires is not None and token.expires <= self._database.now():
-            try:
-                self.end_expired()
-            except Unavailable as error:  # rejected anyway, and stored the next time
-                log.warning("tokens: storing the end of an expired token failed (reason=%s)", error.detail)
+            if store_end:
+                self._store_end()
             return None
         return None if token.ended is not None else token
+
+    def _store_end(self) -> None:
+        try:
+            self.end_expired()
+        except Unavailable as error:  # rejected anyway, and stored the next time
+            log.warning("tokens: storing the end of an expired token failed (reason=%s)", error.detail)
 
     def end_expired(self) -> int:
         """Mark expired tokens as ended, and return how many: they stay so, even if the clock is set back."""

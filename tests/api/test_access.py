@@ -10,6 +10,7 @@ from app.api.http.auth import (
     FRESH_SECONDS,
     WINDOW_SECONDS,
     Authenticator,
+    Credentials,
     Principal,
     client_source,
     environment_in_path,
@@ -50,24 +51,24 @@ def test_token_is_looked_up_once_per_second() -> None:
     clock, book = Clock(), Book(good=token())
     access = Authenticator(book, failures=3, clock=clock)
     header = b"Bearer good"
-    assert access.cached_principal(header) is None
-    assert access.authenticate(header, "10.0.0.1").name == "somebody"
-    assert access.cached_principal(header) is not None
-    access.authenticate(header, "10.0.0.1")
+    assert access.cached_principal(Credentials(header)) is None
+    assert access.authenticate(Credentials(header, client="10.0.0.1")).name == "somebody"
+    assert access.cached_principal(Credentials(header)) is not None
+    access.authenticate(Credentials(header, client="10.0.0.1"))
     assert book.lookups == 1
     clock.time += FRESH_SECONDS + 0.01
-    assert access.cached_principal(header) is None
+    assert access.cached_principal(Credentials(header)) is None
     book.tokens.clear()
     with pytest.raises(Unauthenticated):
-        access.authenticate(header, "10.0.0.1")
+        access.authenticate(Credentials(header, client="10.0.0.1"))
 
 
 def test_revoked_token_is_refused_at_once() -> None:
     book = Book(good=token())
     access = Authenticator(book, failures=3, clock=Clock())
-    access.authenticate(b"Bearer good", None)
+    access.authenticate(Credentials(b"Bearer good", client=None))
     access.invalidate()
-    assert access.cached_principal(b"Bearer good") is None
+    assert access.cached_principal(Credentials(b"Bearer good")) is None
 
 
 @pytest.mark.parametrize(
@@ -76,50 +77,52 @@ def test_revoked_token_is_refused_at_once() -> None:
 def test_unusable_token_raises_unauthenticated_without_lookup(header: bytes | None) -> None:
     book = Book(good=token())
     with pytest.raises(Unauthenticated):
-        Authenticator(book, failures=3, clock=Clock()).authenticate(header, None)
+        Authenticator(book, failures=3, clock=Clock()).authenticate(Credentials(header))
     assert book.lookups == 0
 
 
 def test_scheme_is_case_insensitive() -> None:
-    assert Authenticator(Book(good=token()), failures=3).authenticate(b"bearer good", None).id == "t1"
+    assert Authenticator(Book(good=token()), failures=3).authenticate(Credentials(b"bearer good")).id == "t1"
 
 
 def test_expired_token_raises_unauthenticated() -> None:
     access = Authenticator(Book(old=token(expires=NOW - timedelta(seconds=1))), failures=3)
     with pytest.raises(Unauthenticated):
-        access.authenticate(b"Bearer old", None)
+        access.authenticate(Credentials(b"Bearer old", client=None))
 
 
 def test_wrong_tokens_throttle_only_their_source() -> None:
     clock, book = Clock(), Book(good=token())
     access = Authenticator(book, failures=3, clock=clock)
-    access.authenticate(b"Bearer good", "10.0.0.1")
+    access.authenticate(Credentials(b"Bearer good", client="10.0.0.1"))
     for _ in range(3):
         with pytest.raises(Unauthenticated):
-            access.authenticate(b"Bearer wrong", "10.0.0.1")
+            access.authenticate(Credentials(b"Bearer wrong", client="10.0.0.1"))
     with pytest.raises(Throttled, match="always accepted"):
-        access.authenticate(b"Bearer wrong", "10.0.0.1")
+        access.authenticate(Credentials(b"Bearer wrong", client="10.0.0.1"))
     with pytest.raises(Throttled):
         access.note_failure("::ffff:10.0.0.1")  # a wrong signature of a link
     with pytest.raises(Unauthenticated):
-        access.authenticate(None, "10.0.0.1")
+        access.authenticate(Credentials(None, client="10.0.0.1"))
     book.tokens["other"] = token("robot")
-    assert access.authenticate(b"Bearer other", "10.0.0.1").role == "robot", "robots behind one NAT share its address"
-    assert access.authenticate(b"Bearer good", "10.0.0.1"), "a cached token stays valid"
-    assert access.authenticate(b"Bearer good", "10.0.0.2")
+    assert access.authenticate(Credentials(b"Bearer other", client="10.0.0.1")).role == "robot", (
+        "robots behind one NAT share its address"
+    )
+    assert access.authenticate(Credentials(b"Bearer good", client="10.0.0.1")), "a cached token stays valid"
+    assert access.authenticate(Credentials(b"Bearer good", client="10.0.0.2"))
     with pytest.raises(Unauthenticated):
-        access.authenticate(b"Bearer wrong", "10.0.0.2")
+        access.authenticate(Credentials(b"Bearer wrong", client="10.0.0.2"))
     clock.time += WINDOW_SECONDS + 1
     with pytest.raises(Unauthenticated):
-        access.authenticate(b"Bearer wrong", "10.0.0.1")
+        access.authenticate(Credentials(b"Bearer wrong", client="10.0.0.1"))
 
 
 def test_missing_token_counts_as_no_failure() -> None:
     access = Authenticator(Book(good=token()), failures=1, clock=Clock())
     for _ in range(5):
         with pytest.raises(Unauthenticated):
-            access.authenticate(None, "10.0.0.1")
-    assert access.authenticate(b"Bearer good", "10.0.0.1")
+            access.authenticate(Credentials(None, client="10.0.0.1"))
+    assert access.authenticate(Credentials(b"Bearer good", client="10.0.0.1"))
 
 
 def test_client_source_groups_addresses() -> None:

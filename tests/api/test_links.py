@@ -19,6 +19,7 @@ import httpx
 import pytest
 
 from app import links
+from app.api.http.auth import Credentials
 from app.errors import ExpiredLink, InvalidLink
 from app.links import LinkSecrets
 from tests.api import samples
@@ -194,7 +195,7 @@ def test_link_needs_no_token(api: Api, farm: str) -> None:
 def test_short_address_can_be_signed(api: Api, farm: str) -> None:
     services = api.app.state.services
     environment = services.store.environments.get(farm)
-    creator = services.access.authenticate(f"Bearer {api.token}".encode(), None)
+    creator = services.access.authenticate(Credentials(f"Bearer {api.token}".encode()))
     for path in (f"/maps/{farm}/tmap2", f"/maps/{farm}/tmap2/network.tmap2.yaml"):
         grant = services.links.create(environment, path, {}, 60, creator)
         for _ in range(2):
@@ -364,7 +365,7 @@ def test_slow_map_by_link_returns_503_and_keeps_no_signature(tmp_path: Path) -> 
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()})
         services = api.app.state.services
-        creator = services.access.authenticate(f"Bearer {api.token}".encode(), None)
+        creator = services.access.authenticate(Credentials(f"Bearer {api.token}".encode()))
         path = "/api/v1/environments/farm/versions/1/maps/geojson"
         grant = services.links.create(services.store.environments.get("farm"), path, {"derive": "false"}, 600, creator)
         anonymous = api.as_(None)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from app.api import channels, maps
-from app.api.http.auth import Authenticator
+from app.api.http.auth import Authenticator, Credentials
 from app.api.http.single_flight import SingleFlight
 from app.errors import NotFound, Unavailable
 from app.store.channels import Channels
@@ -270,13 +270,13 @@ def test_token_revoked_during_lookup_is_not_cached() -> None:
 
     access = Authenticator(find, failures=10)
     with at_once(1) as start:
-        pending = start(access.authenticate, b"Bearer t", "1.2.3.4")
+        pending = start(access.authenticate, Credentials(b"Bearer t", client="1.2.3.4"))
         assert gate.reached.wait(20)
         store.clear()
         access.invalidate()
         gate.open.set()
         pending.result(20)  # it was valid when it was looked up
-    assert access.cached_principal(b"Bearer t") is None
+    assert access.cached_principal(Credentials(b"Bearer t")) is None
 
 
 # --- writers ---

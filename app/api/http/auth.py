@@ -1,7 +1,7 @@
-"""Authentication and authorization: bearer tokens, roles, environment name patterns, throttling of failures.
+"""Authentication and authorization: bearer tokens, sessions, roles, environment patterns, throttling of failures.
 
-Access is denied by default: the middleware requires a token for every path that is not listed as open, and access to
-the environment in the path. Each route declares the role that it requires.
+Access is denied by default: the middleware requires a token or session for every request that is not listed as open,
+and access to the environment in the path. Each route declares the role that it requires.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ import re
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Literal
+from ipaddress import IPv4Network, IPv6Network
+from typing import Annotated, Any, Literal, NamedTuple, Self
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Request
@@ -24,6 +25,7 @@ from starlette.types import Scope
 
 from app.api.http.problems import Throttled
 from app.errors import Denied, Unauthenticated
+from app.store.sessions import Session
 from app.store.values import Role, Token
 
 RequiredRole = Literal["viewer", "robot", "editor", "admin"]
@@ -46,6 +48,14 @@ MAX_TOKEN = 512
 OPEN = frozenset({"/", "/icon.svg", "/service-worker.js", "/healthz", "/readyz", "/docs", "/openapi.json"})
 """Paths that need no token, besides all below /docs/ and /assets/ (files of the documentation and of the web page)."""
 
+SESSION_PATH = "/api/v1/session"
+OPEN_CALLS = frozenset({("POST", SESSION_PATH), ("DELETE", SESSION_PATH)})
+"""Calls that need no token, because they start or end a session."""
+
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+SESSION_COOKIE = "fleetmap_session"
+_COOKIE = re.compile(rb"(?:^|;)[ \t]*" + SESSION_COOKIE.encode() + rb"=([A-Za-z0-9_-]{1,128})[ \t]*(?=;|$)")
+
 PROVE = "prove"
 """Key in a request scope's ``state``: callback for the first valid token or link of a connection."""
 
@@ -53,9 +63,39 @@ _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.DOTALL)
 
 
+class Credentials(NamedTuple):
+    """Credentials of a request, before they are checked. A session beside an Authorization header is ignored."""
+
+    authorization: bytes | None
+    session: bytes | None = None
+    client: str | None = None
+
+    @classmethod
+    def from_headers(cls, authorization: bytes | None, cookie: bytes | None, scope: Scope) -> Self:
+        """Create the credentials of a request with these headers."""
+        client = scope.get("client")
+        match = _COOKIE.search(cookie) if cookie is not None and authorization is None else None
+        return cls(authorization, match[1] if match else None, client[0] if client else None)
+
+    @classmethod
+    def from_scope(cls, scope: Scope) -> Self:
+        """Create the credentials of a request."""
+        headers = dict(scope["headers"])
+        return cls.from_headers(headers.get(b"authorization"), headers.get(b"cookie"), scope)
+
+    def digest(self) -> bytes:
+        """Return the key of the credentials in a cache."""
+        kind, secret = (b"t", self.authorization) if self.authorization is not None else (b"s", self.session)
+        return hashlib.sha256(kind + (secret or b"")).digest()
+
+
 @dataclass(frozen=True, slots=True)
 class Principal:
-    """Authenticated caller. environments: name pattern, None for all."""
+    """Authenticated caller.
+
+    environments: name pattern, None for all. expires: end of the token or link. session_ends: end of a session that is
+    not used until then; None without a session.
+    """
 
     id: str
     name: str
@@ -63,11 +103,12 @@ class Principal:
     environments: str | None = None
     robot: str | None = None
     expires: datetime | None = None
+    session_ends: datetime | None = None
 
     @classmethod
-    def from_token(cls, token: Token) -> Principal:
+    def from_token(cls, token: Token, session_ends: datetime | None = None) -> Principal:
         """Create the principal of a token."""
-        return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires)
+        return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires, session_ends)
 
     def has_expired(self) -> bool:
         """Test if the token or link has expired."""
@@ -114,9 +155,54 @@ ANONYMOUS_ADMIN = Principal("", "anonymous", "admin")
 """Principal of every request if access control is disabled."""
 
 
-def is_open(path: str) -> bool:
-    """Test if a path needs no token."""
-    return path in OPEN or path.startswith(("/docs/", "/assets/"))
+ANONYMOUS_VIEWER = Principal("anonymous", "anonymous", "viewer")
+"""Principal of readers without credentials from the networks that the operator allows."""
+
+
+def is_open(path: str, method: str = "GET") -> bool:
+    """Test if a request needs no token."""
+    return path in OPEN or path.startswith(("/docs/", "/assets/")) or (method, path) in OPEN_CALLS
+
+
+def check_same_origin(scope: Scope, *, required: bool) -> None:
+    """Raise Denied unless a request comes from a page of this server: its browser adds the session by itself.
+
+    The origin is that of the request: scheme and client as trusted proxies report them, and ``Host``.
+
+    Args:
+        required: refuse also a request without ``Origin``, unless ``Sec-Fetch-Site`` is ``same-origin``.
+    """
+    headers = dict(scope["headers"])
+    origin = headers.get(b"origin")
+    if origin is None:
+        if required and headers.get(b"sec-fetch-site") != b"same-origin":
+            raise Denied(
+                "a change with a session requires the header Origin of this server's own page: use that page, or send "
+                "'Authorization: Bearer <token>'"
+            )
+        return
+    expected = f"{scope.get('scheme', 'http')}://{headers.get(b'host', b'').decode('latin-1')}"
+    given = origin.decode("latin-1")
+    if _origin(given) is None or _origin(given) != _origin(expected):
+        raise Denied(
+            f"the request comes from a page of another site ({given[:80]!r}, not {expected[:80]!r}): use this server's "
+            "own page, send 'Authorization: Bearer <token>', or let the proxy pass Host and X-Forwarded-Proto"
+        )
+
+
+_PORTS = {"http": 80, "https": 443}
+
+
+def _origin(text: str) -> tuple[str, str, int] | None:
+    """Parse an origin as scheme, host and port; None if it is not one of a page (``null``)."""
+    try:
+        parts = urlsplit(text)
+        port = parts.port
+    except ValueError:
+        return None
+    if parts.scheme not in _PORTS or not parts.hostname or parts.path or parts.query or parts.fragment or "@" in text:
+        return None
+    return parts.scheme, parts.hostname, _PORTS[parts.scheme] if port is None else port
 
 
 def environment_in_path(path: str) -> str | None:
@@ -126,17 +212,28 @@ def environment_in_path(path: str) -> str | None:
 
 
 class Authenticator:
-    """Token check with a cache of FRESH_SECONDS. is_invalidated: number of revocations in this process."""
+    """Check of tokens and sessions with a cache of FRESH_SECONDS.
+
+    Args:
+        find: returns a token by its secret, None if it is unknown.
+        find_session: returns a session by its secret, None if it has ended.
+        anonymous: networks whose clients may read without credentials.
+
+    is_invalidated: number of revocations and ended sessions in this process.
+    """
 
     def __init__(
         self,
         find: Callable[[str], Token | None],
         *,
         failures: int,
+        find_session: Callable[[str], Session | None] = lambda _: None,
+        anonymous: Sequence[IPv4Network | IPv6Network] = (),
         insecure: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._find_token, self._failures, self._clock = find, failures, clock
+        self._find_token, self._find_session, self._failures, self._clock = find, find_session, failures, clock
+        self._anonymous = tuple(anonymous)
         self.insecure = insecure
         self._cache: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
         self._sources: OrderedDict[str, deque[float]] = OrderedDict()
@@ -161,43 +258,71 @@ class Authenticator:
                 "must not come from pages of other sites"
             )
 
-    def cached_principal(self, header: bytes | None) -> Principal | None:
-        """Return the cached principal of an Authorization header, or None. Never blocks."""
+    def cached_principal(self, credentials: Credentials) -> Principal | None:
+        """Return the cached principal of a request, or None. Never blocks."""
         if self.insecure:
             return ANONYMOUS_ADMIN
-        if header is None:
-            return None
-        entry = self._cache.get(hashlib.sha256(header).digest())
+        if credentials.authorization is None and credentials.session is None:
+            return self._anonymous_principal(credentials.client)
+        entry = self._cache.get(credentials.digest())
         return entry[0] if entry is not None and self._clock() < entry[1] else None
 
-    def authenticate(self, header: bytes | None, client: str | None) -> Principal:
-        """Authenticate an Authorization header. Reads the store, so call it from a thread.
+    def authenticate(self, credentials: Credentials) -> Principal:
+        """Authenticate a request. Reads the store, so call it from a thread.
 
         A valid token is accepted even from an address with too many failures, because many robots may share an
-        address.
+        address. An ended session is no failure, since open pages send it again, and it counts as none at all.
 
         Raises Unauthenticated; Throttled for a wrong token after too many failures from the client's address.
         """
-        cached = self.cached_principal(header)
+        cached = self.cached_principal(credentials)
         if cached is not None:
             return cached
-        if header is None:
-            raise Unauthenticated("missing token: send 'Authorization: Bearer <token>'")
         forgotten = self.is_invalidated
-        token = self._find_token(_token(header)) if _token(header) else None
-        principal = None if token is None else Principal.from_token(token)
-        if principal is None or principal.has_expired():
-            self.note_failure(client)
+        principal = self._find_principal(credentials)
+        if principal is None:
+            anonymous = self._anonymous_principal(credentials.client) if credentials.authorization is None else None
+            if anonymous is not None:
+                return anonymous
+            if credentials.session is not None:
+                raise Unauthenticated("the session has ended: sign in again")
+            if credentials.authorization is None:
+                raise Unauthenticated("missing token: send 'Authorization: Bearer <token>'")
+            self.note_failure(credentials.client)
             raise Unauthenticated("unknown or expired token: ask an administrator for a new one")
         with self._lock:
             if forgotten == self.is_invalidated:  # otherwise it may have been revoked during the lookup
-                self._cache[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
+                self._cache[credentials.digest()] = (principal, self._clock() + FRESH_SECONDS)
             while len(self._cache) > MAX_CACHED_TOKENS:
                 self._cache.popitem(last=False)
         return principal
 
+    def _find_principal(self, credentials: Credentials) -> Principal | None:
+        if credentials.authorization is not None:
+            secret = _token(credentials.authorization)
+            token = self._find_token(secret) if secret else None
+            principal = None if token is None else Principal.from_token(token)
+        elif credentials.session is not None:
+            session = self._find_session(credentials.session.decode("ascii"))
+            principal = None if session is None else Principal.from_token(session.token, session.ends)
+        else:
+            return None
+        return None if principal is None or principal.has_expired() else principal
+
+    def _anonymous_principal(self, client: str | None) -> Principal | None:
+        """Return the principal of clients without credentials, None if the address is not in an allowed network."""
+        if not self._anonymous:
+            return None
+        try:
+            address = ipaddress.ip_address(client or "")
+        except ValueError:
+            return None
+        if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
+            address = address.ipv4_mapped
+        return ANONYMOUS_VIEWER if any(address in network for network in self._anonymous) else None
+
     def invalidate(self) -> None:
-        """Clear the cache of tokens, because one was revoked."""
+        """Clear the cache of tokens and sessions, because one was revoked or has ended."""
         with self._lock:
             self.is_invalidated += 1
             self._cache.clear()

@@ -17,16 +17,31 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api.http import problems
-from app.api.http.auth import MAX_SOURCES, Principal, authorise, client_source, environment_in_path, is_open
+from app.api.http.auth import (
+    ANONYMOUS_VIEWER,
+    MAX_SOURCES,
+    OPEN_CALLS,
+    SAFE_METHODS,
+    Credentials,
+    Principal,
+    authorise,
+    check_same_origin,
+    client_source,
+    environment_in_path,
+    is_open,
+)
 from app.api.http.dependencies import Services
 from app.api.http.problems import SlowBody, UnsupportedMedia
 from app.api.http.signed import LINK, request_link
 from app.api.http.single_flight import SingleFlight
-from app.errors import FleetMapError, TooLarge
+from app.errors import FleetMapError, TooLarge, Unauthenticated
 from app.logs import REQUEST_ID, log_request
 from app.store.audit import CALLER, Caller
 
 log = logging.getLogger("app.requests")
+
+MAX_OPEN_BODY_BYTES = 4096
+"""Maximum size of a body that anyone may send: a sign-in, in bytes."""
 
 MULTIPART_OVERHEAD = 2**20
 """Maximum size of a multipart body beside its files: field values and the headers of parts, in bytes."""
@@ -58,7 +73,7 @@ class Guard:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._checks: SingleFlight[tuple[bytes | None, str | None, int], Principal] = SingleFlight()
+        self._checks: SingleFlight[tuple[Credentials, int], Principal] = SingleFlight()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle a request, or pass it on."""
@@ -103,11 +118,20 @@ class Guard:
     async def _pass(self, scope: Scope, body: _RequestBody, answer: _ResponseSender, services: Services) -> None:
         headers = _headers(scope)
         services.access.check_origin(scope["headers"])
-        if is_open(scope["path"]):
-            # Do not read the body: anyone can send one, and open routes take none.
+        if is_open(scope["path"], scope["method"]):
+            # Do not read the body: anyone can send one, and only the sign-in takes one.
+            if (scope["method"], scope["path"]) in OPEN_CALLS and body.check_headers(
+                scope, headers, MAX_OPEN_BODY_BYTES
+            ):
+                await body.preload()
             await self._app(scope, body, answer)
             return
-        principal = await self._principal(scope, headers, services)
+        principal = await self._principal(scope, services)
+        if scope["method"] not in SAFE_METHODS:
+            if principal is ANONYMOUS_VIEWER:
+                raise Unauthenticated("a change requires a token: sign in, or send 'Authorization: Bearer <token>'")
+            if principal.session_ends is not None:
+                check_same_origin(scope, required=True)
         environment = environment_in_path(scope["path"])
         authorise(scope, principal, environment)
         scope["state"]["principal"] = principal
@@ -116,18 +140,17 @@ class Guard:
             await body.preload()
         await self._app(scope, body, answer)
 
-    async def _principal(self, scope: Scope, headers: dict[bytes, bytes], services: Services) -> Principal:
-        """Authenticate by signed link, else by token. A token beside a link is ignored."""
-        client = scope["client"][0] if scope.get("client") else None
+    async def _principal(self, scope: Scope, services: Services) -> Principal:
+        """Authenticate by signed link, else by token or session. A token beside a link is ignored."""
+        credentials = Credentials.from_scope(scope)
         link = request_link(scope)
         if link is not None:
             scope["state"][LINK] = link
-            return await run_in_threadpool(services.links.check, link, client)
-        authorization = headers.get(b"authorization")
-        principal = services.access.cached_principal(authorization)
+            return await run_in_threadpool(services.links.check, link, credentials.client)
+        principal = services.access.cached_principal(credentials)
         if principal is None:
-            key = (authorization, client, services.response_cache.generation())
-            principal = await self._checks.run(key, services.access.authenticate, authorization, client)
+            key = (credentials, services.response_cache.generation())
+            principal = await self._checks.run(key, services.access.authenticate, credentials)
         return principal
 
     async def _reject(self, response: Response, scope: Scope, body: _RequestBody, answer: _ResponseSender) -> None:
@@ -266,8 +289,12 @@ class _RequestBody:
         self._loaded: Message | None = None
         self.content = "request body"
 
-    def check_headers(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
-        """Check the declared coding, media type and length; return whether to read the body at once."""
+    def check_headers(self, scope: Scope, headers: dict[bytes, bytes], limit: int | None = None) -> bool:
+        """Check the declared coding, media type and length; return whether to read the body at once.
+
+        limit: a lower maximum size than that of other calls, in bytes.
+        """
+        self._limit = self._limit if limit is None else min(self._limit, limit)
         coding = headers.get(b"content-encoding", b"identity").strip().lower()
         length = headers.get(b"content-length")
         self._declared = int(length) if length is not None and length.isdigit() else None

@@ -13,7 +13,7 @@ from fastapi.openapi.utils import get_openapi
 from starlette.responses import HTMLResponse, Response
 
 from app import formats, parameters
-from app.api.http.auth import is_open
+from app.api.http.auth import SESSION_COOKIE, is_open
 from app.api.http.problems import MEDIA_TYPE
 from app.api.http.responses import API
 from app.api.http.schemas import ProblemOut, problem_responses
@@ -53,7 +53,8 @@ Stores the maps of environments, versioned in canonical layers, and exports them
 - **Lists** are paginated: follow the `Link` header with `rel="next"`.
 - **Versions** are given by number, by channel (`production`), or as `latest`.
 - **Coordinates** are `longitude, latitude` in GeoJSON, and `latitude, longitude` in query parameters (`LAT,LON`).
-- **Access** requires `Authorization: Bearer <token>`; maps can also be read with a signed link (`POST …/links`).
+- **Access** requires `Authorization: Bearer <token>`, or in a browser a session (`POST /api/v1/session`); maps can also
+  be read with a signed link (`POST …/links`).
 - **Roles**: `viewer` reads; `robot` also reports the status of the token's robot, and obstructions; `editor` also
   uploads, edits, converts, moves channels and sets datums; `admin` may do everything.
 """
@@ -81,6 +82,8 @@ TAGS = {
     "jobs": "Conversions that outlive their request.",
     "stored data": "Stored bytes, for the repair of another server.",
     "tokens": "Access tokens.",
+    "session": "Sign-in of browsers.",
+    "search": "Search in all environments.",
     "audit": "Log of changes with author and address.",
     "health": "Liveness, readiness and metrics.",
 }
@@ -136,6 +139,12 @@ def build(app: FastAPI) -> dict[str, Any]:
             schemas.update(operation.pop("x-schemas", {}))  # of bodies that a route parses itself
     components["securitySchemes"] = {
         "token": {"type": "http", "scheme": "bearer", "description": "Bearer token; see `/api/v1/tokens`."},
+        "session": {
+            "type": "apiKey",
+            "in": "cookie",
+            "name": SESSION_COOKIE,
+            "description": "Session of a browser; see `POST /api/v1/session`. Changes require the header `Origin`.",
+        },
         "link": {
             "type": "apiKey",
             "in": "query",
@@ -157,10 +166,10 @@ def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
     problem = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     responses = operation["responses"]
     common: dict[str, str] = {}
-    if not is_open(path):
-        operation["security"] = [{"token": []}, *([{"link": []}] if _is_map(path) else [])]
+    if not is_open(path, method.upper()):
+        operation["security"] = [{"token": []}, {"session": []}, *([{"link": []}] if _is_map(path) else [])]
         common |= {
-            "401": "The token is missing, unknown or expired.",
+            "401": "The token is missing, unknown or expired, or the session has ended.",
             "403": "The role or the environments of the token do not allow the call."
             + (" Or the signed link is invalid or expired." if _is_map(path) else ""),
             "429": "Too many wrong tokens from this address.",

@@ -1,6 +1,6 @@
 """Response cache in memory: repeated requests of a fleet take microseconds.
 
-A response is valid while ``Store.generation()`` is unchanged, for at most a second, and so is the caller's token.
+A response is valid while ``Store.generation()`` is unchanged, for at most a second, and so are tokens and sessions.
 Other requests take the slow path: middleware, route, recipe (the ETag), disk cache, conversion.
 """
 
@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 from fastapi import Request
 from starlette.types import Scope
 
-from app.api.http.auth import Authenticator, Principal, authorise
+from app.api.http.auth import Authenticator, Credentials, Principal, authorise
 from app.api.http.caching import none_match
 from app.api.http.metrics import Metrics
 from app.api.http.single_flight import SingleFlight
@@ -154,10 +154,12 @@ class ResponseCache:
         entry = self.get_fresh((scope.get("raw_path") or b"", scope["query_string"]))
         if entry is None:
             return None
-        authorization = condition = None
+        authorization = cookie = condition = None
         for name, value in scope["headers"]:
             if name == b"authorization":
                 authorization = value
+            elif name == b"cookie":
+                cookie = value
             elif name == b"if-none-match":
                 if condition is not None:
                     return None
@@ -165,7 +167,8 @@ class ResponseCache:
             elif name in (b"range", b"if-match", b"available-dictionary"):
                 return None
         # The signature of a link is part of the key: the first request checked it.
-        principal = entry.link or self.access.cached_principal(authorization)
+        credentials = Credentials.from_headers(authorization, cookie, scope)
+        principal = entry.link or self.access.cached_principal(credentials)
         if principal is None or (entry.link is not None and principal.has_expired()):
             return None
         try:
