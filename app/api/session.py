@@ -83,7 +83,7 @@ def sign_in_path(code: str) -> str:
 @router.post(
     "",
     status_code=201,
-    responses=problem_responses(SessionOut, 400, 409, 415, ok=201, description="The session; its cookie is set"),
+    responses=problem_responses(SessionOut, 400, 409, 415, 422, ok=201, description="The session; its cookie is set"),
     summary="Sign in",
 )
 async def sign_in(body: SignInBody, request: Request, services: ServicesDep) -> Response:

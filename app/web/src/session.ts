@@ -1,14 +1,8 @@
 /** The signed-in user. The token stays in an HttpOnly cookie that scripts cannot read. */
 import { effect, signal } from "@preact/signals";
-import { ApiError, type Role, request, requestJson, unauthenticated } from "./api/client";
+import { ApiError, api, ask, type Role, type Schemas, unauthenticated } from "./api/client";
 
-export interface Session {
-  name: string;
-  role: Role;
-  environments: string | null;
-  robot: string | null;
-  expires: string | null;
-}
+export type Session = Schemas["SessionOut"];
 
 const ROLES: Role[] = ["viewer", "robot", "editor", "admin"];
 
@@ -30,7 +24,7 @@ export async function start(): Promise<void> {
     if (await signIn({ code }).catch(() => false)) return;
   }
   try {
-    session.value = await requestJson<Session>("/api/v1/session");
+    session.value = await ask(api.GET("/api/v1/session"));
   } catch (error) {
     if (!(error instanceof ApiError)) throw error;
     if (error.status === 401) session.value = null;
@@ -40,17 +34,13 @@ export async function start(): Promise<void> {
 
 /** Throws ApiError if the server refuses the token or code. */
 export async function signIn(credentials: { token: string } | { code: string }): Promise<boolean> {
-  session.value = await requestJson<Session>("/api/v1/session", {
-    method: "POST",
-    headers: { "content-type": "application/json" },
-    body: JSON.stringify(credentials),
-  });
+  session.value = await ask(api.POST("/api/v1/session", { body: credentials as Schemas["SignInBody"] }));
   expired.value = false;
   return true;
 }
 
 export async function signOut(): Promise<void> {
-  await request("/api/v1/session", { method: "DELETE" }).catch(() => undefined);
+  await ask(api.DELETE("/api/v1/session")).catch(() => undefined);
   for (const name of await caches.keys().catch(() => [])) await caches.delete(name);
   session.value = null;
 }
