@@ -1,6 +1,6 @@
 /** Events of the server, resumed by the browser at the last one received. */
 import { signal } from "@preact/signals";
-import { apiPath } from "./client";
+import { apiPath, request } from "./client";
 
 export interface FleetEvent {
   sequence: number;
@@ -74,6 +74,7 @@ export class EventStream {
     source.onerror = () => {
       live.value = false;
       if (source.readyState !== EventSource.CLOSED) return; // the browser tries again by itself
+      void request("/api/v1/session").catch(() => undefined); // has the session ended, or does the server not answer?
       this.timer = window.setTimeout(() => this.open(), this.pause);
       this.pause = Math.min(this.pause * 2, MAX_PAUSE);
     };
