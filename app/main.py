@@ -256,13 +256,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes, run_trial=run_trial
     )
     service.cache.on_damage = metrics.cache_damaged.inc
-    access = Authenticator(
-        store.tokens.find,
-        failures=settings.token_failures,
-        find_session=store.sessions.find,
-        anonymous=settings.anonymous_list,
-        insecure=settings.insecure_no_auth,
-    )
+    access = _authenticator(settings, store)
 
     keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
     with contextlib.suppress(OSError):  # create now: later the disk may be full
@@ -302,6 +296,16 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         deltas=Deltas(service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
+    )
+
+
+def _authenticator(settings: Settings, store: Store) -> Authenticator:
+    return Authenticator(
+        store.tokens.find,
+        failures=settings.token_failures,
+        find_session=store.sessions.find,
+        anonymous=settings.anonymous_list,
+        insecure=settings.insecure_no_auth,
     )
 
 

@@ -83,7 +83,9 @@ def sign_in_path(code: str) -> str:
 @router.post(
     "",
     status_code=201,
-    responses=problem_responses(SessionOut, 400, 409, 415, 422, ok=201, description="The session; its cookie is set"),
+    responses=problem_responses(
+        SessionOut, 401, 403, 409, 422, 429, 503, ok=201, description="The session; its cookie is set"
+    ),
     summary="Sign in",
 )
 async def sign_in(body: SignInBody, request: Request, services: ServicesDep) -> Response:
@@ -122,12 +124,13 @@ def get_session(principal: Viewer) -> Response:
     return json_response(as_dict(principal), headers={"cache-control": "no-store"})
 
 
-@router.delete("", status_code=204, responses=problem_responses(None), summary="Sign out")
+@router.delete("", status_code=204, responses=problem_responses(None, 403, 422, 503), summary="Sign out")
 async def sign_out(request: Request, services: ServicesDep) -> Response:
     """End the session of the cookie, if there is one, and clear the cookie. A token stays valid."""
-    secret = Credentials.from_headers(None, dict(request.scope["headers"]).get(b"cookie"), request.scope).session
+    headers = dict(request.scope["headers"])
+    secret = Credentials.from_headers(None, headers.get(b"cookie"), request.scope).session
     if secret is not None:
-        check_same_origin(request.scope, required=True)
+        check_same_origin(request.scope, required=b"authorization" not in headers)
         await run_in_threadpool(_end, services, secret)
     response = Response(status_code=204, headers={"cache-control": "no-store"})
     _set_cookie(response, request, "", max_age=0)

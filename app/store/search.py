@@ -231,7 +231,7 @@ class Search:
         table, channel = tables.environment, tables.channel
         production = (channel.c.environment_id == table.c.id) & (channel.c.name == PRODUCTION)
         number = func.coalesce(channel.c.version, table.c.head).label("version")
-        query = select(table.c.id, table.c.name, table.c.title, number).outerjoin(channel, production)
+        query: Any = select(table.c.id, table.c.name, table.c.title, number).outerjoin(channel, production)
         with self._database.read() as connection:
             rows = connection.execute(query.where(table.c.deleted.is_(None)).order_by(table.c.name)).all()
             return [(row, self._content(connection, row)) for row in rows if reaches(allowed, row.name)]
@@ -311,17 +311,20 @@ def _environment_match(owner: Row[Any], needle: str) -> _Match | None:
 def fold(text: str) -> str:
     """Convert to lower case without changing the number of characters."""
     lower = text.lower()
-    if len(lower) == len(text):
-        return lower
-    return "".join([c.lower() if len(c.lower()) == 1 else c for c in text])
+    if len(lower) != len(text):
+        lower = "".join([c.lower() if len(c.lower()) == 1 else c for c in text])
+    return lower.replace("ς", "σ")  # the only letter whose lower case depends on its neighbours
 
 
 def _positions(geometry: NDArray[np.object_]) -> NDArray[np.float64]:
     """Return a position [n, 2] on each geometry; NaN for empty ones."""
-    points = geometry.copy()
-    shapes = shapely.get_type_id(geometry) != 0
+    out = np.full((len(geometry), 2), np.nan)
+    used = np.flatnonzero(~shapely.is_empty(geometry))
+    points = geometry[used]
+    shapes = shapely.get_type_id(points) != 0
     try:
-        points[shapes] = shapely.point_on_surface(geometry[shapes])
+        points[shapes] = shapely.point_on_surface(points[shapes])
     except shapely.errors.GEOSException:  # of an invalid polygon
-        points[shapes] = shapely.centroid(geometry[shapes])
-    return np.column_stack([shapely.get_x(points), shapely.get_y(points)])
+        points[shapes] = shapely.centroid(points[shapes])
+    out[used] = shapely.get_coordinates(points)
+    return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -257,7 +258,7 @@ def test_parameters_of_generators_have_types_units_defaults_and_bounds(offline: 
     assert "did you mean orchard?" in offline("generate", "orchrd", "--parameters").err
 
 
-def test_token_create_list_and_delete(fleetmap: Fleetmap, network: Path) -> None:
+def test_token_create_list_link_and_delete(fleetmap: Fleetmap, server: str, network: Path) -> None:
     assert fleetmap("import", network, "-e", "guarded").status == 0
     token = fleetmap("token", "create", "field robot", "--role", "viewer", "--environments", "guard*", "--json").json
     assert fleetmap("versions", "guarded", "--token", token["token"]).status == 0
@@ -268,6 +269,10 @@ def test_token_create_list_and_delete(fleetmap: Fleetmap, network: Path) -> None
     assert token["id"] in {row["id"] for row in listed.json}
     assert token["token"] not in listed.out
     assert "ended" in fleetmap("token", "list").out.splitlines()[0].split()
+    link = fleetmap("token", "link", token["id"])
+    assert re.fullmatch(rf"{server}/#sign-in=[\w-]{{22}}\n", link.out), link.out
+    assert set(fleetmap("token", "link", token["id"], "--json").json) == {"code", "path", "expires", "url"}
+    assert fleetmap("token", "link", "nosuch").status == 1
     assert fleetmap("token", "delete", token["id"]).status == 0
     result = fleetmap("versions", "guarded", "--token", token["token"])
     assert result.status == 1

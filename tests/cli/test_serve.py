@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import socket
 import sqlite3
@@ -28,7 +29,8 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
 ) -> None:
     process = start(tmp_path, "--workers", workers)
     try:
-        process.ready()
+        address = process.ready()
+        process.wait_for(f"^open {address}/$")
         token = process.wait_for(r"administrator's token, shown only once: (\S+)")[1]
         listed = offline("token", "list", "--server", process.address, "--token", token, "--json")
         assert [row["role"] for row in listed.json] == ["admin"]
@@ -78,6 +80,13 @@ def test_serve_demo_prints_working_commands_at_every_start(tmp_path: Path) -> No
             request = urllib.request.Request(address, headers={"Authorization": f"Bearer {token}"})
             with urllib.request.urlopen(request, timeout=30) as answer:
                 assert b"Dock" in answer.read()
+            code = process.wait_for(r"^open http://127\.0\.0\.1:\d+/#sign-in=(\S+)$")[1]
+            address = f"{process.address}/api/v1/session"
+            body, headers = json.dumps({"code": code}).encode(), {"Content-Type": "application/json"}
+            with urllib.request.urlopen(urllib.request.Request(address, body, headers), timeout=30) as answer:
+                assert json.load(answer)["role"] == "admin"
+            with pytest.raises(urllib.error.HTTPError, match="401"):
+                urllib.request.urlopen(urllib.request.Request(address, body, headers), timeout=30)
         finally:
             assert process.stop() == 0
     assert (tmp_path / "data" / "demo-token").stat().st_mode & 0o077 == 0

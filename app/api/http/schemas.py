@@ -149,6 +149,8 @@ def problem_responses(
     """Build the OpenAPI responses: success with its schema, and the problems besides those of every call."""
     reasons = {
         400: "The body is malformed.",
+        401: "The token or code is wrong, used or expired.",
+        403: "The request comes from a page of another site.",
         404: "Not found.",
         406: "None of the accepted media types is available.",
         409: "Conflict with the present state, or several items match and none is named.",
@@ -157,6 +159,7 @@ def problem_responses(
         415: "Unsupported media type or content coding.",
         416: "The range is outside the file.",
         422: "The request, a file or stored data is not suitable; `errors` has the details.",
+        429: "Too many wrong tokens or codes from this address.",
         503: "Overloaded, or a part of the server does not respond: try again after `Retry-After` seconds.",
     }
     out: dict[int | str, dict[str, Any]] = {}
