@@ -128,7 +128,10 @@ class Ingest:
             changes = edits(base)
             if not changes and key is None and not commit.dry_run:
                 return CommitResult("unchanged", base, base.as_dict())
-            change_set, warnings = edit_changes(self._store, base, changes)
+            if changes or key is not None:
+                change_set, warnings = edit_changes(self._store, base, changes)
+            else:
+                change_set, warnings = Changes(), ()
             prepared: Prepared = self._run_in_worker(prepare_changes, base, change_set)
             return self._commit(environment, base, prepared, commit, key, warnings)
 
