@@ -126,12 +126,12 @@ class Ingest:
     ) -> CommitResult:
         def once(base: Version) -> CommitResult:
             changes = edits(base)
-            if not changes and key is None and not commit.dry_run:
-                return CommitResult("unchanged", base, base.as_dict())
             if changes or key is not None:
                 change_set, warnings = edit_changes(self._store, base, changes)
-            else:
+            elif commit.dry_run:
                 change_set, warnings = Changes(), ()
+            else:
+                return CommitResult("unchanged", base, base.as_dict())
             prepared: Prepared = self._run_in_worker(prepare_changes, base, change_set)
             return self._commit(environment, base, prepared, commit, key, warnings)
 
@@ -226,9 +226,9 @@ class Ingest:
                 prepare_alignment, base, request, failure="the grid could not be aligned"
             )
             if result.prepared is None:
-                none = CommitResult("dry_run", None, {})
-                return dataclasses.replace(none, body=_alignment_as_json(result.summary, none, result.warnings))
-            outcome = self._commit(environment, base, result.prepared, described, key, result.warnings)
+                outcome = CommitResult("dry_run", None, {})
+            else:
+                outcome = self._commit(environment, base, result.prepared, described, key, result.warnings)
             return dataclasses.replace(outcome, body=_alignment_as_json(result.summary, outcome, result.warnings))
 
         return self._commit_on_head(environment, None, commit.if_match, once, "align the grid")
