@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -147,6 +149,29 @@ def test_garbage_collection_keeps_live_dry_runs_only(farm: Store, clock: Clock) 
     assert count(farm, "chunk") > before, "those of the version"
     assert len(farm.content.features(farm.versions.get("farm"), TOPOLOGY)) == 60
     assert kept.root == farm.versions.get("farm").root
+
+
+def test_commit_while_another_server_collects_finds_all_content_or_nothing(farm: Store) -> None:
+    """The clock of the collecting server is ahead: only for that server has the dry run expired."""
+    ahead = Store(farm.database_url, farm.blob_dir, clock=lambda: NOW + LIFETIME)
+    outcomes = []
+    try:
+        for k in range(12):
+            dry = attempt(farm, Replace(TOPOLOGY, network(200, seed=k)))
+            with ThreadPoolExecutor(1) as thread:
+                collection = thread.submit(ahead.garbage.collect, timedelta(0))
+                time.sleep(0.002 * k)
+                try:
+                    commit(farm, dry)
+                    outcomes.append("committed")
+                except NotFound:
+                    outcomes.append("expired")
+                collection.result()
+            farm.chunks.forget()
+            assert farm.verifier().run().findings == [], "no version lacks a chunk"
+    finally:
+        ahead.close()
+    assert farm.versions.get("farm").number == 1 + outcomes.count("committed")
 
 
 def test_oldest_dry_run_is_removed_when_there_are_too_many(farm: Store, clock: Clock) -> None:
