@@ -468,7 +468,7 @@ def _note_time(newest: datetime) -> datetime:
 
 
 async def _run_housekeeping(services: Services) -> None:
-    """Run periodic tasks: expiry of tokens, sessions and overlays, channel moves, rollouts, garbage collection."""
+    """Run periodic tasks: expiry of tokens, sessions, overlays and dry runs; channel moves, rollouts, collection."""
     beat = 0.0
     newest = datetime.now(UTC)
     collect = newest + COLLECT_EVERY
@@ -483,6 +483,7 @@ async def _run_housekeeping(services: Services) -> None:
             await run_in_threadpool(services.store.channels.apply_due_moves, datetime.now(UTC))
             await run_in_threadpool(services.store.channels.advance_rollouts, datetime.now(UTC), next_step)
             await run_in_threadpool(services.store.overlays.end_due, datetime.now(UTC))
+            await run_in_threadpool(services.store.versions.remove_expired_dry_runs)
             if beat >= HEARTBEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(services.jobs.send_heartbeats)

@@ -12,6 +12,8 @@ from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
+    DryRun,
+    DryRunOut,
     EnvironmentPath,
     ProblemItem,
     RequestModel,
@@ -73,7 +75,7 @@ class AlignmentBody(RequestModel):
         "for points.",
     )
     least: float = Field(0.5, ge=0, le=1, description="Minimum share of matching cells or points, from 0 to 1.")
-    dry_run: bool = Field(False, description="Report the alignment without committing it.")
+    dry_run: DryRun = False
     message: str = Field("", max_length=MAX_TEXT)
 
 
@@ -84,8 +86,9 @@ class AlignmentOut(BaseModel):
         description="`x`, `y`, `yaw`, `residual` (m), `agreement` and `overlap` (0 to 1), `origin` and the previous "
         "origin `before`."
     )
-    version: VersionOut | None
+    version: VersionOut | None = Field(description="Null in a dry run.")
     warnings: list[ProblemItem]
+    dry_run: DryRunOut | None = Field(description="In a dry run the version that would be created, if the maps fit.")
 
 
 router = api_router("alignments")
@@ -122,9 +125,8 @@ def create_alignment(env: EnvironmentPath, body: AlignmentBody, services: Servic
         reach=body.reach,
         near=body.near or (0.5 if body.pairs else 0.1),
         least=body.least,
-        dry_run=body.dry_run,
     )
-    outcome = services.ingest.align(env, request, commit.with_message(body.message))
+    outcome = services.ingest.align(env, request, commit.with_message(body.message).as_dry_run(body.dry_run))
     version = outcome.version
     if version is None or outcome.status == "unchanged":
         return json_response(outcome.body)

@@ -80,8 +80,8 @@ def get_delta(
     - `other`: parts without a delta: fetch the maps that use them.
     """
     new, old = (
-        services.store.versions.get(env, parse_version_ref(v)),
-        services.store.versions.get(env, parse_version_ref(since)),
+        services.store.versions.get_committed(env, parse_version_ref(v)),
+        services.store.versions.get_committed(env, parse_version_ref(since)),
     )
     anchor: Anchor = crs or ("wgs84" if new.datum else "local")
     seed = json_bytes(["delta", old.root, new.root, old.number, new.number, anchor, env])

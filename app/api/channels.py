@@ -232,7 +232,7 @@ def move_channel(
         if body.activate_at <= datetime.now(UTC) - MAX_CLOCK_SKEW:
             raise _invalid_body_error("activate_at is in the past: omit it to move now")
     rollout = _rollout(body) if body.rollout is not None else None
-    version = services.store.versions.get(env, body.version).number
+    version = services.store.versions.get_committed(env, body.version).number
     moved = services.store.channels.move(
         env, channel, version, author=principal.name, activate_at=body.activate_at, rollout=rollout
     )

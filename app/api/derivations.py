@@ -13,6 +13,8 @@ from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
     MAX_TEXT,
+    UNCHANGED_OR_DRY_RUN,
+    DryRun,
     EnvironmentPath,
     RequestModel,
     VersionOut,
@@ -38,6 +40,7 @@ class DerivationBody(RequestModel):
     )
     message: str = Field("", max_length=MAX_TEXT)
     replace: bool = Field(False, description="Replace uploaded or edited content as well.")
+    dry_run: DryRun = False
 
 
 class DerivationOut(BaseModel):
@@ -82,7 +85,7 @@ def list_derivations(services: ServicesDep, _: Viewer) -> Response:
     status_code=201,
     responses={
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
-        200: {"model": VersionOut, "description": "Nothing changed: the head."},
+        **UNCHANGED_OR_DRY_RUN,
     },
     summary="Derive a layer and commit it",
 )
@@ -98,7 +101,7 @@ def create_derivation(env: EnvironmentPath, body: DerivationBody, services: Serv
     request = DerivationRequest(body.method, body.parameters, body.replace)
     try:
         carry_out = services.ingest.fetch_imagery if body.method == online.METHOD else services.ingest.derive
-        outcome = carry_out(env, request, commit.with_message(body.message))
+        outcome = carry_out(env, request, commit.with_message(body.message).as_dry_run(body.dry_run))
     except NotFound as error:
         if body.method in derive.all_derivations():
             raise

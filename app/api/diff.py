@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import io
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import shapely
 from fastapi import Query
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import VERSION, EnvironmentPath, problem_responses
+from app.api.http.schemas import VERSION_OR_DRY_RUN, DiffOut, EnvironmentPath, problem_responses
 from app.errors import Invalid
 from app.model.features import Features, features
 from app.model.frame import Anchor
@@ -27,22 +26,14 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import PartKey
 from app.store.values import Version
 
-
-class DiffOut(BaseModel):
-    """Differences between two versions."""
-
-    model_config = ConfigDict(populate_by_name=True)
-
-    from_: int = Field(alias="from")
-    to: int
-    layers: dict[str, Any]
-
-
 router = api_router("versions", "/environments/{env}")
 
 Ref = Annotated[
     str | None,
-    Query(pattern=VERSION, description="The newer version: number, channel, or `latest`."),
+    Query(
+        pattern=VERSION_OR_DRY_RUN,
+        description="The newer version: number, channel, or `latest`; or `dry:…` of a dry run.",
+    ),
 ]
 
 SIDE = 1024
@@ -67,8 +58,9 @@ def diff(
         str | None,
         Query(
             alias="from",
-            pattern=VERSION,
-            description="The older version: number, channel, or `latest`. Default: the parent of `to`.",
+            pattern=VERSION_OR_DRY_RUN,
+            description="The older version: number, channel, or `latest`; or `dry:…` of a dry run. Default: the parent "
+            "of `to`.",
         ),
     ] = None,
     to: Ref = "latest",
@@ -92,7 +84,7 @@ def diff(
     if render == "png":
         return Response(_picture(services, old, new), media_type="image/png")
     layers = services.store.content.diff(old, new)
-    return json_response({"from": old.number, "to": new.number, "layers": layers})
+    return json_response({"from": old.ref, "to": new.ref, "layers": layers})
 
 
 def _picture(services: Services, old: Version, new: Version) -> bytes:

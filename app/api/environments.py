@@ -223,7 +223,7 @@ def create_environment(body: EnvironmentBody, services: ServicesDep, principal: 
         if body.datum is not None:
             raise Invalid("datum and clone exclude each other: give one, and PATCH the datum of a clone later")
         principal.require_environment(body.clone.environment)
-        clone = services.store.versions.get(body.clone.environment, body.clone.version)
+        clone = services.store.versions.get_committed(body.clone.environment, body.clone.version)
     set_audit_target(environment=body.name, target=f"environment {body.name}")
     environment = services.store.environments.create(
         body.name,

@@ -296,7 +296,7 @@ def answer_zenoh_query(
         return _locate(services, parameters)
     pieces = rest.split("/")
     if pieces[1:] == ["version"]:
-        version = services.store.versions.get(environment, parse_version_ref(pieces[0]))
+        version = services.store.versions.get_committed(environment, parse_version_ref(pieces[0]))
         _no_parameters(parameters)
         return Reply(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":

@@ -13,6 +13,8 @@ from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
     MAX_TEXT,
+    UNCHANGED_OR_DRY_RUN,
+    DryRun,
     EnvironmentPath,
     RequestModel,
     VersionOut,
@@ -38,6 +40,7 @@ class GenerationBody(RequestModel):
     parameters: dict[str, Any] = Field(default_factory=dict, description="Parameters of the generator.")
     message: str = Field("", max_length=MAX_TEXT)
     replace: bool = Field(False, description="Replace uploaded or edited content as well.")
+    dry_run: DryRun = False
 
 
 class GeneratorOut(BaseModel):
@@ -69,7 +72,7 @@ def list_generators(_: Viewer) -> Response:
     status_code=201,
     responses={
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
-        200: {"model": VersionOut, "description": "Nothing changed: the head."},
+        **UNCHANGED_OR_DRY_RUN,
     },
     summary="Generate a synthetic site and commit it",
 )
@@ -81,7 +84,7 @@ def create_generation(env: EnvironmentPath, body: GenerationBody, services: Serv
     """
     order = GenerationRequest(body.generator, body.seed, body.parameters, body.replace)
     try:
-        outcome = services.ingest.generate(env, order, commit.with_message(body.message))
+        outcome = services.ingest.generate(env, order, commit.with_message(body.message).as_dry_run(body.dry_run))
     except NotFound as error:
         if body.generator in generate.all_generators():
             raise

@@ -144,7 +144,7 @@ def get_layer(
     headers = {
         "etag": etag,
         "vary": "accept",
-        "fleetmap-version": str(version.number),
+        "fleetmap-version": str(version.ref),
         "fleetmap-root": version.root,
     }
     if none_match(request.headers.get("if-none-match"), etag):
@@ -410,7 +410,7 @@ def _no_such_part_error(version: Version, layer: Layer, level: str | None, name:
     existing_names = [f"{e.key.name} (level {e.key.level})" for e in version.parts if e.key.layer == layer]
     selection = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
     description = f"{layer} {selection}".strip()
-    return NotFound(f"version {version.number} has no {description}; available: {', '.join(existing_names) or 'none'}")
+    return NotFound(f"version {version.ref} has no {description}; available: {', '.join(existing_names) or 'none'}")
 
 
 def _no_datum(environment: str) -> MissingDatum:

@@ -84,7 +84,7 @@ async def create_link(
     fails, there is no link.
     """
     services.links.check_life(body.seconds)
-    version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
+    version = await run_in_threadpool(services.store.versions.get_committed, env, parse_version_ref(v))
     values = {name: _text(value) for name, value in body.parameters.items()}
     linked = await link_to(services, request, principal, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, JobStarted):

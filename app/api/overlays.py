@@ -19,7 +19,7 @@ from app.api.http.auth import Editor, Principal, RobotRole, Viewer
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import ApiTime, EnvironmentPath, RequestModel, problem_responses
+from app.api.http.schemas import ApiTime, DryRun, DryRunOut, EnvironmentPath, RequestModel, problem_responses
 from app.convert.cache import CachedMap
 from app.convert.closures import place_problem
 from app.errors import Conflict, Denied, Invalid, NotFound, Problem
@@ -311,13 +311,20 @@ def end_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, pr
 
 @router.post(
     "/{id}/keep",
-    responses=problem_responses(OverlayOut, 404, 409, 422, 503),
+    responses=problem_responses(OverlayOut | DryRunOut, 404, 409, 422, 503),
     summary="Make an accepted overlay permanent",
 )
-def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, principal: Editor) -> Response:
+def keep_overlay(
+    env: EnvironmentPath,
+    id: OverlayPath,
+    services: ServicesDep,
+    principal: Editor,
+    dry_run: Annotated[DryRun, Query()] = False,
+) -> Response:
     """Create a version with the obstruction: an area as a keepout zone, an edge with `blocked: true`.
 
     The overlay stays in force until its end. Promote the version before that, so that robots keep out permanently.
+    To commit after a dry run, call it again without `dry_run`, so that the overlay refers to the version.
     """
     overlay = services.store.overlays.get(env, id)
     if overlay.state != "accepted":
@@ -326,8 +333,14 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep, p
     outcome = services.ingest.amend(
         env,
         partial(overlays.permanent_edits, services.store, overlay=overlay),
-        CommitRequest(principal.name, f"{obstruction} is blocked permanently (reported by {overlay.reporter})"),
+        CommitRequest(
+            principal.name,
+            f"{obstruction} is blocked permanently (reported by {overlay.reporter})",
+            dry_run=dry_run,
+        ),
     )
+    if outcome.status == "dry_run":
+        return json_response(outcome.body)
     assert outcome.version is not None
     return json_response(services.store.overlays.note_kept(env, id, outcome.version.number).as_dict())
 

@@ -14,7 +14,7 @@ from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
+from app.api.http.schemas import EnvironmentPath, VersionName, VersionPath, problem_responses
 from app.convert.maps import Maps
 from app.store.values import Version
 
@@ -23,7 +23,7 @@ class ProvenanceOut(BaseModel):
     """Provenance graph: files, layers and maps. `links` connect them by id."""
 
     environment: str
-    version: int
+    version: VersionName
     sources: list[dict[str, Any]]
     parts: list[dict[str, Any]]
     maps: list[dict[str, Any]]
@@ -206,6 +206,6 @@ def provenance(env: EnvironmentPath, v: VersionPath, request: Request, services:
     version = services.store.versions.get(env, parse_version_ref(v))
     lineage = graph(services.maps, version)
     if "application/json" in request.headers.get("accept", ""):
-        return json_response({"environment": env, "version": version.number, **lineage})
-    picture = svg(lineage, f"{env}, version {version.number}")
+        return json_response({"environment": env, "version": version.ref, **lineage})
+    picture = svg(lineage, f"{env}, version {version.ref}")
     return Response(picture, media_type="image/svg+xml", headers={"content-security-policy": "default-src 'none'"})

@@ -15,7 +15,9 @@ from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, commit_response, json_response, version_headers
 from app.api.http.schemas import (
     MAX_TEXT,
+    UNCHANGED_OR_DRY_RUN,
     VERSION,
+    DryRun,
     EnvironmentPath,
     RequestModel,
     VersionOut,
@@ -44,7 +46,7 @@ class FormatTemplatesBody(RequestModel):
         description="Values by parameter of the format; see `GET /api/v1/formats`.",
     )
     message: str = Field("", max_length=MAX_TEXT)
-    dry_run: bool = Field(False, description="Report the result without committing it.")
+    dry_run: DryRun = False
 
 
 class OwnTemplatesBody(RequestModel):
@@ -70,7 +72,7 @@ class TemplatesBody(RequestModel):
         description="Values of these formats, which replace their previous values.",
     )
     message: str = Field("", max_length=MAX_TEXT)
-    dry_run: bool = Field(False, description="Report the result without committing it.")
+    dry_run: DryRun = False
 
 
 class TemplateSetOut(BaseModel):
@@ -121,12 +123,12 @@ TemplateVersion = Annotated[
     str,
     Query(alias="version", pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["latest"]),
 ]
+DryRunQuery = Annotated[DryRun, Query()]
 Message = Annotated[str, Query(max_length=MAX_TEXT, description="Reason of the change, for the history.")]
-DryRun = Annotated[bool, Query(description="Report the result without committing it.")]
 
 CHANGED: dict[int | str, dict[str, Any]] = {
     **problem_responses(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
-    200: {"model": VersionOut, "description": "Nothing changed: the head. Or a dry run: `version` is null."},
+    **UNCHANGED_OR_DRY_RUN,
 }
 
 
@@ -177,8 +179,8 @@ def put_templates(env: EnvironmentPath, body: TemplatesBody, services: ServicesD
     Omitted formats keep their values.
     """
     format_templates = {name: FormatTemplate(template.set, template.values) for name, template in body.formats.items()}
-    update = TemplateUpdate(body.set, format_templates, dry_run=body.dry_run).validated()
-    return _commit_templates(services, env, update, commit.with_message(body.message))
+    update = TemplateUpdate(body.set, format_templates).validated()
+    return _commit_templates(services, env, update, commit.with_message(body.message).as_dry_run(body.dry_run))
 
 
 @router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Reset all templates")
@@ -187,11 +189,11 @@ def delete_templates(
     services: ServicesDep,
     commit: CommitDep,
     message: Message = "",
-    dry_run: DryRun = False,
+    dry_run: DryRunQuery = False,
 ) -> Response:
     """Create a version without templates: the formats' own defaults apply."""
-    update = TemplateUpdate(clear=True, dry_run=dry_run)
-    return _commit_templates(services, env, update, commit.with_message(message))
+    update = TemplateUpdate(clear=True)
+    return _commit_templates(services, env, update, commit.with_message(message).as_dry_run(dry_run))
 
 
 @router.get(
@@ -230,10 +232,8 @@ def put_format_templates(
 
     Maps of the new version use them; maps of old versions do not change.
     """
-    update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}, dry_run=body.dry_run).validated(
-        "body"
-    )
-    return _commit_templates(services, env, update, commit.with_message(body.message))
+    update = TemplateUpdate(None, {format: FormatTemplate(body.set, body.values)}).validated("body")
+    return _commit_templates(services, env, update, commit.with_message(body.message).as_dry_run(body.dry_run))
 
 
 @router.delete(
@@ -248,11 +248,11 @@ def delete_format_templates(
     services: ServicesDep,
     commit: CommitDep,
     message: Message = "",
-    dry_run: DryRun = False,
+    dry_run: DryRunQuery = False,
 ) -> Response:
     """Create a version in which the environment's template set applies to the format again."""
-    update = TemplateUpdate(None, {format: FormatTemplate()}, dry_run=dry_run).validated()
-    return _commit_templates(services, env, update, commit.with_message(message))
+    update = TemplateUpdate(None, {format: FormatTemplate()}).validated()
+    return _commit_templates(services, env, update, commit.with_message(message).as_dry_run(dry_run))
 
 
 def _commit_templates(

@@ -13,7 +13,7 @@ from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
 from app.api.http.parameters import numbers, parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import VERSION, DatumOut, EnvironmentPath, problem_responses
+from app.api.http.schemas import VERSION_OR_DRY_RUN, DatumOut, EnvironmentPath, problem_responses
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
 from app.model.geodesy import local_frame
@@ -50,7 +50,13 @@ def transform(
         str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["52.4206,5.6134"])
     ] = None,
     xy: Annotated[str | None, Query(description="`X,Y` in metres of the local frame.")] = None,
-    version: Annotated[str, Query(pattern=VERSION, description="Version whose datum to use.")] = "latest",
+    version: Annotated[
+        str,
+        Query(
+            pattern=VERSION_OR_DRY_RUN,
+            description="Version whose datum to use: number, channel, or `latest`; or `dry:…` of a dry run.",
+        ),
+    ] = "latest",
 ) -> Response:
     """Convert `latlon` or `xy`; the response has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):

@@ -140,7 +140,7 @@ async def get_actions(
     """
     reserved_names = {"mapId", "format", "level", "signed", "seconds"}
     values = {name: text for name, text in request.query_params.multi_items() if name not in reserved_names}
-    version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
+    version = await run_in_threadpool(services.store.versions.get_committed, env, parse_version_ref(v))
     _check_format(format, by_level=level is not None)
     services.links.check_life(seconds)
     maps: list[dict[str, Any]] = []

@@ -20,9 +20,12 @@ from app.api.http.parameters import parse_version_ref
 from app.api.http.problems import MalformedBody, UnsupportedMedia
 from app.api.http.responses import api_router, commit_response, json_response, page_response, version_headers
 from app.api.http.schemas import (
+    DRY_RUN,
     MAX_TEXT,
-    VERSION,
+    UNCHANGED_OR_DRY_RUN,
     Cursor,
+    DryRun,
+    DryRunOut,
     EnvironmentPath,
     Limit,
     RequestModel,
@@ -34,7 +37,7 @@ from app.api.http.schemas import (
 from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
 from app.api.http.uploads import UploadForm
 from app.errors import FleetMapError, Invalid, NotFound, Problem
-from app.ingest import CommitResult, Upload
+from app.ingest import CommitRequest, CommitResult, Upload, dry_run_as_json
 from app.store.values import Source
 from app.upload_reader import DRAWN_LAYERS
 
@@ -44,6 +47,17 @@ class RevertBody(RequestModel):
 
     revert_to: int = Field(ge=0, description="Number of the old version.")
     message: str = Field("", max_length=MAX_TEXT)
+    dry_run: DryRun = False
+
+
+class CommitBody(RequestModel):
+    """Commit of a dry run: a version with exactly its content, sources, provenance and warnings."""
+
+    commit: str = Field(
+        pattern=DRY_RUN,
+        description="`id` of the dry run. Returns 412 if the head is not the `parent` of the dry run any more.",
+    )
+    message: str = Field("", max_length=MAX_TEXT, description="Default: the message of the dry run.")
 
 
 class PutChange(RequestModel):
@@ -131,13 +145,14 @@ class EditsBody(RequestModel):
 
     message: str = Field("", max_length=MAX_TEXT)
     changes: list[Change] = Field(min_length=1, max_length=100_000)
+    dry_run: DryRun = False
 
 
 router = api_router("versions", "/environments/{env}")
 
 UPLOAD_BODY: dict[str, Any] = {
     "x-free-query": True,
-    "x-schemas": {"RevertBody": RevertBody.model_json_schema()},
+    "x-schemas": {"RevertBody": RevertBody.model_json_schema(), "CommitBody": CommitBody.model_json_schema()},
     "requestBody": {
         "required": True,
         "content": {
@@ -170,7 +185,8 @@ UPLOAD_BODY: dict[str, Any] = {
                         "dry_run": {
                             "type": "boolean",
                             "default": False,
-                            "description": "Report the result without committing it.",
+                            "description": "Return the version that would be created, and store it only as a dry run: "
+                            "see `DryRunOut`.",
                         },
                     },
                     "additionalProperties": {"type": "string", "description": "Options of the format."},
@@ -186,7 +202,12 @@ UPLOAD_BODY: dict[str, Any] = {
                 },
             },
             "application/json": {
-                "schema": {"$ref": "#/components/schemas/RevertBody"},
+                "schema": {
+                    "oneOf": [
+                        {"$ref": "#/components/schemas/RevertBody"},
+                        {"$ref": "#/components/schemas/CommitBody"},
+                    ]
+                },
                 "examples": {"revert": {"value": {"revert_to": 1, "message": "the gate was open"}}},
             },
         },
@@ -215,9 +236,9 @@ def list_versions(
     status_code=201,
     responses={
         **problem_responses(VersionOut, 400, 404, 409, 412, 413, 415, 503, ok=201, description="A new version"),
-        200: {"model": VersionOut, "description": "Nothing changed: the head. Or a dry run: `version` is null."},
+        **UNCHANGED_OR_DRY_RUN,
     },
-    summary="Upload files, or revert to a version",
+    summary="Upload files, revert to a version, or commit a dry run",
     openapi_extra=UPLOAD_BODY,
 )
 async def create_version(
@@ -229,26 +250,30 @@ async def create_version(
     """Create one version from one upload, or none if it fails.
 
     The files are stored unchanged; doubtful content causes warnings.
+
+    With `dry_run` nothing becomes a version. The response has an `id` by which the result can be read for ten minutes
+    instead of a version, and committed with `{"commit": id}`.
     """
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media == "multipart/form-data":
         async with services.intake.receive(request) as form:
-            upload, message = _upload(form, request)
-            outcome = await run_in_threadpool(
-                _counted, services, services.ingest.upload, env, upload, commit.with_message(message)
-            )
+            upload, described = _upload(form, request, commit)
+            outcome = await run_in_threadpool(_counted, services, services.ingest.upload, env, upload, described)
     elif media == "application/json" or media.endswith("+json"):
         _no_query(request)
-        body = await _revert_body(request)
-        outcome = await run_in_threadpool(
-            services.ingest.revert,
-            env,
-            body.revert_to,
-            commit.with_message(body.message),
-        )
+        body = await _revert_or_commit_body(request)
+        described = commit.with_message(body.message)
+        if isinstance(body, CommitBody):
+            outcome = await run_in_threadpool(
+                _counted, services, services.ingest.commit_dry_run, env, body.commit, described
+            )
+        else:
+            outcome = await run_in_threadpool(
+                services.ingest.revert, env, body.revert_to, described.as_dry_run(body.dry_run)
+            )
     else:
         raise UnsupportedMedia(
-            "unsupported media type: send multipart/form-data with files, or application/json with revert_to"
+            "unsupported media type: send multipart/form-data with files, or application/json with revert_to or commit"
         )
     return commit_response(outcome)
 
@@ -258,7 +283,7 @@ async def create_version(
     status_code=201,
     responses={
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
-        200: {"model": VersionOut, "description": "Nothing changed: the head."},
+        **UNCHANGED_OR_DRY_RUN,
     },
     summary="Edit features and cells",
 )
@@ -268,15 +293,17 @@ def create_edit(env: EnvironmentPath, body: EditsBody, services: ServicesDep, co
     Edits that leave edges without their nodes are refused.
     """
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
-    outcome = _counted(services, services.ingest.edit, env, changes, commit.with_message(body.message))
+    described = commit.with_message(body.message).as_dry_run(body.dry_run)
+    outcome = _counted(services, services.ingest.edit, env, changes, described)
     return commit_response(outcome)
 
 
-@router.get("/versions/{v}", responses=problem_responses(VersionOut, 404), summary="Get a version")
+@router.get("/versions/{v}", responses=problem_responses(VersionOut | DryRunOut, 404), summary="Get a version")
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """Return a version by number, by channel, or the newest."""
+    """Return a version by number, by channel, or the newest; or a dry run by its `id`, with its differences."""
     version = services.store.versions.get(env, parse_version_ref(v))
-    return json_response(version.as_dict(), headers=version_headers(version))
+    body = version.as_dict() if version.dry_run is None else dry_run_as_json(services.store, version)
+    return json_response(body, headers=version_headers(version))
 
 
 @router.get(
@@ -306,7 +333,7 @@ def list_sources(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _:
 )
 def get_source(
     env: EnvironmentPath,
-    v: Annotated[str, Path(pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["latest"])],
+    v: VersionPath,
     name: Annotated[
         str, Path(max_length=1024, description="Name of the file, with its folders.", examples=["datum.yaml"])
     ],
@@ -348,8 +375,8 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     return next((s for s in fitting if s.used), fitting[0])
 
 
-def _upload(form: UploadForm, request: Request) -> tuple[Upload, str]:
-    """Parse the form and the query of an upload: the upload and its message. Raises Invalid."""
+def _upload(form: UploadForm, request: Request, commit: CommitRequest) -> tuple[Upload, CommitRequest]:
+    """Parse the form and the query of an upload; returns it with the completed request. Raises Invalid."""
     fields = FormFields(form, request.query_params.multi_items())
     mode = fields.take("mode") or "replace"
     if mode not in ("replace", "merge"):
@@ -359,9 +386,8 @@ def _upload(form: UploadForm, request: Request) -> tuple[Upload, str]:
         files=tuple(form.files),
         hints=replace(hints, options=fields.take_rest()),
         mode=mode,  # type: ignore[arg-type]  # checked above
-        dry_run=dry_run,
     )
-    return upload, message
+    return upload, commit.with_message(message).as_dry_run(dry_run)
 
 
 def _counted(services: Services, change: Callable[..., CommitResult], *args: Any) -> CommitResult:
@@ -375,13 +401,19 @@ def _counted(services: Services, change: Callable[..., CommitResult], *args: Any
     return outcome
 
 
-async def _revert_body(request: Request) -> RevertBody:
+async def _revert_or_commit_body(request: Request) -> RevertBody | CommitBody:
     try:
         value = await request.json()
     except ValueError as error:
         raise MalformedBody(f"the request body is not JSON: {error}") from None
+    model: type[RevertBody | CommitBody] = RevertBody
+    if isinstance(value, dict) and "commit" in value:
+        if "revert_to" in value:
+            reason = "revert_to and commit exclude each other: give one"
+            raise Invalid(reason, [Problem(reason, where="body.commit")])
+        model = CommitBody
     try:
-        return RevertBody.model_validate(value)
+        return model.model_validate(value)
     except ValidationError as error:
         items = [{**item, "loc": ("body", *item["loc"])} for item in error.errors()]
         raise RequestValidationError(items) from None
@@ -390,5 +422,7 @@ async def _revert_body(request: Request) -> RevertBody:
 def _no_query(request: Request) -> None:
     for name in request.query_params:
         raise Invalid(
-            f"unknown query parameter {name[:80]!r}: a revert takes none", [Problem("unknown", where=name[:80])]
+            f"unknown query parameter {name[:80]!r}: put it into the JSON body, as in "
+            '{"revert_to": 1, "dry_run": true}',
+            [Problem("unknown", where=name[:80])],
         )

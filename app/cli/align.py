@@ -48,7 +48,7 @@ def align(
     reach: Reach = None,
     near: Near = None,
     least: Least = 0.5,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the result; store nothing.")] = False,
+    dry_run: options.DryRun = False,
     message: options.Message = "",
     server: options.Server = None,
     token: options.Token = None,

@@ -66,6 +66,7 @@ def generate(
     create: options.Create = None,
     message: options.Message = "",
     replace: options.Replace = False,
+    dry_run: options.DryRun = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -91,14 +92,17 @@ def generate(
         name = environment or environment_name(f"{site}-{seed}")
         check_name(name)
         body = {"generator": site, "seed": seed, "parameters": values, "message": message, "replace": replace}
+        body["dry_run"] = dry_run
         with (
             Client(server, token) as client,
             output.progress_bar(f"generating {site}"),
-            ensure_environment(client, name, datum=place, create=create if environment else True),
+            ensure_environment(client, name, datum=place, create=create if environment else True, dry_run=dry_run),
         ):
             result = client.post(quote_path("environments", name, "generations"), body, repeat=True)
         show_commit(name, result, as_json=as_json)
         return
+    if dry_run:
+        raise typer.BadParameter("--dry-run and --to cannot be combined: --to stores nothing on a server")
     if out is None:
         raise typer.BadParameter("--to requires -o: a file, a folder, or - for standard output")
     if environment is not None:

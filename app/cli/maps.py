@@ -13,7 +13,7 @@ from app.cli import folder as folders
 from app.cli.client import Client, Download, LocalFile, quote_path
 from app.cli.companions import with_companions
 from app.cli.created import ensure_environment
-from app.cli.versions import change_line, channel_rows
+from app.cli.versions import change_line, channel_rows, dry_run_line
 from app.errors import Invalid, NotFound
 from app.model.frame import GROUND
 
@@ -47,7 +47,7 @@ def import_maps(
     datum: options.DatumText = None,
     option: options.Options = None,
     create: options.Create = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would change; store nothing.")] = False,
+    dry_run: options.DryRun = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -456,7 +456,7 @@ def _default_message(paths: Sequence[Path]) -> str:
 
 def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bool, is_new: bool) -> None:
     if dry_run:
-        output.print_result(f"{name}: this would create a version")
+        output.print_result(dry_run_line(name, body))
     elif status == 201:
         output.print_result(f"{name}: version {body['version']}{' of the new environment' if is_new else ''}")
     else:

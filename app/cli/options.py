@@ -72,6 +72,7 @@ Message = Annotated[
     str, typer.Option("--message", "-m", help="Reason for the change, shown in the history.", show_default=False)
 ]
 Replace = Annotated[bool, typer.Option("--replace", help="Also replace uploaded or edited content.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would change; store nothing.")]
 Format = Annotated[
     str | None,
     typer.Option(

@@ -34,7 +34,7 @@ def template(
         bool, typer.Option("--unset", help="Reset to the defaults; with -O NAME only this parameter.")
     ] = False,
     message: options.Message = "",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would change; store nothing.")] = False,
+    dry_run: options.DryRun = False,
     version: options.Version = "latest",
     server: options.Server = None,
     token: options.Token = None,

@@ -195,6 +195,7 @@ def revert(
         ),
     ],
     message: options.Message = "",
+    dry_run: options.DryRun = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -205,10 +206,10 @@ def revert(
     """
     with Client(server, token) as client:
         number = resolve(client, environment, version)
-        body = {"revert_to": number, "message": message or f"revert to version {number}"}
+        body = {"revert_to": number, "message": message or f"revert to version {number}", "dry_run": dry_run}
         result = client.post(quote_path("environments", environment, "versions"), body, repeat=True)
-    if as_json:
-        output.show_json(result)
+    if dry_run or as_json:
+        show_commit(environment, result, as_json=as_json)
     else:
         output.print_result(f"{environment}: version {result['version']} has the content of version {number}")
 
@@ -335,6 +336,7 @@ def derive(
     option: Annotated[list[str] | None, options.named_values_option("Parameter of the derivation")] = None,
     message: options.Message = "",
     replace: options.Replace = False,
+    dry_run: options.DryRun = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -361,17 +363,28 @@ def derive(
     if method is None:
         raise typer.BadParameter("missing derivation: list them with `fleetmap derive`")
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
+    body["dry_run"] = dry_run
     with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
         result = client.post(quote_path("environments", environment, "derivations"), body, repeat=True)
     show_commit(environment, result, as_json=as_json)
 
 
+def dry_run_line(environment: str, body: Mapping[str, Any]) -> str:
+    """Summarise a dry run: whether it would create a version."""
+    return f"{environment}: this would {'create a version' if body.get('changes') else 'change nothing'}"
+
+
 def show_commit(environment: str, result: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print the version of a derivation or a generator, which may be unchanged."""
+    """Print the version of a derivation or a generator, which may be unchanged; or what a dry run would change."""
     if as_json:
         output.show_json(result)
         return
-    output.print_result(
-        f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'no changes'}"
-    )
+    if result["version"] is None:
+        output.print_result(dry_run_line(environment, result))
+        for subject, change in result["changes"].items():
+            output.print_result(f"  {change_line(subject, change)}")
+    else:
+        output.print_result(
+            f"{environment}: version {result['version']}: {summary(result.get('changes') or {}) or 'no changes'}"
+        )
     output.show_warnings(result.get("warnings") or ())

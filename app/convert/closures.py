@@ -117,9 +117,9 @@ def place_problem(closure: Closure, version: Version) -> str | None:
     """Return why a closed area cannot be located in a version, or None."""
     levels = [level.name for level in version.levels]
     if closure.level not in levels:
-        return f"version {version.number} has no level {closure.level[:80]!r}; its levels: {', '.join(levels)[:500]}"
+        return f"version {version.ref} has no level {closure.level[:80]!r}; its levels: {', '.join(levels)[:500]}"
     if closure.crs == "wgs84" and version.datum is None:
-        return f"version {version.number} has no datum, which coordinates in degrees require"
+        return f"version {version.ref} has no datum, which coordinates in degrees require"
     try:
         box = shapely.total_bounds(_zones([closure]).in_local(_frame(version.datum)))
     except FleetMapError as error:

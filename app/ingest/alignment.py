@@ -52,7 +52,7 @@ class AlignmentRequest:
 
 @dataclass(frozen=True, slots=True)
 class AlignmentResult:
-    """Result of an alignment. prepared: None for a dry run."""
+    """Result of an alignment. prepared: None for a dry run in which the maps do not fit."""
 
     summary: dict[str, Any]
     warnings: tuple[Problem, ...]
@@ -60,7 +60,7 @@ class AlignmentResult:
 
 
 def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: AlignmentRequest) -> AlignmentResult:
-    """Find the alignment of a grid and prepare the moved grid, unless it is a dry run (in a worker).
+    """Find the alignment of a grid and prepare the moved grid (in a worker).
 
     Raises NotFound (no such grid), Invalid (parameters), CannotConvert (no alignment fits well enough).
     """
@@ -112,7 +112,7 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, request: 
         notes.warn(reason)
     if any(k.layer in ("topology", "zones", "imagery") or (k.layer == "occupancy" and k != key) for k in entries):
         notes.warn("only the grid moves; features drawn on it in local metres keep their coordinates")
-    if request.dry_run:
+    if fit.score < request.least:
         return AlignmentResult(report, tuple(notes.warnings), None)
     old = entries[key].provenance.with_edit_step()
     provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": report}))

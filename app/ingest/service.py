@@ -27,6 +27,7 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.pool import WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
+from app.store.dry_runs import as_prepared
 from app.store.store import Store
 from app.store.values import Idempotency, Source, Version
 from app.upload_reader import UploadHints
@@ -61,12 +62,11 @@ class Upload:
     files: tuple[SpooledFile, ...]
     hints: UploadHints = field(default_factory=UploadHints)
     mode: Mode = "replace"
-    dry_run: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class CommitResult:
-    """Result of a change. body: the version as JSON; its ``version`` is null for a dry run."""
+    """Result of a change. version: None for a dry run. body: the version or dry run as JSON."""
 
     status: Literal["created", "unchanged", "dry_run", "replayed"]
     version: Version | None
@@ -74,7 +74,7 @@ class CommitResult:
 
 
 class Ingest:
-    """Operations that create versions."""
+    """Operations that create versions, or dry runs if the request says so."""
 
     def __init__(self, store: Store, run: Run, limits: Limits, provider: online.Provider | None = None) -> None:
         self._store, self._run, self._limits = store, run, limits
@@ -87,21 +87,13 @@ class Ingest:
         idempotency key was used for another request), Unavailable.
         """
         _check_upload(upload)
-        key = commit.idempotency(_fingerprint(upload, commit.message))
+        key = commit.idempotency(_fingerprint(upload, commit))
         paths = {f.name: f.path for f in upload.files}
 
         def once(base: Version) -> CommitResult:
             proposal: PreparedUpload = self._run_in_worker(
                 prepare_upload, base, paths, upload.hints, upload.mode, self._limits
             )
-            notes = {n.name: n for n in proposal.notes}
-            if upload.dry_run:
-                sources = [
-                    Source(f.name, f.size, f.sha256, notes[f.name].format, notes[f.name].used) for f in upload.files
-                ]
-                return CommitResult(
-                    "dry_run", None, self._preview(base, proposal.prepared, commit, proposal.warnings, sources)
-                )
             sources = self._store_sources(upload, proposal)
             return self._commit(environment, base, proposal.prepared, commit, key, proposal.warnings, sources)
 
@@ -134,9 +126,12 @@ class Ingest:
     ) -> CommitResult:
         def once(base: Version) -> CommitResult:
             changes = edits(base)
-            if not changes and key is None:
+            if changes or key is not None:
+                change_set, warnings = edit_changes(self._store, base, changes)
+            elif commit.dry_run:
+                change_set, warnings = Changes(), ()
+            else:
                 return CommitResult("unchanged", base, base.as_dict())
-            change_set, warnings = edit_changes(self._store, base, changes)
             prepared: Prepared = self._run_in_worker(prepare_changes, base, change_set)
             return self._commit(environment, base, prepared, commit, key, warnings)
 
@@ -213,18 +208,17 @@ class Ingest:
         return self._commit_on_head(environment, key, commit.if_match, once, "commit the fetched image")
 
     def align(self, environment: str, request: AlignmentRequest, commit: CommitRequest) -> CommitResult:
-        """Align a grid with another map and commit it as one version, unless it is a dry run.
+        """Align a grid with another map and commit it as one version.
 
-        body of the result: {alignment, version, warnings}. Raises NotFound, Invalid, CannotConvert (nothing fits),
-        StaleParent.
+        body of the result: {alignment, version, warnings, dry_run}. Raises NotFound, Invalid, CannotConvert (nothing
+        fits), StaleParent.
         """
+        request = dataclasses.replace(request, dry_run=commit.dry_run)
         key = commit.idempotency(_digest(["align", dataclasses.asdict(request), commit.message]))
-        replayed = None if request.dry_run else self._previous_result(environment, key)
+        replayed = self._previous_result(environment, key)
         if replayed is not None and replayed.version is not None:
             report = previous_alignment(replayed.version, request)
-            return dataclasses.replace(
-                replayed, body=_alignment_as_json(report, replayed.version, replayed.version.warnings)
-            )
+            return dataclasses.replace(replayed, body=_alignment_as_json(report, replayed, replayed.version.warnings))
         described = commit.with_default_message(f"Aligned the grid {request.level}/{request.grid}")
 
         def once(base: Version) -> CommitResult:
@@ -232,11 +226,10 @@ class Ingest:
                 prepare_alignment, base, request, failure="the grid could not be aligned"
             )
             if result.prepared is None:
-                return CommitResult("dry_run", None, _alignment_as_json(result.summary, None, result.warnings))
-            outcome = self._commit(environment, base, result.prepared, described, key, result.warnings)
-            return dataclasses.replace(
-                outcome, body=_alignment_as_json(result.summary, outcome.version, result.warnings)
-            )
+                outcome = CommitResult("dry_run", None, {})
+            else:
+                outcome = self._commit(environment, base, result.prepared, described, key, result.warnings)
+            return dataclasses.replace(outcome, body=_alignment_as_json(result.summary, outcome, result.warnings))
 
         return self._commit_on_head(environment, None, commit.if_match, once, "align the grid")
 
@@ -246,6 +239,10 @@ class Ingest:
         text = commit.message or f"Revert to version {to}"
 
         def once(base: Version) -> CommitResult:
+            if commit.dry_run:
+                target = self._store.versions.get(environment, to)
+                prepared = self._store.versions.prepare_revert(base, target)
+                return self._commit(environment, base, prepared, commit.with_message(text), None)
             same = self._store.versions.get(environment, to).root == base.root
             noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
             version = self._store.versions.revert(
@@ -254,6 +251,26 @@ class Ingest:
             return CommitResult("unchanged" if same else "created", version, version.as_dict())
 
         return self._commit_on_head(environment, key, commit.if_match, once, "revert the environment")
+
+    def commit_dry_run(self, environment: str, ref: str, commit: CommitRequest) -> CommitResult:
+        """Commit exactly what a dry run (``dry:<id>``) tried, with its sources, provenance and warnings.
+
+        Raises NotFound if it has expired, StaleParent if it was not made for the head, Conflict.
+        """
+        key = commit.idempotency(_digest(["commit", ref, commit.message]))
+        replayed = self._previous_result(environment, key)
+        if replayed is not None:
+            return replayed
+        head = self._store.versions.get(environment)
+        check_if_match(commit.if_match, head)
+        tried = self._store.versions.get(environment, ref)
+        if tried.parent != head.number:
+            raise StaleParent(
+                f"the head of {environment} is version {head.number}, the dry run was made for version {tried.parent}: "
+                "run it again and review the changes"
+            )
+        described = commit.with_default_message(tried.message)
+        return self._commit(environment, head, as_prepared(tried), described, key, tried.warnings, tried.sources)
 
     def set_datum(self, environment: str, datum: Datum, commit: CommitRequest) -> CommitResult:
         """Commit a version with another datum: local features keep their metres, wgs84 features their degrees."""
@@ -273,13 +290,11 @@ class Ingest:
         update: validated. Raises StaleParent, Conflict.
         """
         fingerprint = _digest(["template", update.as_dict(), commit.message])
-        key = None if update.dry_run else commit.idempotency(fingerprint)
+        key = commit.idempotency(fingerprint)
         described = commit.with_default_message(update.summary())
 
         def once(base: Version) -> CommitResult:
             prepared = self._store.versions.prepare(base, Changes(templates=update.apply_to(base.templates)))
-            if update.dry_run:
-                return CommitResult("dry_run", None, self._preview(base, prepared, described))
             return self._commit(environment, base, prepared, described, key)
 
         return self._commit_on_head(environment, key, commit.if_match, once, "set the templates")
@@ -321,6 +336,16 @@ class Ingest:
         warnings: Sequence[Problem] = (),
         sources: Sequence[Source] = (),
     ) -> CommitResult:
+        if commit.dry_run:
+            tried = self._store.versions.store_dry_run(
+                environment,
+                prepared,
+                author=commit.author,
+                message=commit.message,
+                sources=tuple(sources),
+                warnings=tuple(warnings),
+            )
+            return CommitResult("dry_run", None, dry_run_as_json(self._store, tried))
         if not prepared.changed:
             # Store the key too: if the request is repeated after other changes, it must not undo them.
             noted = None if key is None else Idempotency(key.key, UNCHANGED + key.fingerprint)
@@ -381,39 +406,21 @@ class Ingest:
         except WorkerDied as error:
             raise UnreadableFile(f"{failure}: {error.detail}") from error
 
-    def _preview(
-        self,
-        base: Version,
-        p: Prepared,
-        commit: CommitRequest,
-        warnings: Sequence[Problem] = (),
-        sources: Sequence[Source] = (),
-    ) -> dict[str, Any]:
-        """Describe the version that a change would create, without a number."""
-        preview = Version(
-            environment=base.environment,
-            number=base.number,
-            root=p.root,
-            parent=base.number,
-            author=commit.author,
-            message=commit.message,
-            time=base.time,
-            changes=p.changes,
-            sources=tuple(sources),
-            warnings=tuple(warnings),
-            datum=p.datum,
-            levels=p.levels,
-            parts=p.parts,
-            templates=p.templates,
-        )
-        return {**preview.as_dict(), "version": None, "time": None}
+
+def dry_run_as_json(store: Store, tried: Version) -> dict[str, Any]:
+    """Describe a dry run: the version as it would be, with its differences from the head that it was made for."""
+    assert tried.parent is not None
+    layers = store.content.diff(store.versions.get(tried.environment, tried.parent), tried)
+    return {**tried.as_dict(), "diff": {"from": tried.parent, "to": tried.ref, "layers": layers}}
 
 
 def _alignment_as_json(
-    report: Mapping[str, Any] | None, version: Version | None, warnings: Sequence[Problem]
+    report: Mapping[str, Any] | None, outcome: CommitResult, warnings: Sequence[Problem]
 ) -> dict[str, Any]:
-    version_body = None if version is None else version.as_dict()
-    return {"alignment": report, "version": version_body, "warnings": [w.as_dict() for w in warnings]}
+    version_body = None if outcome.version is None else outcome.version.as_dict()
+    dry_run = outcome.body if outcome.status == "dry_run" and outcome.body else None
+    problems = [w.as_dict() for w in warnings]
+    return {"alignment": report, "version": version_body, "warnings": problems, "dry_run": dry_run}
 
 
 def check_if_match(header: str | None, head: Version) -> None:
@@ -484,9 +491,9 @@ def _tries(if_match: str | None) -> list[bool]:
     return [k == count - 1 for k in range(count)]
 
 
-def _fingerprint(upload: Upload, message: str) -> str:
+def _fingerprint(upload: Upload, commit: CommitRequest) -> str:
     hints = upload.hints
-    values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, message, upload.dry_run]
+    values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, commit.message, commit.dry_run]
     files = sorted([f.name, f.sha256] for f in upload.files)
     return _digest(["upload", values, dict(sorted(hints.options.items())), files])
 

@@ -21,7 +21,6 @@ class TemplateUpdate:
     set: str | None = None
     formats: Mapping[str, FormatTemplate] = field(default_factory=dict)
     clear: bool = False
-    dry_run: bool = False
 
     def validated(self, location: str = "body.formats.{}") -> TemplateUpdate:
         """Return the update with typed values.
@@ -39,7 +38,7 @@ class TemplateUpdate:
             out[name] = FormatTemplate(
                 format_template.set, templates.check_values(fmt, format_template.values, f"{place}.values")
             )
-        return TemplateUpdate(self.set, out, self.clear, self.dry_run)
+        return TemplateUpdate(self.set, out, self.clear)
 
     def apply_to(self, old: Templates) -> Templates:
         """Return the templates after the update."""

@@ -103,7 +103,8 @@ class Prepared:
     chunks: hash (hex) -> stored bytes of all chunks that are missing or damaged in the base. blobs: SHA-256 -> content
     of files that belong to the content (resources). changes: counts by layer. changed: whether the root differs from
     the base's, or the provenance of derived parts is renewed. index: the changes to the index if they are few, else
-    None (the next query updates it). area: KEEP if it is the base's, None if the next query computes it.
+    None (the next query updates it). area: KEEP if it is the base's, None if the next query computes it. dry_run: id of
+    the dry run that stored the content, which must not have expired.
     """
 
     base: int
@@ -118,3 +119,4 @@ class Prepared:
     blobs: Mapping[str, bytes] = field(default_factory=dict)
     index: tuple[IndexRows, ...] | None = None
     area: Area | Literal[Keep.KEEP] | None = None
+    dry_run: str | None = None

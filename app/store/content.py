@@ -149,6 +149,6 @@ def _grid_delta(draft: ChunkStage, key: PartKey, old: PartRoot | None, new: Part
 def _missing(version: Version, key: PartKey) -> str:
     contents = ", ".join(f"{e.key.layer}/{e.key.level}/{e.key.name}" for e in version.parts) or "nothing"
     return (
-        f"version {version.number} of {version.environment} has no {key.layer} {key.name!r} on level {key.level!r}; it "
+        f"version {version.ref} of {version.environment} has no {key.layer} {key.name!r} on level {key.level!r}; it "
         f"has {contents}"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import ormsgpack
@@ -91,12 +91,17 @@ def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Ve
         time=row.time,
         changes=row.changes,
         sources=tuple(sources),
-        warnings=tuple(Problem(w["problem"], w.get("file"), w.get("line"), w.get("where")) for w in row.warnings),
+        warnings=warnings_from_row(row.warnings),
         datum=datum,
         levels=levels,
         parts=parts,
         templates=templates,
     )
+
+
+def warnings_from_row(rows: Sequence[Mapping[str, Any]]) -> tuple[Problem, ...]:
+    """Convert stored warnings."""
+    return tuple(Problem(w["problem"], w.get("file"), w.get("line"), w.get("where")) for w in rows)
 
 
 def read_sources(connection: Connection, environment_id: str, numbers: Sequence[int]) -> dict[int, list[Source]]:

@@ -207,6 +207,28 @@ source = Table(
 )
 """Files of a version, in the order of the upload."""
 
+dry_run = Table(
+    "dry_run",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    _environment(nullable=False, index=True),
+    Column("base", Integer, nullable=False),
+    Column("root", String(64), nullable=False),
+    Column("author", Text, nullable=False),
+    Column("message", Text, nullable=False),
+    Column("created", UtcDateTime, nullable=False),
+    Column("expires", UtcDateTime, nullable=False, index=True),
+    Column("changed", Boolean, nullable=False),
+    Column("changes", JSON, nullable=False),
+    Column("warnings", JSON, nullable=False),
+    Column("sources", JSON, nullable=False),
+    Column("manifest", LargeBinary, nullable=False),
+)
+"""Versions that were tried and not committed; garbage collection keeps their content as long as the row exists.
+
+base: number of the head that they were made for. sources: as in ``source``. changed: see ``Prepared``.
+"""
+
 chunk = Table(
     "chunk",
     metadata,

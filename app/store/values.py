@@ -197,13 +197,33 @@ def datum_information(datum: Datum, parts: Iterable[PartEntry]) -> Information:
     return "generated" if made_up else "raw"
 
 
+DRY_PREFIX = "dry:"
+"""Start of the name of a dry run among the names of versions: ``dry:<id>``."""
+
+DRY_NUMBER = -1
+"""``Version.number`` of a dry run: no version has it."""
+
+
+@dataclass(frozen=True, slots=True)
+class DryRun:
+    """A version that was tried and not committed.
+
+    id: 32 hexadecimal digits. expires: until when it can be read. changed: whether committing it makes a version.
+    """
+
+    id: str
+    expires: datetime
+    changed: bool
+
+
 @dataclass(frozen=True, slots=True)
 class Version:
     """An immutable state of an environment.
 
     environment: its name. changes: counts of changes against its parent, by layer. warnings: of its sources. parts:
     sorted by key. templates: values for formats that need more than the layers have. closures: those that its maps
-    show; None: none (as it is stored).
+    show; None: none (as it is stored). dry_run: set if it is not committed; number is then ``DRY_NUMBER`` and time that
+    of the dry run.
     """
 
     environment: str
@@ -221,6 +241,12 @@ class Version:
     parts: tuple[PartEntry, ...]
     templates: Templates = NO_TEMPLATES
     closures: Closures | None = None
+    dry_run: DryRun | None = None
+
+    @property
+    def ref(self) -> int | str:
+        """Return the name by which it can be read in its environment: its number, or ``dry:<id>``."""
+        return self.number if self.dry_run is None else DRY_PREFIX + self.dry_run.id
 
     def part(self, key: PartKey) -> PartEntry | None:
         """Return the entry of a part, or None."""
@@ -270,15 +296,16 @@ class Version:
         return out
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the version as JSON."""
+        """Return the version as JSON; of a dry run without number and time, but with its ``id`` and expiry."""
+        dry = self.dry_run
         return {
             "environment": self.environment,
-            "version": self.number,
+            "version": self.number if dry is None else None,
             "root": self.root,
             "parent": self.parent,
             "author": self.author,
             "message": self.message,
-            "time": rfc3339(self.time),
+            "time": rfc3339(self.time) if dry is None else None,
             "changes": dict(self.changes),
             "sources": [source.as_dict() for source in self.sources],
             "warnings": [warning.as_dict() for warning in self.warnings],
@@ -287,6 +314,7 @@ class Version:
                 {"layer": k.layer, "level": k.level, "name": k.name, "changed": list(changed)}
                 for k, changed in self.stale.items()
             ],
+            **({} if dry is None else {"id": self.ref, "expires": rfc3339(dry.expires)}),
         }
 
 

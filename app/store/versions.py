@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent, Unavailable
 from app.model.templates import template_changes
-from app.store import chunks, index, outbox, parts, tables
+from app.store import chunks, dry_runs, index, outbox, parts, tables
 from app.store.area import area_after, write_area
 from app.store.audit import skip_audit
 from app.store.base import (
@@ -29,7 +29,7 @@ from app.store.database import Database
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
 from app.store.prepare import frame_changes, prepare, summarise
-from app.store.values import LATEST, Area, Idempotency, Source, Version
+from app.store.values import DRY_PREFIX, LATEST, Area, Idempotency, Source, Version
 
 MAX_REVERT_ATTEMPTS: Final = 8
 
@@ -176,10 +176,20 @@ class Versions:
         self._database, self._chunks, self._blobs = database, chunks, blobs
 
     def get(self, environment: str, ref: str | int = LATEST) -> Version:
-        """Read a version by number, channel or ``latest``. Raises NotFound, or Gone if the environment is deleted."""
+        """Read a version by number, channel or ``latest``, or a dry run by ``dry:<id>``.
+
+        Raises NotFound, or Gone if the environment is deleted.
+        """
         with self._database.read() as connection:
             row = environment_row(connection, environment)
+            if isinstance(ref, str) and ref.startswith(DRY_PREFIX):
+                return dry_runs.read(connection, row, ref, self._database.now())
             return read_version(connection, row, resolve(connection, row, ref))
+
+    def get_committed(self, environment: str, ref: str | int) -> Version:
+        """Read a version that robots may be given. Raises Invalid for a dry run, and the errors of ``get``."""
+        dry_runs.check_committed(ref)
+        return self.get(environment, ref)
 
     def page(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
         """List versions, newest first; ``before``: only those with a smaller number."""
@@ -230,7 +240,7 @@ class Versions:
 
         A key that was used before returns the version of that request. A prepared version without changes adds the
         sources to the head and returns it. Raises StaleParent if the head has moved since ``prepared.base``, Conflict
-        if the key was used with another fingerprint.
+        if the key was used with another fingerprint, NotFound if ``prepared.dry_run`` has expired.
         """
         checked_text(author, "an author")
         checked_text(message, "a message")
@@ -243,6 +253,8 @@ class Versions:
                 return read_version(connection, row, previous)
             _check_head(row, prepared.base)
             now = self._database.now()
+            if prepared.dry_run is not None:
+                dry_runs.lock(connection, row, prepared.dry_run, now)
             chunks.insert(connection, prepared.chunks)  # without changes: the repaired chunks
             if not prepared.changed:
                 _append_sources(connection, row.id, row.head, sources)
@@ -275,6 +287,44 @@ class Versions:
             stored = read_version(connection, row, version.number)
             append_version_event(connection, row, before, version, sequence)
         return stored
+
+    def store_dry_run(
+        self,
+        environment: str,
+        prepared: Prepared,
+        *,
+        author: str,
+        message: str,
+        sources: Sequence[Source] = (),
+        warnings: Sequence[Problem] = (),
+    ) -> Version:
+        """Store the prepared version as a dry run, which can be read and committed by its id until it expires.
+
+        The blobs of the sources must exist. Raises StaleParent if the head has moved since ``prepared.base``.
+        """
+        checked_text(author, "an author")
+        checked_text(message, "a message")
+        if prepared.blobs:
+            self._blobs.put_many(list(prepared.blobs.values()))
+        with self._database.write(notify=False, upkeep=True) as connection:
+            row = environment_row(connection, environment, lock=True)
+            _check_head(row, prepared.base)
+            chunks.insert(connection, prepared.chunks)
+            lock_blobs(connection, {*prepared.blobs, *(source.sha256 for source in sources)})
+            return dry_runs.insert(
+                connection,
+                row,
+                prepared,
+                author=author,
+                message=message,
+                sources=sources,
+                warnings=warnings,
+                now=self._database.now(),
+            )
+
+    def remove_expired_dry_runs(self) -> None:
+        """Remove expired dry runs; the next garbage collection removes their content."""
+        dry_runs.remove_expired(self._database)
 
     def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
         """Add files of an upload without changes to a version; returns the version with all of its files."""
@@ -311,7 +361,7 @@ class Versions:
             try:
                 return self.commit(
                     environment,
-                    self._prepare_revert(head, target),
+                    self.prepare_revert(head, target),
                     author=author,
                     message=message,
                     idempotency=idempotency,
@@ -321,7 +371,8 @@ class Versions:
                     raise
         raise AssertionError("unreachable")
 
-    def _prepare_revert(self, head: Version, target: Version) -> Prepared:
+    def prepare_revert(self, head: Version, target: Version) -> Prepared:
+        """Prepare a version on top of the head with the content of another one."""
         changed = head.root != target.root
         changes: dict[str, Any] = {}
         area: Area | Literal[Keep.KEEP] | None = KEEP

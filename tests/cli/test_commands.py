@@ -198,6 +198,19 @@ def test_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
     assert result.status == 0, result.err
     assert "topology: 2 changed" in result.out, "the node and the edge that starts at it"
     assert fleetmap("versions", "rehearsal", "--json").json[0]["version"] == 1
+    assert fleetmap("import", network, "-e", "rehearsal").status == 0
+    derived = fleetmap("derive", "rehearsal", "topology_to_occupancy", "--dry-run")
+    assert derived.status == 0, derived.err
+    assert derived.out.startswith("rehearsal: this would create a version\n  occupancy: map (")
+    generated = fleetmap("generate", "orchard", "-e", "rehearsal", "--replace", "--dry-run")
+    assert "\n  occupancy: map (" in generated.out, generated.err
+    assert fleetmap("generate", "orchard", "--to", "kml", "-o", "-", "--dry-run").status == 2
+    assert fleetmap("generate", "orchard", "-e", "nowhere", "--dry-run").status == 1
+    reverted = fleetmap("revert", "rehearsal", "1", "--dry-run")
+    assert reverted.out == "rehearsal: this would create a version\n  topology: 2 changed\n"
+    assert fleetmap("revert", "rehearsal", "2", "--dry-run").out == "rehearsal: this would change nothing\n"
+    assert fleetmap("revert", "rehearsal", "1", "--dry-run", "--json").json["id"].startswith("dry:")
+    assert fleetmap("versions", "rehearsal", "--json").json[0]["version"] == 2
 
 
 def test_damaged_file_is_refused_with_its_position(fleetmap: Fleetmap, tmp_path: Path) -> None:

@@ -47,9 +47,9 @@ def page_response(request: Request, items: list[Any], cursor: str | None) -> Res
 
 
 def version_headers(version: Version) -> dict[str, str]:
-    """Build the headers of a version: ``ETag`` for ``If-Match``, number and root."""
-    number = str(version.number)
-    return {"etag": f'"{number}"', "fleetmap-version": number, "fleetmap-root": version.root}
+    """Build the headers of a version: ``ETag`` for ``If-Match``, number and root. A dry run has its id for both."""
+    name = str(version.ref)
+    return {"etag": f'"{name}"', "fleetmap-version": name, "fleetmap-root": version.root}
 
 
 def commit_response(outcome: CommitResult) -> Response:

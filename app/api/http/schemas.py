@@ -17,6 +17,8 @@ from app.model.frame import MAX_DATUM_LATITUDE
 NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"
 CHANNEL = r"^[a-z][a-z0-9_-]{0,62}$"
 VERSION = r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$"
+DRY_RUN = r"^dry:[0-9a-f]{32}$"
+VERSION_OR_DRY_RUN = r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62}|dry:[0-9a-f]{32})$"
 MAX_TEXT = 20_000
 
 
@@ -89,16 +91,13 @@ class SourceOut(BaseModel):
     used: bool
 
 
-class VersionOut(BaseModel):
-    """Immutable version of an environment. `version` is null in a dry run."""
+class VersionContentOut(BaseModel):
+    """What versions and dry runs have in common."""
 
     environment: str
-    version: int | None
     root: str
-    parent: int | None
     author: str
     message: str
-    time: datetime | None
     changes: dict[str, Any]
     sources: list[SourceOut]
     warnings: list[ProblemItem]
@@ -108,14 +107,49 @@ class VersionOut(BaseModel):
     )
 
 
+class VersionOut(VersionContentOut):
+    """Immutable version of an environment."""
+
+    version: int
+    parent: int | None
+    time: datetime
+
+
+VersionName = Annotated[int | str, Field(description="Number of the version, or `dry:…` of a dry run.", examples=[3])]
+
+
+class DiffOut(BaseModel):
+    """Differences between two versions."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    from_: VersionName = Field(alias="from")
+    to: VersionName
+    layers: dict[str, Any]
+
+
+class DryRunOut(VersionContentOut):
+    """Version that a change would create. It can be read by its `id` for ten minutes, and committed."""
+
+    id: str = Field(
+        description="Name by which the dry run can be read like a version of its environment, and committed.",
+        examples=["dry:0123456789abcdef0123456789abcdef"],
+    )
+    expires: datetime = Field(description="Time from which it returns 404.")
+    version: None
+    parent: int = Field(description="Number of the head that it was made for.")
+    time: None
+    diff: DiffOut = Field(description="Differences from `parent`, as `GET …/diff` returns them.")
+
+
 EnvironmentPath = Annotated[
     str, Path(pattern=NAME, description="Name of the environment.", examples=["orchard"], max_length=63)
 ]
 VersionPath = Annotated[
     str,
     Path(
-        pattern=VERSION,
-        description="Version: number, channel, or `latest`.",
+        pattern=VERSION_OR_DRY_RUN,
+        description="Version: number, channel, or `latest`. To read: also the `id` of a dry run, `dry:…`.",
         examples=["latest"],
     ),
 ]
@@ -132,6 +166,13 @@ IfMatch = Annotated[
         "moved.",
     ),
 ]
+DryRun = Annotated[
+    bool,
+    Field(
+        description="Return the version that would be created, and store it only as a dry run: see `DryRunOut`. "
+        "`If-Match` is checked, an `Idempotency-Key` is not used up."
+    ),
+]
 IdempotencyKey = Annotated[
     str | None,
     Header(
@@ -141,6 +182,11 @@ IdempotencyKey = Annotated[
         "version.",
     ),
 ]
+
+
+UNCHANGED_OR_DRY_RUN: dict[int | str, dict[str, Any]] = {
+    200: {"model": VersionOut | DryRunOut, "description": "Nothing changed: the head. Or the dry run."}
+}
 
 
 def problem_responses(
