@@ -40,6 +40,7 @@ from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.config import Settings
 from app.convert.maps import Maps
+from app.convert.tiles import Tiles
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
@@ -294,6 +295,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         keys=keys,
         links=SignedLinks(secrets, access, store.environments.get, int(settings.link_seconds)),
         deltas=Deltas(service.cache),
+        tiles=Tiles(store, service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
     )

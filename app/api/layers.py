@@ -155,7 +155,7 @@ def get_layer(
     else:
         if crs == "wgs84" and version.datum is None:
             raise _no_datum(env)
-        key = _select_part(version, layer, level, name)
+        key = select_part(version, layer, level, name)
         if layer == "voxels":
             response = _voxels(services, version, key, _local_box(version, bbox, crs), accept)
         elif layer == "occupancy":
@@ -388,7 +388,7 @@ def _fit_to_size(version: Version, layer: Layer, level: str | None, name: str | 
     return sorted(k for k in keys if k.layer == layer and level in (None, k.level) and name in (None, k.name))
 
 
-def _select_part(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
+def select_part(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
     """Select a part: the named one, else ``map``, else the only one. Raises Ambiguous with the choices."""
     keys = _fit_to_size(version, layer, level, name)
     if not keys:

@@ -20,6 +20,7 @@ from app.api.http.schemas import IdempotencyKey, IfMatch
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.convert.maps import Maps
+from app.convert.tiles import Tiles
 from app.errors import Unavailable
 from app.fleet import ReportQueue as FleetIntake
 from app.ingest import CommitRequest, Ingest
@@ -109,6 +110,7 @@ class Services:
     keys: Keys
     links: SignedLinks
     deltas: Deltas
+    tiles: Tiles
     fleet: FleetIntake
     writability: Writability
     prepared: threading.Event = field(default_factory=threading.Event)
