@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
-from app.api.http.caching import none_match
+from app.api.http.caching import cache_control, none_match
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
@@ -28,11 +28,6 @@ from app.model.layers import PartKey
 from app.store.values import PartEntry, Version
 
 router = api_router("tiles", "/environments/{env}/versions/{v}/tiles")
-
-IMMUTABLE = "private, max-age=31536000, immutable"
-"""Numbered versions never change; ``private``, since a token is needed."""
-
-REVALIDATE = "private, no-cache"
 
 
 class RasterOut(BaseModel):
@@ -98,7 +93,7 @@ def _find(services: Services, env: str, v: str, kind: Kind, name: str, level: st
     entry = version.part(key)
     assert entry is not None
     headers = {
-        "cache-control": IMMUTABLE if isinstance(ref, int) else REVALIDATE,
+        "cache-control": cache_control(ref),
         "fleetmap-version": str(version.number),
         "fleetmap-root": version.root,
     }
