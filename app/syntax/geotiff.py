@@ -379,7 +379,8 @@ def fit_affine(points: Sequence[tuple[float, float, float, float]]) -> tuple[Aff
 def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> bytes:
     """Write a cloud optimized GeoTIFF: tiles of 512 pixels, overviews above that size, deflate with a predictor.
 
-    crs: its name or WKT; None: metres of the local frame. tags: of the whole file. The pixels are not copied: GDAL reads the array in place.
+    crs: its name or WKT; None: metres of the local frame. tags: of the whole file. The pixels are not copied: GDAL
+    reads the array in place.
     The file has no time stamp and no version, so equal images give equal bytes.
     """
     from rasterio import shutil
