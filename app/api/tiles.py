@@ -139,8 +139,8 @@ async def get_tile(
     if kind == "voxels":
         heights: Span | None = await run_in_threadpool(_heights, services, raster, z_min, z_max)
     elif z_min is not None or z_max is not None:
-        where = "z_min" if z_min is not None else "z_max"
-        raise Invalid(f"{where} selects a slice of voxels: omit it for {kind}", [Problem("omit it", where=where)])
+        given = "z_min" if z_min is not None else "z_max"
+        raise Invalid(f"{given} selects a slice of voxels: omit it for {kind}", [Problem("omit it", where=given)])
     else:
         heights = None
     raster.headers["etag"] = tile_etag(entry, address, heights)

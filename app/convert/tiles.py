@@ -118,9 +118,9 @@ class Tiles:
 
     def raster_tile(self, entry: PartEntry, address: TileAddress) -> bytes:
         """Return a tile of a grid or image as PNG. Raises NotFound outside the raster."""
-        found = self.cached(entry, address)
-        if found is not None:
-            return found
+        cached = self.cached(entry, address)
+        if cached is not None:
+            return cached
         source = self._source(entry)
         k = _reduction(source.size, address)
         if k >= STORED:
@@ -166,9 +166,9 @@ class Tiles:
         """Return the leaves of a voxel map. Raises NotFound if it is empty."""
         entry = version.part(key)
         assert entry is not None
-        found = self._columns.get(entry.hash)
-        if found is not None:
-            return found
+        cached = self._columns.get(entry.hash)
+        if cached is not None:
+            return cached
         voxels = self._store.content.load(version, [key]).parts[key]
         assert isinstance(voxels, VoxelMap)
         if not len(voxels):
@@ -179,18 +179,18 @@ class Tiles:
         """Return a tile of a slice of a voxel map as PNG. Raises NotFound outside the raster."""
         entry = version.part(key)
         assert entry is not None
-        found = self.cached(entry, address, heights)
-        if found is not None:
-            return found
+        cached = self.cached(entry, address, heights)
+        if cached is not None:
+            return cached
         columns = self.columns(version, key)
         k = _reduction(Size(columns.width, columns.height), address)
         cells = columns.tile(k, address.row * TILE, address.column * TILE, TILE, heights)
         return self._tiles.put((entry.hash, address, heights), encode_cells(cells))
 
     def _source(self, entry: PartEntry) -> Source:
-        found = self._sources.get(entry.hash)
-        if found is not None:
-            return found
+        cached = self._sources.get(entry.hash)
+        if cached is not None:
+            return cached
         reader = self.header(entry)
         source: Source
         if reader.kind == "grid":

@@ -73,8 +73,8 @@ class Columns:
         index = index[index < self.low.shape[1]]
         if len(index) == self.low.shape[1]:
             return np.flatnonzero(_meet(self.low, self.high, low, high))
-        found: NDArray[np.intp] = index[_meet(self.low[:, index], self.high[:, index], low, high)]
-        return found
+        chosen: NDArray[np.intp] = index[_meet(self.low[:, index], self.high[:, index], low, high)]
+        return chosen
 
 
 def _meet(

@@ -82,7 +82,7 @@ class RasterReader:
         leaves = tree.paths(self._draft, self._node, keys)
         chosen = set(codes.tolist())
         raws = self._draft.read_many(leaves)
-        return [found for leaf in leaves for found in tile_leaf(raws[leaf]) if found[0] in chosen]
+        return [row for leaf in leaves for row in tile_leaf(raws[leaf]) if row[0] in chosen]
 
     def _last(self) -> tuple[int, ...]:
         return () if self.bands is None else (self.bands,)
