@@ -40,6 +40,8 @@ from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.config import Settings
 from app.convert.maps import Maps
+from app.convert.preview import Previews
+from app.convert.tiles import Tiles
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
@@ -266,6 +268,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     def count(name: str, result: str) -> None:
         metrics.conversions.labels(name, result).inc()
 
+    tiles = Tiles(store, service.cache)
     return Services(
         options=ApiOptions(
             limits=settings.limits,
@@ -294,6 +297,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         keys=keys,
         links=SignedLinks(secrets, access, store.environments.get, int(settings.link_seconds)),
         deltas=Deltas(service.cache),
+        tiles=tiles,
+        previews=Previews(store, tiles, service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
     )

@@ -15,7 +15,7 @@ import shapely
 from fastapi import Path, Query, Request
 from numpy.typing import NDArray
 from PIL import Image
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
@@ -25,6 +25,7 @@ from app.api.http.parameters import numbers, parse_box, parse_version_ref
 from app.api.http.problems import NotAcceptable
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
+from app.convert.extents import bounds_in_both_frames
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
@@ -34,7 +35,19 @@ from app.model.imagery import GeoImage, display_pixels
 from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
 from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
-from app.store.values import Box, PartEntry, Version
+from app.store.values import Bounds, Box, PartEntry, Version
+
+
+class BoundsOut(BaseModel):
+    """Bounding boxes of a part. Null in a frame to which it cannot be converted, and without content."""
+
+    local: tuple[float, float, float, float] | None = Field(
+        description="Minimum x, minimum y, maximum x, maximum y in metres of the local frame."
+    )
+    wgs84: tuple[float, float, float, float] | None = Field(
+        description="West, south, east, north in degrees; west > east crosses the antimeridian. Null without a datum, "
+        "unless the part is stored in degrees."
+    )
 
 
 class LayerOut(BaseModel):
@@ -45,7 +58,7 @@ class LayerOut(BaseModel):
     name: str
     count: int
     hash: str
-    bounds: dict[str, list[float] | None]
+    bounds: BoundsOut
     information: str
     format: str | None = None
     sources: list[str]
@@ -74,9 +87,8 @@ Crs = Annotated[
 ]
 
 
-def entry_dict(entry: PartEntry) -> dict[str, Any]:
+def entry_dict(entry: PartEntry, bounds: Bounds) -> dict[str, Any]:
     """Convert a part entry to an item of the list of layers."""
-    bounds = {name: list(box) if box else None for name, box in (entry.bounds or {}).items()}
     p = entry.provenance
     return {
         "layer": entry.key.layer,
@@ -84,7 +96,7 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
         "name": entry.key.name,
         "count": entry.count,
         "hash": entry.hash,
-        "bounds": bounds,
+        "bounds": {"local": bounds.get("local"), "wgs84": bounds.get("wgs84")},
         "information": p.information,
         "format": p.format,
         "sources": list(p.sources),
@@ -94,9 +106,15 @@ def entry_dict(entry: PartEntry) -> dict[str, Any]:
 
 @router.get("", responses=problem_responses(list[LayerOut], 404), summary="List the layers of a version")
 def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """List the parts of a version: layer, level, name, item count, bounds and provenance."""
+    """List the parts of a version: layer, level, name, item count, bounds and provenance.
+
+    With a datum, bounds are given in both frames. Those of a grid or an image are of its turned outline. Those of other
+    parts contain the part, and may be larger than necessary if the datum has a heading.
+    """
     version = services.store.versions.get(env, parse_version_ref(v))
-    return json_response([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
+    entries = [entry for entry in version.parts if entry.key.layer != "resources"]
+    boxes = [bounds_in_both_frames(entry, version.datum, services.tiles.header) for entry in entries]
+    return json_response([entry_dict(entry, bounds) for entry, bounds in zip(entries, boxes, strict=True)])
 
 
 @router.get(
@@ -155,7 +173,7 @@ def get_layer(
     else:
         if crs == "wgs84" and version.datum is None:
             raise _no_datum(env)
-        key = _select_part(version, layer, level, name)
+        key = select_part(version, layer, level, name)
         if layer == "voxels":
             response = _voxels(services, version, key, _local_box(version, bbox, crs), accept)
         elif layer == "occupancy":
@@ -388,7 +406,7 @@ def _fit_to_size(version: Version, layer: Layer, level: str | None, name: str | 
     return sorted(k for k in keys if k.layer == layer and level in (None, k.level) and name in (None, k.name))
 
 
-def _select_part(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
+def select_part(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
     """Select a part: the named one, else ``map``, else the only one. Raises Ambiguous with the choices."""
     keys = _fit_to_size(version, layer, level, name)
     if not keys:

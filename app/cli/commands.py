@@ -34,6 +34,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
     "Environments and their versions": (
         ("environment", "environments:commands"),
         ("versions", "versions:versions"),
+        ("show", "show:show"),
         ("diff", "versions:diff"),
         ("revert", "versions:revert"),
         ("where", "position:locate"),

@@ -117,10 +117,10 @@ def export_map(
     params: dict[str, str] = options.pairs(option)
     params |= {} if derive else {"derive": "false"}
     with Client(server, token) as client:
-        chosen = version or _preferred_channel(client, environment)
+        chosen = version or preferred_channel(client, environment)
         base = quote_path("environments", environment, "versions", chosen)
         with client.download(base + quote_path("maps", format, *(file.split("/") if file else ())), params) as got:
-            written = _store(got, to)
+            written = store(got, to)
         report = client.get(base + quote_path("reports", format), params)
     if as_json:
         output.show_json({"files": written, "report": report})
@@ -155,7 +155,7 @@ def link(
     parameters |= {} if derive else {"derive": "false"}
     body: dict[str, Any] = {"format": format, "file": file, "parameters": parameters, "seconds": seconds}
     with Client(server, token) as client:
-        chosen = version or _preferred_channel(client, environment)
+        chosen = version or preferred_channel(client, environment)
         result = client.post_until_done(quote_path("environments", environment, "versions", chosen, "links"), body)
     if as_json:
         output.show_json(result)
@@ -379,7 +379,7 @@ def coverage(
         with Client(server, token) as client:
             address = quote_path("environments", environment, "versions", version, "provenance")
             with client.download(address, {}) as got:
-                written = _store(got, picture)
+                written = store(got, picture)
         output.print_status(f"wrote {', '.join(written)}")
         return
     with Client(server, token) as client:
@@ -485,13 +485,13 @@ def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bo
     output.show_warnings(body.get("warnings") or ())
 
 
-def _preferred_channel(client: Client, environment: str) -> str:
+def preferred_channel(client: Client, environment: str) -> str:
     """Return ``production`` if the channel exists, else ``latest``, like the short map address for robots."""
     names = {row["channel"] for row in channel_rows(client, environment)}
     return "production" if "production" in names else "latest"
 
 
-def _store(got: Download, to: str | None) -> list[str]:
+def store(got: Download, to: str | None) -> list[str]:
     """Write a download to a file, a folder or standard output. Return the written paths."""
     if to is not None and output_files.wants_folder(to):
         if got.is_zip:

@@ -440,8 +440,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         return _write_png(picture, named, stem, context)
     if named is None:
         context.warn(
-            "its coordinates are metres of the local frame, which has no CRS name; use crs=wgs84 for a position "
-            "on earth (needs a datum)",
+            "its coordinates are metres of the local frame, an engineering CRS without a position on earth; use "
+            "crs=wgs84 for one (needs a datum)",
             file=f"{stem}.tif",
         )
     tags = _tags(picture)
@@ -544,6 +544,7 @@ register(
         detect=detect,
         read=read,
         write=write,
+        version=2,
         needs=LayerRequirements((frozenset({"imagery"}),)),
         read_options=ReadOptions,
         write_options=WriteOptions,

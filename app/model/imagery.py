@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,28 +100,28 @@ def pixel_positions(transform: Affine, column: NDArray[np.float64], row: NDArray
     return np.column_stack([a * column + b * row + c, d * column + e * row + f])
 
 
-def display_pixels(picture: GeoImage) -> NDArray[np.uint8]:
+def display_pixels(picture: GeoImage, shown_range: tuple[float, float] | None = None) -> NDArray[np.uint8]:
     """Convert an image for display: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
 
     8-bit values stay as they are (without a copy if nothing changes); others are stretched so that the minimum becomes
     0 and the maximum 255, all bands alike. Bands beyond the colours are dropped, a palette is looked up. No-data and
     NaN become transparent.
+
+    shown_range: values that become 0 and 255, for a part of a larger image; None: of these pixels (``display_range``).
     """
     pixels, colours = picture.pixels, picture.colours
     height, width, _ = pixels.shape
     clear = next((k for k, colour in enumerate(colours) if colour in CLEAR), None)
     table = _palette(picture)
-    if all(colour in colours for colour in DEFAULT_COLOURS[3]):
-        shown = [colours.index(colour) for colour in DEFAULT_COLOURS[3]]
-    else:
-        first = next((k for k, colour in enumerate(colours) if colour in ("palette", "gray")), None)
-        shown = [first if first is not None else next((k for k in range(len(colours)) if k != clear), 0)]
+    shown = _shown_bands(colours)
     nodata = picture.nodata
     holes = clear is not None or nodata is not None or pixels.dtype.kind == "f"
     if pixels.dtype == np.uint8 and table is None and colours == DEFAULT_COLOURS.get(len(colours)) and nodata is None:
         return pixels
     rows = max(1, STRIP // width)
-    low, high = (0.0, 255.0) if pixels.dtype == np.uint8 or table is not None else _range(picture, shown, rows)
+    low, high = (0.0, 255.0) if shown_range is None else shown_range
+    if needs_range(picture) and shown_range is None:
+        low, high = display_range([picture])
     if table is not None:
         out = np.empty((height, width, 4), np.uint8)
     else:
@@ -150,6 +150,32 @@ def display_pixels(picture: GeoImage) -> NDArray[np.uint8]:
     return out
 
 
+def _shown_bands(colours: tuple[str, ...]) -> list[int]:
+    """Return the bands with red, green and blue, or the one that is shown in grey."""
+    if all(colour in colours for colour in DEFAULT_COLOURS[3]):
+        return [colours.index(colour) for colour in DEFAULT_COLOURS[3]]
+    clear = next((k for k, colour in enumerate(colours) if colour in CLEAR), None)
+    first = next((k for k, colour in enumerate(colours) if colour in ("palette", "gray")), None)
+    return [first if first is not None else next((k for k in range(len(colours)) if k != clear), 0)]
+
+
+def needs_range(picture: GeoImage) -> bool:
+    """Return whether the values of an image are stretched for display: those that are not 8-bit."""
+    return picture.pixels.dtype != np.uint8 and _palette(picture) is None
+
+
+def display_range(pieces: Iterable[GeoImage]) -> tuple[float, float]:
+    """Return the values of an image that become 0 and 255 for display. pieces: of the image, with its properties."""
+    low, high = math.inf, -math.inf
+    for piece in pieces:
+        rows = max(1, STRIP // piece.pixels.shape[1])
+        piece_low, piece_high = _range(piece, _shown_bands(piece.colours), rows)
+        low, high = min(low, piece_low), max(high, piece_high)
+    if not low < high:  # no data, or one value everywhere
+        return (low, low + 1.0) if math.isfinite(low) and low + 1.0 > low else (0.0, 1.0)
+    return low, high
+
+
 def _valid_mask(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_]:
     """Return which pixels have data: [rows, columns] of values [rows, columns, bands]."""
     valid = np.isfinite(values).all(axis=-1) if values.dtype.kind == "f" else np.ones(values.shape[:-1], bool)
@@ -159,15 +185,13 @@ def _valid_mask(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.
 
 
 def _range(picture: GeoImage, shown: list[int], rows: int) -> tuple[float, float]:
-    """Return the minimum and maximum value that is shown."""
+    """Return the minimum and maximum value that is shown; infinite if there is none."""
     low, high = math.inf, -math.inf
     for y in range(0, len(picture.pixels), rows):
         values = picture.pixels[y : y + rows][..., shown]
         values = values[_valid_mask(values, picture.nodata)]
         if values.size:
             low, high = min(low, float(values.min())), max(high, float(values.max()))
-    if not low < high:  # no data, or one value everywhere
-        return (low, low + 1.0) if math.isfinite(low) and low + 1.0 > low else (0.0, 1.0)
     return low, high
 
 

@@ -30,7 +30,10 @@ BLOCK = 512
 """Side of a written tile, in pixels."""
 
 OWN_TAG = "FLEETMAP_CRS"
-"""Private metadata item: ``local`` if the coordinates are metres of the local frame, which has no CRS."""
+"""Private metadata item: ``local`` if the coordinates are metres of the local frame."""
+
+LOCAL_WKT = 'LOCAL_CS["local frame",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+"""The local frame as an engineering CRS, without a position on earth: GDAL keeps its name and unit in GeoTIFF keys."""
 
 MAX_WKT = 2**16
 """Maximum length of a CRS definition, in characters: ten times PROJ's longest."""
@@ -376,7 +379,8 @@ def fit_affine(points: Sequence[tuple[float, float, float, float]]) -> tuple[Aff
 def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> bytes:
     """Write a cloud optimized GeoTIFF: tiles of 512 pixels, overviews above that size, deflate with a predictor.
 
-    crs: its name, None for none. tags: of the whole file. The pixels are not copied: GDAL reads the array in place.
+    crs: its name or WKT; None: metres of the local frame. tags: of the whole file. The pixels are not copied: GDAL
+    reads the array in place.
     The file has no time stamp and no version, so equal images give equal bytes.
     """
     from rasterio import shutil
@@ -417,8 +421,7 @@ def _describe(
 ) -> None:
     interpretations = rasterio.enums.ColorInterp
     dataset.transform = rasterio.Affine(*picture.transform)
-    if crs is not None:
-        dataset.crs = rasterio.crs.CRS.from_user_input(crs)
+    dataset.crs = rasterio.crs.CRS.from_user_input(LOCAL_WKT if crs is None else crs)
     nodata = picture.nodata
     if nodata is not None and _can_represent(picture.pixels.dtype, nodata):
         dataset.nodata = nodata

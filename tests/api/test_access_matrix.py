@@ -87,6 +87,8 @@ ROWS = [
     *rows(
         "environment",
         viewer=f"GET {E}, GET {E}/versions, GET {V}, GET {V}/sources, GET {V}/sources/{{name}}, GET {V}/layers, "
+        f"GET {V}/tiles/{{kind}}/{{name}}, GET {V}/tiles/{{kind}}/{{name}}/{{z}}/{{row}}/{{col}}.png, "
+        f"GET {V}/preview.png, "
         f"GET {V}/layers/{{layer}}, GET {V}/maps, GET {V}/reports/{{format}}, POST {V}/links, GET {E}/diff, "
         f"GET {V}/delta, GET {E}/channels, GET {E}/transform, GET {E}/templates, GET {E}/templates/{{format}}, "
         f"GET {V}/manifest, GET {V}/provenance, GET {E}/overlays, GET {E}/overlays/nav2, GET {E}/overlays/rmf, "
@@ -105,7 +107,8 @@ ROWS = [
 NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
-          "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64}  # fmt: skip
+          "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
+          "z": "0", "row": "0", "col": "0"}  # fmt: skip
 
 
 @dataclass

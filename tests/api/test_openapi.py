@@ -45,6 +45,8 @@ def operations(schema: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
 def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
     e, v = "/api/v1/environments/{env}", "/api/v1/environments/{env}/versions/{v}"
     wanted = {
+        f"{v}/tiles/{{kind}}/{{name}}": "get", f"{v}/tiles/{{kind}}/{{name}}/{{z}}/{{row}}/{{col}}.png": "get",
+        f"{v}/preview.png": "get",
         "/healthz": "get", "/readyz": "get", "/metrics": "get", "/api/v1/formats": "get",
         "/api/v1/environments": "get post", e: "get patch delete", f"{e}/restore": "post", f"{e}/purge": "post",
         f"{e}/versions": "get post", v: "get", f"{v}/sources": "get", f"{v}/sources/{{name}}": "get",

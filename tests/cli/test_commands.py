@@ -86,6 +86,18 @@ def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp
     assert len(fleetmap("versions", "story", "-n", "2", "--json").json) == 2
 
 
+def test_show_writes_a_picture(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    history(fleetmap, network, "drawn")
+    out = tmp_path / "drawn.png"
+    assert fleetmap("show", "drawn", "-o", out, "--theme", "dark", "--width", "300").out.strip() == str(out)
+    picture = Image.open(out)
+    assert picture.width == 300
+    assert picture.getpixel((0, 0)) == (20, 23, 27)  # the background of the dark theme
+    assert fleetmap("show", "drawn", "-o", out, "--layers", "imagery").status == 1
+
+
 def test_all_environments_are_listed(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "listed-farm").status == 0
     rows = {row["name"]: row for row in fleetmap("versions", "--json").json}

@@ -277,8 +277,32 @@ def test_local_metres_round_trip_without_warning(transform: Any) -> None:
     assert (back.crs, back.transform, context.warnings) == ("local", transform, [])
 
 
+def test_local_metres_are_an_engineering_crs() -> None:
+    import rasterio
+    from rasterio.io import MemoryFile
+
+    data = tif(GeoImage(np.ones((2, 3, 1), np.uint8), (0.04, 0.03, 1.0, 0.03, -0.04, 2.0)))
+    with MemoryFile(data) as file, file.open() as dataset:
+        assert dataset.crs.to_wkt().startswith('LOCAL_CS["local frame",UNIT["metre",1')
+        assert dataset.transform[:6] == (0.04, 0.03, 1.0, 0.03, -0.04, 2.0)
+        assert dataset.crs != rasterio.crs.CRS.from_epsg(32630)
+    picture, context = read({"a.tif": without_tag(data)})
+    assert (picture.crs, context.warnings) == ("local", [])
+
+
+def tiff_without_crs() -> bytes:
+    import rasterio
+    from rasterio.io import MemoryFile
+
+    with MemoryFile() as file:
+        size = {"width": 3, "height": 2, "count": 1, "dtype": "uint8"}
+        with file.open(driver="GTiff", transform=rasterio.Affine(2.0, 0.0, 5e5, 0.0, -2.0, 4e5), **size) as dataset:
+            dataset.write(np.ones((1, 2, 3), np.uint8))
+        return bytes(file.read())
+
+
 def test_tiff_without_crs_uses_option() -> None:
-    data = without_tag(tif(GeoImage(np.ones((2, 3, 1), np.uint8), (2.0, 0.0, 5e5, 0.0, -2.0, 4e5))))
+    data = tiff_without_crs()
     assert read({"a.tif": data})[0].crs == "local"
     picture, context = read({"a.tif": data}, options={"crs": "epsg:27700"})
     assert picture.crs == "EPSG:27700"

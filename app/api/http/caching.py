@@ -6,9 +6,17 @@ import re
 from dataclasses import dataclass
 from urllib.parse import quote
 
+IMMUTABLE = "private, max-age=31536000, immutable"
+REVALIDATE = "private, no-cache"
+
 _TAG = re.compile(r'\s*(?:(W/)?("[\x21\x23-\x7e\x80-\xff]*"))\s*(?:,|$)')
 _RANGE = re.compile(r"bytes\s*=\s*(.*)", re.IGNORECASE)
 _ONE_RANGE = re.compile(r"\s*(\d{0,18})\s*-\s*(\d{0,18})\s*")
+
+
+def cache_control(version: str | int) -> str:
+    """Return ``Cache-Control`` of a version's content: a number never changes; ``private``, since a token is needed."""
+    return IMMUTABLE if isinstance(version, int) else REVALIDATE
 
 
 def none_match(header: str | None, etag: str) -> bool:

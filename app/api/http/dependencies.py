@@ -20,6 +20,8 @@ from app.api.http.schemas import IdempotencyKey, IfMatch
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.convert.maps import Maps
+from app.convert.preview import Previews
+from app.convert.tiles import Tiles
 from app.errors import Unavailable
 from app.fleet import ReportQueue as FleetIntake
 from app.ingest import CommitRequest, Ingest
@@ -109,6 +111,8 @@ class Services:
     keys: Keys
     links: SignedLinks
     deltas: Deltas
+    tiles: Tiles
+    previews: Previews
     fleet: FleetIntake
     writability: Writability
     prepared: threading.Event = field(default_factory=threading.Event)
