@@ -87,7 +87,8 @@ NamePath = Annotated[str, Path(max_length=256, description="Name of the grid.", 
 LevelQuery = Annotated[
     str | None, Query(max_length=256, description="Level of the grid; required if several levels have the name.")
 ]
-IndexPath = Annotated[int, Path(ge=0, le=2**20, examples=[0])]
+RowPath = Annotated[int, Path(ge=0, le=2**20, description="Row of the tile, 0 on top.", examples=[0])]
+ColumnPath = Annotated[int, Path(ge=0, le=2**20, description="Column of the tile, 0 on the left.", examples=[0])]
 NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "Not modified: the client has this content"}}
 
 
@@ -105,8 +106,8 @@ async def get_change_tile(
     env: EnvironmentPath,
     name: NamePath,
     z: Annotated[int, Path(ge=0, le=32, description="Level of detail, 0 to `levels` - 1.", examples=[0])],
-    row: IndexPath,
-    col: IndexPath,
+    row: RowPath,
+    col: ColumnPath,
     request: Request,
     services: ServicesDep,
     _: Viewer,

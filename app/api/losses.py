@@ -45,7 +45,7 @@ router = api_router("maps", "/environments/{env}/versions/{v}/losses")
 class DroppedOut(BaseModel):
     """Content that a format cannot contain, as its report states it."""
 
-    what: str
+    subject: str = Field(alias="what")
     count: int
     why: str
 

@@ -84,6 +84,7 @@ ROWS = [
         "environment",
         viewer=f"GET {E}, GET {E}/versions, GET {V}, GET {V}/sources, GET {V}/sources/{{name}}, GET {V}/layers, "
         f"GET {V}/layers/{{layer}}, GET {V}/maps, GET {V}/reports/{{format}}, POST {V}/links, GET {E}/diff, "
+        f"GET {E}/diff/tiles/{{name}}, GET {E}/diff/tiles/{{name}}/{{z}}/{{row}}/{{col}}.png, GET {V}/losses, "
         f"GET {V}/delta, GET {E}/channels, GET {E}/transform, GET {E}/templates, GET {E}/templates/{{format}}, "
         f"GET {V}/manifest, GET {V}/provenance, GET {E}/overlays, GET {E}/overlays/nav2, GET {E}/overlays/rmf, "
         f"GET {E}/overlays/vda5050, GET {V}/vda5050/actions, GET {V}/maps/{{format}}, "
@@ -101,7 +102,8 @@ ROWS = [
 NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
-          "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64}  # fmt: skip
+          "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
+          "z": "0", "row": "0", "col": "0"}  # fmt: skip
 
 
 @dataclass

@@ -13,6 +13,7 @@ import shapely
 from fastapi import Query
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
+from pydantic.json_schema import SkipJsonSchema
 
 from app.api.http.schemas import DatumOut
 from app.errors import Invalid, MissingDatum, Problem
@@ -43,35 +44,44 @@ PageCursor = Annotated[
 ]
 
 
+def omittable(description: str, alias: str | None = None) -> Any:
+    """Declare a member of a response that is omitted, never null; its type is ``X | SkipJsonSchema[None]``."""
+
+    def drop_default(schema: dict[str, Any]) -> None:
+        schema.pop("default", None)
+
+    return Field(None, alias=alias, description=description, json_schema_extra=drop_default)
+
+
 class GeometryOut(BaseModel):
     """Geometry as in GeoJSON, in the coordinates of the collection."""
 
     type: Literal[
         "Point", "LineString", "Polygon", "MultiPoint", "MultiLineString", "MultiPolygon", "GeometryCollection"
     ]
-    coordinates: list[Any] | None = Field(None, description="Omitted for a `GeometryCollection`.")
-    geometries: list[dict[str, Any]] | None = Field(None, description="Only of a `GeometryCollection`.")
+    coordinates: list[Any] | SkipJsonSchema[None] = omittable("Omitted for a `GeometryCollection`.")
+    geometries: list[dict[str, Any]] | SkipJsonSchema[None] = omittable("Only of a `GeometryCollection`.")
 
 
 class CollectionOut(BaseModel):
     """Members that all collections of features share."""
 
     type: Literal["FeatureCollection"]
-    conforms_to: list[str] | None = Field(
-        None, alias="conformsTo", description="JSON-FG, if the coordinates are local. Else omitted."
+    conforms_to: list[str] | SkipJsonSchema[None] = omittable(
+        "JSON-FG, if the coordinates are local. Else omitted.", "conformsTo"
     )
-    coord_ref_sys: Literal["urn:fleetmap:crs:local"] | None = Field(
-        None,
-        alias="coordRefSys",
-        description="If the coordinates are local metres: in `place` of each feature. Else omitted.",
+    coord_ref_sys: Literal["urn:fleetmap:crs:local"] | SkipJsonSchema[None] = omittable(
+        "If the coordinates are local metres: in `place` of each feature. Else omitted.", "coordRefSys"
     )
-    datum: DatumOut | None = Field(None, description="Origin of local coordinates.")
-    next: str | None = Field(None, description="Cursor of the next page. Omitted on the last page.")
-    number_matched: int | None = Field(
-        None, alias="numberMatched", description="Number of features on all pages. Only with `limit`."
+    datum: DatumOut | None = Field(
+        None, description="Origin of local coordinates; null if there is none. Omitted if the coordinates are WGS 84."
     )
-    number_returned: int | None = Field(
-        None, alias="numberReturned", description="Number of features on this page. Only with `limit`."
+    next: str | SkipJsonSchema[None] = omittable("Cursor of the next page. Omitted on the last page.")
+    number_matched: int | SkipJsonSchema[None] = omittable(
+        "Number of features on all pages. Only with `limit`.", "numberMatched"
+    )
+    number_returned: int | SkipJsonSchema[None] = omittable(
+        "Number of features on this page. Only with `limit`.", "numberReturned"
     )
 
 

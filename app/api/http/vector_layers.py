@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
+from pydantic.json_schema import SkipJsonSchema
 
 from app.api.http.features import (
     CollectionOut,
@@ -19,6 +20,7 @@ from app.api.http.features import (
     digits_of,
     geometries_as_geojson,
     missing_datum_error,
+    omittable,
     page_of,
     placed,
 )
@@ -54,10 +56,8 @@ class LayerFeaturesOut(CollectionOut):
     """Features of a layer."""
 
     features: list[FeatureOut]
-    left_out: int | None = Field(
-        None,
-        alias="leftOut",
-        description="Number of features that are too small or too dense to draw. Only with `zoom`.",
+    left_out: int | SkipJsonSchema[None] = omittable(
+        "Number of features that are too small or too dense to draw. Only with `zoom`.", "leftOut"
     )
 
 
