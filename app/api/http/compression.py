@@ -22,6 +22,9 @@ else:
 MIN_BYTES = 1024
 """Minimum size of a compressed response: smaller ones fit into one packet."""
 
+SMALL_DIGITS = 3
+"""Maximum number of digits of a Content-Length that is small for certain."""
+
 INLINE_BYTES = 32 * 2**10
 """Maximum size of a response that is compressed at once, in less than a millisecond; others are in a thread."""
 
@@ -124,10 +127,13 @@ def accepted_coding(accept_encoding: bytes) -> bytes | None:
 
 
 def _is_compressible(start: Message) -> bool:
-    """Test if a response is JSON that is not a file."""
+    """Test if a response is JSON that is not a file, and not known to be small."""
     compressible = False
     for name, value in start.get("headers", ()):
-        if name == b"content-type":
+        if name == b"content-length":
+            if len(value) <= SMALL_DIGITS:
+                return False
+        elif name == b"content-type":
             media_type = value.partition(b";")[0].strip()
             compressible = media_type == b"application/json" or media_type.endswith(b"+json")
         elif name in _BINARY:
