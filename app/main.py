@@ -28,6 +28,7 @@ from app.api import events, health, maps, page, ros2, routers
 from app.api.http import openapi, problems
 from app.api.http.application import FleetMapApp
 from app.api.http.auth import Authenticator
+from app.api.http.compression import JsonCompression
 from app.api.http.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.http.conversions import HEARTBEAT_SECONDS, ConversionJobs
 from app.api.http.deltas import Deltas
@@ -91,6 +92,7 @@ def create_app(settings: Settings) -> FleetMapApp:
     app.add_exception_handler(HTTPException, problems.handle_http)
     app.add_exception_handler(RequestValidationError, problems.handle_validation)
     app.add_middleware(Guard)
+    app.add_middleware(JsonCompression)  # the last one is the outermost
     maps.add_routes(app)
     openapi.add_pages(app)
     for router in (*routers(), health.root_router, page.root_router):

@@ -16,10 +16,11 @@ from starlette.responses import Response
 from app.api.http.auth import Viewer
 from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.features import Crs
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import VERSION, EnvironmentPath, VersionPath, problem_responses
-from app.api.layers import Crs, feature_collection
+from app.api.http.vector_layers import feature_collection
 from app.errors import MissingDatum
 from app.model.features import Features
 from app.model.frame import Anchor

@@ -15,6 +15,7 @@ from starlette.responses import Response
 from app import fleet
 from app.api.http.auth import Editor, Viewer
 from app.api.http.caching import none_match
+from app.api.http.compression import UNCOMPRESSED
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import CHANNEL, ApiTime, EnvironmentPath, RequestModel, problem_responses
@@ -187,6 +188,7 @@ async def list_channels(
     if robots:  # not shared: a shared result is valid until the next commit, and robot reports are not commits
         headers, data = await run_in_threadpool(_list_response, services, env, request, robots)
     else:
+        request.scope["state"][UNCOMPRESSED] = True  # as its repetition from memory
         headers, data = await services.response_cache.run_shared(
             request, _list_response, services, env, request, robots
         )

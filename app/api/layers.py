@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import orjson
-import shapely
 from fastapi import Path, Query, Request
 from numpy.typing import NDArray
 from PIL import Image
@@ -21,18 +19,19 @@ from starlette.responses import Response
 from app.api.http.auth import Viewer
 from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.features import GEOJSON, Crs, PageCursor, PageLimit, missing_datum_error
 from app.api.http.parameters import numbers, parse_box, parse_version_ref
 from app.api.http.problems import NotAcceptable
-from app.api.http.responses import api_router, json_bytes, json_response
-from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
+from app.api.http.responses import api_router, json_bytes, json_response, next_page
+from app.api.http.schemas import EnvironmentPath, VersionPath, component_schemas, problem_responses
+from app.api.http.vector_layers import MAX_IDS, FeatureQuery, LayerFeaturesOut, parse_ids, write_layer
 from app.convert.extents import bounds_in_both_frames
-from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
-from app.model.features import Features
-from app.model.frame import GROUND, MAX_METRES, Anchor
-from app.model.geodesy import LocalFrame, local_frame
+from app.errors import Ambiguous, Invalid, NotFound, Problem
+from app.model.frame import MAX_METRES, Anchor
+from app.model.geodesy import local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage, display_pixels
-from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
+from app.model.layers import MAP, VECTOR_LAYERS, Layer, PartKey
 from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
 from app.store.values import Bounds, Box, PartEntry, Version
@@ -71,20 +70,6 @@ LayerPath = Annotated[
 ]
 
 router = api_router("layers", "/environments/{env}/versions/{v}/layers")
-
-LOCAL_CRS = "urn:fleetmap:crs:local"
-"""Name of the local frame in JSON-FG's ``coordRefSys``; the member ``datum`` gives its origin."""
-
-CONFORMS = ["http://www.opengis.net/spec/json-fg-1/1.0/conf/core"]
-GEOJSON = "application/geo+json"
-
-Crs = Annotated[
-    Literal["local", "wgs84"] | None,
-    Query(
-        description="`wgs84`: longitude, latitude in degrees. `local`: metres. Default: `wgs84` if there is a datum, "
-        "else `local`."
-    ),
-]
 
 
 def entry_dict(entry: PartEntry, bounds: Bounds) -> dict[str, Any]:
@@ -125,7 +110,7 @@ def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: 
         200: {
             "description": "The content",
             "content": {
-                GEOJSON: {"schema": {"type": "object"}},
+                GEOJSON: {"schema": {"$ref": "#/components/schemas/LayerFeaturesOut"}},
                 "image/png": {},
                 "application/json": {"schema": {"type": "object"}},
                 "application/octet-stream": {},
@@ -134,6 +119,7 @@ def list_layers(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: 
         304: {"description": "Not modified: the client has this content"},
     },
     summary="Get a layer",
+    openapi_extra=component_schemas(LayerFeaturesOut),
 )
 def get_layer(
     env: EnvironmentPath,
@@ -148,8 +134,33 @@ def get_layer(
     ] = None,
     bbox: Annotated[str | None, Query(description="Only content that intersects this box, given in `crs`.")] = None,
     crs: Crs = None,
+    q: Annotated[
+        str | None,
+        Query(max_length=200, description="Only features whose id, name or kind contains this text, in any case."),
+    ] = None,
+    ids: Annotated[
+        str | None,
+        Query(
+            description=f"Only features with these ids, separated by commas: 1 to {MAX_IDS}.", examples=["dock,gate"]
+        ),
+    ] = None,
+    zoom: Annotated[
+        int | None,
+        Query(
+            ge=0,
+            le=24,
+            description="For drawing at this zoom level (a pixel is 156543.034 m / 2^zoom): shapes are simplified to a "
+            "pixel, what is smaller is left out, and of several nodes in one pixel one is kept. Points that are no "
+            "nodes are all kept, and edges keep their geometry.",
+        ),
+    ] = None,
+    limit: PageLimit = None,
+    cursor: PageCursor = None,
 ) -> Response:
     """Return the content of a layer. Vector layers are GeoJSON; in the local frame JSON-FG, with metres in `place`.
+
+    Features are in the order of level, part and id. With `limit` they come in pages: `next` is the `cursor` of the
+    next one, also in the header `Link`.
 
     `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`. `voxels` are JSON (`counts` in voxels
     of the finest resolution, whether or not leaves are merged), or an OctoMap `.bt` with `Accept:
@@ -157,7 +168,9 @@ def get_layer(
     """
     version = services.store.versions.get(env, parse_version_ref(v))
     accept = request.headers.get("accept", "*/*")
-    seed = [version.root, layer, level, name, bbox, crs, accept]
+    given = {"q": q, "ids": ids, "zoom": zoom, "limit": limit, "cursor": cursor}
+    seed: list[Any] = [version.root, layer, level, name, bbox, crs, accept]
+    seed += [given] if any(value is not None for value in given.values()) else []
     etag = f'"{hashlib.sha256(json_bytes(seed)).hexdigest()[:32]}"'
     headers = {
         "etag": etag,
@@ -169,10 +182,12 @@ def get_layer(
         return Response(status_code=304, headers=headers)
     if layer in VECTOR_LAYERS:
         anchor: Anchor = crs or ("wgs84" if version.datum else "local")
-        response = _vector(services, version, layer, level, name, _box(bbox, anchor), anchor, accept)
+        query = FeatureQuery(_box(bbox, anchor), q, parse_ids(ids), zoom, limit, cursor)
+        response = _vector(request, services, version, layer, level, name, anchor, query)
     else:
+        _refuse_vector_parameters(layer, given)
         if crs == "wgs84" and version.datum is None:
-            raise _no_datum(env)
+            raise missing_datum_error(env)
         key = select_part(version, layer, level, name)
         if layer == "voxels":
             response = _voxels(services, version, key, _local_box(version, bbox, crs), accept)
@@ -198,97 +213,32 @@ def get_layer(
 
 
 def _vector(
+    request: Request,
     services: Services,
     version: Version,
     layer: Layer,
     level: str | None,
     name: str | None,
-    box: Box | None,
     crs: Anchor,
-    accept: str,
+    query: FeatureQuery,
 ) -> Response:
-    _choose(accept, GEOJSON, "application/json")
+    _choose(request.headers.get("accept", "*/*"), GEOJSON, "application/json")
     keys = _fit_to_size(version, layer, level, name)
     if not keys and (level is not None or name is not None):
         raise _no_such_part_error(version, layer, level, name)
-    frame = local_frame(version.datum) if version.datum else None
-    parts = [(key, services.store.content.features(version, key, bbox=box, crs=crs)) for key in keys]
-    if frame is None and any(len(part) and bool((part.local != (crs == "local")).any()) for _, part in parts):
-        raise _no_datum(version.environment)
-    fences = [e for e in version.parts if e.key.layer == "location" and e.count]
-    alone = layer == "location" and not fences and (box is None or _datum_within(version, box, crs))
-    collection = feature_collection(parts, crs, frame, version, with_datum=alone)
-    return Response(collection, media_type=GEOJSON)
+    body, cursor = write_layer(services.store.content, version, keys, crs, query, layer)
+    return Response(body, headers=next_page(request, cursor), media_type=GEOJSON)
 
 
-def feature_collection(
-    parts: Sequence[tuple[PartKey, Features]],
-    crs: Anchor,
-    frame: LocalFrame | None,
-    version: Version,
-    *,
-    with_datum: bool,
-) -> bytes:
-    """Write parts as GeoJSON (wgs84) or JSON-FG (local); each feature has its level and the name of its part.
-
-    Coordinates are rounded to 1e-12 degrees and 1e-9 metres. with_datum: add the datum as a point, for environments
-    that have a datum but no fence.
-    """
-    features: list[dict[str, Any]] = []
-    local = crs == "local"
-    datum = version.datum.as_dict() if version.datum else None
-    for key, part in parts:
-        geometry = part.in_local(frame) if local else part.in_wgs84(frame)
-        shapes = geometries_as_geojson(geometry, 9 if local else 12)
-        for k, (item, properties) in enumerate(zip(part.ids, part.properties, strict=True)):
-            feature: dict[str, Any] = {"type": "Feature", "id": item}
-            if local:
-                feature["geometry"], feature["place"] = None, shapes[k]
-            else:
-                feature["geometry"] = shapes[k]
-            if key.layer == "location" and datum is not None:
-                properties = {**properties, "datum": datum}  # noqa: PLW2901
-            feature |= {"properties": properties, "level": key.level, "part": key.name}
-            features.append(feature)
-    if with_datum and datum is not None:
-        place = [0.0, 0.0] if local else [datum["longitude"], datum["latitude"]]
-        shape = {"type": "Point", "coordinates": place}
-        placed = {"geometry": None, "place": shape} if local else {"geometry": shape}
-        properties = {"kind": "datum", "datum": datum}
-        features.append(
-            {"type": "Feature", "id": "datum", **placed, "properties": properties, "level": GROUND, "part": SITE}
+def _refuse_vector_parameters(layer: Layer, given: Mapping[str, object]) -> None:
+    """Raise Invalid for parameters of vector layers, requested for another one."""
+    names = [name for name, value in given.items() if value is not None]
+    if names:
+        vector = ", ".join(sorted(VECTOR_LAYERS))
+        raise Invalid(
+            f"{', '.join(names)}: not supported for {layer}, which has no features; omit it, or read {vector}",
+            [Problem("not supported for this layer", where=name) for name in names],
         )
-    out: dict[str, Any] = {"type": "FeatureCollection"}
-    if local:
-        out |= {"conformsTo": CONFORMS, "coordRefSys": LOCAL_CRS, "datum": datum}
-    return json_bytes({**out, "features": features})
-
-
-def _datum_within(version: Version, box: Box, crs: Anchor) -> bool:
-    """Test if the local origin is in a box."""
-    if version.datum is None:
-        return False
-    x, y = (0.0, 0.0) if crs == "local" else (version.datum.longitude, version.datum.latitude)
-    across = box[0] <= x <= box[2] if box[0] <= box[2] else x >= box[0] or x <= box[2]
-    return across and box[1] <= y <= box[3]
-
-
-def geometries_as_geojson(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragment | None]:
-    """Write each geometry as GeoJSON, rounded to ``digits``; None for empty geometries."""
-    if not len(geometry):
-        return []
-    flat = ~shapely.has_z(geometry)
-    rounded = np.empty(len(geometry), object)
-
-    def round_(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.round(values, digits) + 0.0
-
-    for mask, include_z in ((flat, False), (~flat, True)):
-        if mask.any():
-            rounded[mask] = shapely.transform(geometry[mask], round_, include_z=include_z)
-    empty = shapely.is_empty(rounded)
-    texts = shapely.to_geojson(rounded)
-    return [None if none else orjson.Fragment(text) for none, text in zip(empty, texts, strict=True)]
 
 
 # --- grids, voxels, images ---
@@ -429,13 +379,6 @@ def _no_such_part_error(version: Version, layer: Layer, level: str | None, name:
     selection = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
     description = f"{layer} {selection}".strip()
     return NotFound(f"version {version.ref} has no {description}; available: {', '.join(existing_names) or 'none'}")
-
-
-def _no_datum(environment: str) -> MissingDatum:
-    return MissingDatum(
-        f"{environment} has no datum, so local metres cannot be converted to WGS 84: PATCH it with "
-        f'{{"datum": {{…}}}}, upload a datum.yaml, or request the other crs'
-    )
 
 
 def _box(text: str | None, crs: Anchor) -> Box | None:

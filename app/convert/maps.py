@@ -18,8 +18,8 @@ import orjson
 from app import __version__, formats, parameters, templates
 from app.convert import closures as applied_closures
 from app.convert import files as direct
+from app.convert import losses, site
 from app.convert import recipe as recipes
-from app.convert import site
 from app.convert import worker as making
 from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap
 from app.convert.recipe import Recipe
@@ -156,6 +156,8 @@ class Maps:
         Blocks until the map is converted. stop: cancels the conversion from another thread; it then raises Cancelled.
         Raises CannotConvert if no chain works.
         """
+        if recipe.compared is not None:
+            return recipe, self.cache.get_or_make(recipe.key, partial(self._find_losses, recipe.compared, stop))
         try:
             return recipe, self._convert(recipe, stop)
         except CannotDerive:
@@ -183,6 +185,19 @@ class Maps:
         except (CannotConvert, NotFound, Invalid) as error:
             self._note_failure(recipe.key, error)
             raise
+
+    def _find_losses(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
+        """Convert a map, read it back and compare it with its version."""
+        cached_map = self.get_or_convert(recipe, stop)[1]
+        files = {file.name: file.read() for file in cached_map.files}
+        store_location = (self._store.database_url, str(self._store.blob_dir))
+        cancel_arguments = {} if stop is None else {"stop": stop}
+        arguments = (recipe.version, recipe.format.name, files, self._limits)
+        try:
+            content: bytes = self._run(losses.find_losses, *store_location, *arguments, **cancel_arguments)
+        except WorkerDied as error:
+            raise CannotConvert(f"the map in {recipe.format.name} could not be read back: {error.detail}") from error
+        return ConvertedMap({"losses.json": (content, "application/json")}, None, cached_map.report)
 
     def failure(self, recipe: Recipe) -> FleetMapError | None:
         """Return the error of a recent conversion that content or parameters made impossible, or None."""

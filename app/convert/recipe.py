@@ -106,7 +106,8 @@ class Recipe:
     part that the chain produces, instead of one. members: the maps that this one is assembled from. archive: whether to
     create a zip of those. file: name of the requested file in the map, if any. failed: cheaper chains that the content
     does not allow; not part of the key either. replan: plans this request without these derivations (see
-    ``derive.first_working``); None if there is no alternative.
+    ``derive.first_working``); None if there is no alternative. compared: the recipe of the map, if this one is for what
+    the map loses (``app.convert.losses``).
     """
 
     version: Version
@@ -121,6 +122,7 @@ class Recipe:
     file: str | None = None
     failed: tuple[ChainFailure, ...] = ()
     replan: Callable[[frozenset[str]], Recipe] | None = field(default=None, compare=False, repr=False)
+    compared: Recipe | None = field(default=None, compare=False, repr=False)
 
     @property
     def etag(self) -> str:

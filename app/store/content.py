@@ -13,9 +13,11 @@ from app.model.layers import VECTOR_LAYERS, Layers, PartKey
 from app.model.templates import template_changes
 from app.store import diff, parts
 from app.store.blobs import Blobs
+from app.store.cell_changes import CellChangeImage
 from app.store.chunks import Chunks
+from app.store.diff import FeatureChanges
 from app.store.parts.features import features_from_items, features_in_box, find_places, items_by_id
-from app.store.parts.roots import PartRoot, read_document
+from app.store.parts.roots import PartRoot, read_document, read_root
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
 from app.store.tree import ChunkStage
 from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
@@ -117,6 +119,22 @@ class ContentReader:
                 out.setdefault(key.layer, {})[names[key]] = diff.diff_other_parts(draft, old, new)
         out |= frame_changes(a.datum, b.datum, a.levels, b.levels)
         return out | template_changes(a.templates, b.templates)
+
+    def feature_changes(
+        self, a: Version, b: Version, layers: Collection[str] = VECTOR_LAYERS
+    ) -> list[tuple[PartKey, FeatureChanges]]:
+        """Compare the vector parts of two versions that differ, sorted by key."""
+        draft = self._chunks.stage()
+        before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
+        keys = [key for key in differing_keys(before, after) if key.layer in VECTOR_LAYERS and key.layer in layers]
+        roots = [(key, read_roots(draft, key, before), read_roots(draft, key, after)) for key in sorted(keys)]
+        return [(key, diff.features(draft, old, new)) for key, old, new in roots]
+
+    def cell_changes(self, old: str | None, new: str | None) -> CellChangeImage:
+        """Compare two stored grids, given by the hashes of their parts; None for a grid that does not exist."""
+        draft = self._chunks.stage()
+        roots = [None if name is None else read_root(draft, bytes.fromhex(name)) for name in (old, new)]
+        return CellChangeImage(draft, *roots)
 
     def delta_parts(self, a: Version, b: Version) -> Delta:
         """Compute the changes that turn version a into version b: features put and deleted, rectangles of grids."""

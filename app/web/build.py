@@ -23,7 +23,7 @@ GENERATED = "src/api/schema.d.ts"
 STAMP = "dist/.sources"
 
 
-class PageBuildHook(BuildHookInterface):  # type: ignore[type-arg]
+class PageBuildHook(BuildHookInterface):
     """Builds the page before a wheel, an sdist or an editable install."""
 
     PLUGIN_NAME = "custom"

@@ -12,7 +12,8 @@ import pytest
 from PIL import Image
 from pyproj import Proj
 
-from app.api.layers import crop_grid, geometries_as_geojson
+from app.api.http.features import geometries_as_geojson
+from app.api.layers import crop_grid
 from app.errors import NotFound
 from app.model.grid import OccupancyGrid
 from tests.api import samples

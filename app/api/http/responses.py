@@ -38,12 +38,16 @@ def json_response(value: Any, status: int = 200, headers: Mapping[str, str] | No
 
 def page_response(request: Request, items: list[Any], cursor: str | None) -> Response:
     """Build a page of a list, with ``Link: <…>; rel="next"`` if there are more items."""
-    headers = {}
-    if cursor is not None:
-        query = [(k, v) for k, v in request.query_params.multi_items() if k != "cursor"]
-        path = quote(request.url.path, safe="/")
-        headers["link"] = f'<{path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'
-    return json_response(items, headers=headers)
+    return json_response(items, headers=next_page(request, cursor))
+
+
+def next_page(request: Request, cursor: str | None) -> dict[str, str]:
+    """Build the header ``Link`` to the next page; empty for the last one."""
+    if cursor is None:
+        return {}
+    query = [(k, v) for k, v in request.query_params.multi_items() if k != "cursor"]
+    path = quote(request.url.path, safe="/")
+    return {"link": f'<{path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'}
 
 
 def version_headers(version: Version) -> dict[str, str]:

@@ -189,6 +189,15 @@ UNCHANGED_OR_DRY_RUN: dict[int | str, dict[str, Any]] = {
 }
 
 
+def component_schemas(*models: type[BaseModel]) -> dict[str, Any]:
+    """Build ``openapi_extra`` that defines the models of responses whose media type is not ``application/json``."""
+    schemas: dict[str, Any] = {}
+    for model in models:
+        schema = model.model_json_schema(ref_template="#/components/schemas/{model}", mode="serialization")
+        schemas |= {**schema.pop("$defs", {}), model.__name__: schema}
+    return {"x-schemas": schemas}
+
+
 def problem_responses(
     model: Any, *statuses: int, ok: int = 200, description: str = "OK"
 ) -> dict[int | str, dict[str, Any]]:
