@@ -8,7 +8,7 @@ from app.ingest.commit_request import CommitRequest
 from app.ingest.derivation import DerivationRequest
 from app.ingest.generation import GenerationRequest
 from app.ingest.online import Provider
-from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload
+from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload, check_depth
 from app.ingest.templates import TemplateUpdate
 
 __all__ = [
@@ -22,4 +22,5 @@ __all__ = [
     "SpooledFile",
     "TemplateUpdate",
     "Upload",
+    "check_depth",
 ]
