@@ -177,7 +177,7 @@ class Reach:
 
 
 MAX_NETWORKS = 50
-"""Maximum number of networks with other names whose largest parts are searched one by one."""
+"""Maximum number of names of networks whose largest parts are searched; the others count as reachable."""
 
 
 def reach(network: Network, usable: Mask) -> Reach:
@@ -190,10 +190,10 @@ def reach(network: Network, usable: Mask) -> Reach:
         return out
     names = np.array([node.key.name for node in network.nodes], object)
     backward = graph.T.tocsr()
-    for name in sorted(set(names.tolist()))[:MAX_NETWORKS]:
+    for number, name in enumerate(sorted(set(names.tolist()))):
         members = np.flatnonzero(names == name)
         labels, counts = np.unique(group[members], return_counts=True)
-        if counts.max() < 2:
+        if counts.max() < 2 or number >= MAX_NETWORKS:
             for mask in (out.main, out.from_main, out.to_main, out.trivial):
                 mask[members] = True
             continue
