@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import Query, Request
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -77,6 +77,27 @@ class ChecksOut(BaseModel):
 
 class DraftBody(RequestModel):
     """Edits that are applied before the check, as in `POST …/edits`."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "changes": [
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "shed",
+                                "geometry": {"type": "Point", "coordinates": [5.6134, 52.4207]},
+                                "properties": {"kind": "node", "name": "shed"},
+                            },
+                        }
+                    ]
+                }
+            ]
+        },
+    )
 
     changes: list[Change] = Field(min_length=1, max_length=MAX_DRAFT)
 
