@@ -16,6 +16,53 @@ EventType = str
 RobotState = Literal["downloading", "ready", "active", "failed"]
 """State of the map that a robot reports."""
 
+
+@dataclass(frozen=True)
+class Pose:
+    """Position of a robot in metres and radians, in the local frame. level: None if not reported."""
+
+    x: float
+    y: float
+    yaw: float
+    level: str | None = None
+
+
+@dataclass(frozen=True)
+class RobotPlace:
+    """Place and route that a robot reports. node: id of its last node. route: ids of nodes and edges, in order."""
+
+    pose: Pose | None = None
+    node: str | None = None
+    route: tuple[str, ...] | None = None
+
+    def __bool__(self) -> bool:
+        return self.pose is not None or self.node is not None or self.route is not None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON members that are set."""
+        out: dict[str, Any] = {}
+        if self.pose is not None:
+            level = {} if self.pose.level is None else {"level": self.pose.level}
+            out["pose"] = {"x": self.pose.x, "y": self.pose.y, "yaw": self.pose.yaw, **level}
+        if self.node is not None:
+            out["node"] = self.node
+        if self.route is not None:
+            out["route"] = list(self.route)
+        return out
+
+    @classmethod
+    def from_dict(cls, members: Mapping[str, Any]) -> RobotPlace:
+        """Read the result of ``as_dict``."""
+        pose, route = members.get("pose"), members.get("route")
+        return cls(None if pose is None else Pose(**pose), members.get("node"), None if route is None else tuple(route))
+
+
+MAX_POSE_METRES = 1e7
+MAX_YAW = 1e3
+MAX_ROUTE = 1000
+MAX_ROUTE_CHARACTERS = 16_384
+"""Limits of a reported place: coordinates, radians, ids in a route, and their characters together."""
+
 T = TypeVar("T")
 
 _registry: dict[str, type[Any]] = {}

@@ -51,6 +51,8 @@ VAGUE_NAMES = {
 PUBLIC_NAMES = {
     "app/api/search.py:where": "a member of a hit, as clients see it",
     "app/api/http/schemas.py:where": "a member of problems, as clients see them",
+    "app/api/checks.py:where": "a member of findings",
+    "app/api/impact.py:where": "the same",
     "app/errors.py:where": "the same member, and what sets it:",
     "app/formats/_rules.py:where": "",
     "app/formats/clouds/points.py:where": "",

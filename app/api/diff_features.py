@@ -27,8 +27,8 @@ from app.store.values import Version
 class DiffFeaturesOut(CollectionOut):
     """Changed features between two versions."""
 
-    from_: int = Field(alias="from", description="Number of the older version.")
-    to: int = Field(description="Number of the newer version.")
+    from_: int | str = Field(alias="from", description="Number of the older version, or `dry:…`.")
+    to: int | str = Field(description="Number of the newer version, or `dry:…`.")
     features: list[FeatureChangeOut]
 
 
@@ -49,7 +49,7 @@ def changed_features(
     crs, layer, limit, cursor = selection.crs, selection.layer, selection.limit, selection.cursor
     anchor: Anchor = crs or ("wgs84" if new.datum else "local")
     datums = [version.datum.as_dict() if version.datum else None for version in (old, new)]
-    seed = json_bytes(["diff", old.root, new.root, old.number, new.number, datums, anchor, layer, limit, cursor])
+    seed = json_bytes(["diff", old.root, new.root, old.ref, new.ref, datums, anchor, layer, limit, cursor])
     headers = {"etag": f'"{hashlib.sha256(seed).hexdigest()[:32]}"'}
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
@@ -64,8 +64,8 @@ def changed_features(
     changes = _load_states([rows[k] for k in page.indices], parts, old, new, anchor)
     body = {
         **collection_head(anchor, new),
-        "from": old.number,
-        "to": new.number,
+        "from": old.ref,
+        "to": new.ref,
         "features": change_features(changes, anchor),
         **page.members,
     }

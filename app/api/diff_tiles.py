@@ -44,8 +44,8 @@ class ChangeRasterOut(BaseModel):
 
     name: str
     level: str
-    from_: int = Field(alias="from", description="Number of the older version.")
-    to: int = Field(description="Number of the newer version.")
+    from_: int | str = Field(alias="from", description="Number of the older version, or `dry:…`.")
+    to: int | str = Field(description="Number of the newer version, or `dry:…`.")
     width: int = Field(description="Pixels of the highest `z`: cells of the newer grid.")
     height: int
     resolution: float = Field(description="Metres per cell.")
@@ -150,15 +150,15 @@ def get_change_raster(
 ) -> Response:
     """Return size, position and levels of detail of the tiles that show the changed cells of a grid."""
     compared = _find(services, env, from_, to, name, level)
-    headers = _headers(compared.etag(name, compared.level, compared.old.number, compared.new.number), from_, to)
+    headers = _headers(compared.etag(name, compared.level, compared.old.ref, compared.new.ref), from_, to)
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
     image = services.store.content.cell_changes(compared.old_hash, compared.new_hash)
     body = {
         "name": name,
         "level": compared.level,
-        "from": compared.old.number,
-        "to": compared.new.number,
+        "from": compared.old.ref,
+        "to": compared.new.ref,
         "width": image.width,
         "height": image.height,
         "resolution": image.header["resolution"],
@@ -185,7 +185,7 @@ def _find(services: Services, env: str, from_: str | None, to: str | None, name:
         names = sorted({grid for _, grid in present})
         on_level = "" if level is None else f" on level {level!r}"
         raise NotFound(
-            f"unknown grid {name!r}{on_level}{did_you_mean(name, names)}; versions {old.number} and {new.number} have "
+            f"unknown grid {name!r}{on_level}{did_you_mean(name, names)}; versions {old.ref} and {new.ref} have "
             f"{', '.join(f'{grid} (level {at})' for at, grid in sorted(present)) or 'none'}"
         )
     if len(levels) > 1:

@@ -61,7 +61,7 @@ class LossReportOut(BaseModel):
 class LossesOut(CollectionOut):
     """Features that a format loses, or returns with differences."""
 
-    version: int
+    version: int | str
     features: list[FeatureChangeOut]
     report: LossReportOut
 
@@ -111,14 +111,14 @@ async def get_losses(
         raise Invalid(f"{format} cannot be written: choose another format", [Problem("read only", where="format")])
     levels = sorted({entry.key.level for entry in version.parts})
     if level is not None and level not in levels:
-        raise NotFound(f"version {version.number} has no level {level!r}; available: {', '.join(levels) or 'none'}")
+        raise NotFound(f"version {version.ref} has no level {level!r}; available: {', '.join(levels) or 'none'}")
     recipe = await run_in_threadpool(services.maps.recipe, version, format)
     wanted = losses_recipe(recipe)
     outcome = await services.jobs.convert(lambda: wanted, principal, request_address(request))
     if isinstance(outcome, JobStarted):
         return job_started_response(outcome.job)
     anchor: Anchor = crs or ("wgs84" if version.datum else "local")
-    etag = f'"{wanted.key[:32]}-{version.number}-{anchor}"'
+    etag = f'"{wanted.key[:32]}-{version.ref}-{anchor}"'
     if none_match(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers={"etag": etag})
     selection = (anchor, level, limit, cursor)
@@ -144,7 +144,7 @@ def _write(
     report = services.maps.report(recipe)
     body: dict[str, Any] = {
         **collection_head(crs, version),
-        "version": version.number,
+        "version": version.ref,
         "features": change_features(changes, crs),
         **page.members,
         "report": {

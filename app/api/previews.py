@@ -80,7 +80,7 @@ async def get_preview(
     headers = {
         "etag": f'"{key[:32]}"',
         "cache-control": cache_control(ref),
-        "fleetmap-version": str(version.number),
+        "fleetmap-version": str(version.ref),
         "fleetmap-root": version.root,
     }
     if none_match(request.headers.get("if-none-match"), headers["etag"]):

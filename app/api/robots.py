@@ -18,7 +18,15 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_response, page_response
 from app.api.http.schemas import CHANNEL, NAME, ApiTime, Cursor, Limit, RequestModel, problem_responses
 from app.errors import Denied, Invalid, NotFound, Problem
-from app.event_types import RobotState
+from app.event_types import (
+    MAX_POSE_METRES,
+    MAX_ROUTE,
+    MAX_ROUTE_CHARACTERS,
+    MAX_YAW,
+    RobotPlace,
+    RobotState,
+)
+from app.events import messages
 from app.store.audit import set_audit_target
 from app.store.fleet_values import ActiveMap, Channel, ChannelMove, ReceivedReport, Robot, RobotReport
 from app.store.values import rfc3339
@@ -29,6 +37,18 @@ class StatusHoldsBody(RequestModel):
 
     version: int = Field(ge=0, lt=2**63)
     root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Root hash of the version; 64 zeros: no map is loaded.")
+
+
+class PoseBody(RequestModel):
+    """Position of a robot in the environment's local frame."""
+
+    x: float = Field(ge=-MAX_POSE_METRES, le=MAX_POSE_METRES, description="Metres.")
+    y: float = Field(ge=-MAX_POSE_METRES, le=MAX_POSE_METRES, description="Metres.")
+    yaw: float = Field(ge=-MAX_YAW, le=MAX_YAW, description="Radians, counter-clockwise from the local x axis.")
+    level: str | None = Field(None, min_length=1, max_length=256, description="Level. Default: not reported.")
+
+
+FeatureId = Annotated[str, Field(min_length=1, max_length=512)]
 
 
 class StatusBody(RequestModel):
@@ -60,6 +80,23 @@ class StatusBody(RequestModel):
     holds: StatusHoldsBody | None = Field(
         None, description="The loaded map, if the status is about another version. Default: the last `active` one."
     )
+    pose: PoseBody | None = Field(None, description="Where the robot is.")
+    node: FeatureId | None = Field(None, description="Id of the node at which the robot is, or which it passed last.")
+    route: list[FeatureId] | None = Field(
+        None,
+        max_length=MAX_ROUTE,
+        description="Ids of the nodes and edges that the robot drives next, in order; together at most "
+        f"{MAX_ROUTE_CHARACTERS} characters. `[]`: it has no route.",
+    )
+
+    def place(self) -> RobotPlace | None:
+        """Return the reported place; None if there is none. Raises Invalid for a route that is too long."""
+        members = {name: value for name, value in self.model_dump().items() if name in ("pose", "node", "route")}
+        place, problems = messages.read_place(members)
+        if problems:
+            located = [Problem(p.problem, where=f"body.{p.where}") for p in problems]
+            raise Invalid("; ".join(f"{p.where} {p.problem}" for p in located), located)
+        return place or None
 
 
 class LagOut(BaseModel):
@@ -77,6 +114,24 @@ class HoldsOut(BaseModel):
     root: str
     overlays: str | None = Field(None, description="Digest of the closures in the active map.")
     since: datetime
+
+
+class PoseOut(BaseModel):
+    """Position of a robot in the environment's local frame, in metres and radians. `level`: null if not reported."""
+
+    x: float
+    y: float
+    yaw: float
+    level: str | None
+
+
+class PlaceOut(BaseModel):
+    """Last place that a robot reported. Members are null if that report did not have them."""
+
+    pose: PoseOut | None
+    node: str | None = Field(description="Id of the node at which the robot is, or which it passed last.")
+    route: list[str] | None = Field(description="Ids of the nodes and edges that the robot drives next, in order.")
+    time: datetime = Field(description="Time of receipt, by the server's clock.")
 
 
 class RobotOut(BaseModel):
@@ -105,6 +160,7 @@ class RobotOut(BaseModel):
         "with users). Other robots do not count in rollouts."
     )
     lag: LagOut | None
+    place: PlaceOut | None = Field(description="The last place that the robot reported; null if it never did.")
 
 
 class RobotDetailOut(RobotOut):
@@ -201,7 +257,7 @@ async def put_status(
             [Problem("missing time zone", where="body.time")],
         )
     holds = None if body.holds is None else (body.holds.version, body.holds.root)
-    more = (body.detail, body.sequence, body.time, body.overlays, holds)
+    more = (body.detail, body.sequence, body.time, body.overlays, holds, body.place())
     report = RobotReport(body.channel, body.version, body.root, body.state, *more)
     # Wait without a thread: a whole fleet reports at once, and threads are needed for maps.
     noting = services.fleet.submit_report(ReceivedReport(body.environment, robot, report, datetime.now(UTC)))
@@ -282,9 +338,20 @@ def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[st
             "online": fleet.is_online(robot, now),
             "vouched": robot.vouched,
             "lag": lag,
+            "place": place_as_json(robot),
         }
         out.append(body)
     return out
+
+
+def place_as_json(robot: Robot) -> dict[str, Any] | None:
+    """Return the members of a robot's last place, with the time of its receipt."""
+    if robot.place is None or robot.placed is None:
+        return None
+    members = {"pose": None, "node": None, "route": None, **robot.place.as_dict()}
+    if members["pose"] is not None:
+        members["pose"] = {"level": None, **members["pose"]}
+    return {**members, "time": rfc3339(robot.placed)}
 
 
 def _active_map_as_json(active_map: ActiveMap) -> dict[str, Any]:

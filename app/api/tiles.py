@@ -94,7 +94,7 @@ def _find(services: Services, env: str, v: str, kind: Kind, name: str, level: st
     assert entry is not None
     headers = {
         "cache-control": cache_control(ref),
-        "fleetmap-version": str(version.number),
+        "fleetmap-version": str(version.ref),
         "fleetmap-root": version.root,
     }
     return _Raster(version, key, entry, headers)

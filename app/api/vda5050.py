@@ -22,7 +22,7 @@ from app.api.http.schemas import CHANNEL, NAME, EnvironmentPath, VersionPath, pr
 from app.api.links import LinkedFile, link_to
 from app.api.robots import RobotOut, RobotPath, require_report_permission, store_report
 from app.errors import CannotConvert, Invalid, NotFound, Problem
-from app.event_types import RobotState
+from app.event_types import RobotPlace, RobotState
 from app.fleet import vda5050
 from app.store.fleet_values import Channel, RobotReport
 from app.store.values import Version
@@ -256,8 +256,9 @@ def post_state(
     """Convert the `maps` of a vehicle's state to the robot's status.
 
     `mapVersion` is the number of a version. ENABLED becomes `active`; DISABLED becomes `ready` if the version is
-    planned for the channel; a failed action of this server becomes `failed`. The rest of the message is for the fleet
-    manager.
+    planned for the channel; a failed action of this server becomes `failed`. The robot's place comes from
+    `agvPosition` (3.0: `mobileRobotPosition`), `lastNodeId`, `nodeStates` and `edgeStates`, the latter up to 1000 ids.
+    The rest of the message is for the fleet manager.
 
     The levels of a site (`<mapId>/<level>`) count together: the vehicle is `ready` with a version if it has it for
     each level in the message, and `active` with the oldest version that is enabled on any level. `ignored` lists the
@@ -272,8 +273,10 @@ def post_state(
     if environment is not None and len(sites) > 1:
         names = ", ".join(list(sites)[:20])
         raise Invalid(f"the state has several maps: set mapId to the one of {environment}, one of {names}")
+    vehicle = vda5050.read_vehicle_place(message)
     for site, floors in sites.items():
-        _collect_reports(services, principal, robot, floors, environment or site, channel, out)
+        place = None if vehicle is None or not _is_in(vehicle, site, len(sites)) else vehicle.place
+        _collect_reports(services, principal, robot, floors, environment or site, channel, out, place)
     return json_response(out)
 
 
@@ -285,6 +288,7 @@ def _collect_reports(
     env: str,
     channel: str | None,
     out: dict[str, list[dict[str, Any]]],
+    place: RobotPlace | None,
 ) -> None:
     try:
         if not principal.can_access(env):
@@ -304,7 +308,8 @@ def _collect_reports(
         except NotFound as error:
             out["ignored"].append({"mapId": maps.map_id, "mapVersion": text, "why": error.detail})
             continue
-        reports.append(RobotReport(channel or usual, version.number, version.root, state, detail and detail[:2000]))
+        short = detail and detail[:2000]
+        reports.append(RobotReport(channel or usual, version.number, version.root, state, short, place=place))
     # Report the active version only if it is new: otherwise every message would alternate between two reports.
     if (
         len(reports) > 1
@@ -313,10 +318,17 @@ def _collect_reports(
         and stored_robot.active_map.root == reports[0].root
     ):
         reports = reports[1:]
+    if not reports and place is not None and stored_robot is not None:  # no news of maps: only the place changes
+        reports = [dataclasses.replace(stored_robot.report, place=place)]
     for report in reports:
         body = store_report(services, env, robot, report)
     if reports:
         out["robots"].append(body)
+
+
+def _is_in(vehicle: vda5050.VehiclePlace, site: str, sites: int) -> bool:
+    """Return whether a vehicle's place is in a site: that of its position, else the only one."""
+    return sites == 1 if vehicle.map_id is None else vda5050.site_name(vehicle.map_id) == site
 
 
 def _states(maps: vda5050.VehicleMaps, channel: Channel | None) -> list[tuple[RobotState, str, str | None]]:

@@ -6,13 +6,24 @@ Shared with the agent, which imports nothing else of the server except errors, e
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
 from app.errors import Invalid, Problem
-from app.event_types import EVENT_TYPES, EventType, RobotState
+from app.event_types import (
+    EVENT_TYPES,
+    MAX_POSE_METRES,
+    MAX_ROUTE,
+    MAX_ROUTE_CHARACTERS,
+    MAX_YAW,
+    EventType,
+    Pose,
+    RobotPlace,
+    RobotState,
+)
 
 PREFIX = "fleetmap"
 """Default prefix of all keys."""
@@ -27,10 +38,14 @@ ROBOT_STATES: tuple[RobotState, ...] = get_args(RobotState)
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
 """Robot name: one segment of a key and of a URL, without slashes and wildcards."""
 
-MAX_STATUS_BYTES = 16 * 2**10
+MAX_STATUS_BYTES = 32 * 2**10
 MAX_DETAIL = 2000
+MAX_ID = 512
+MAX_LEVEL = 256
 _CHANNEL = re.compile(r"[a-z][a-z0-9_-]{0,62}")
 _ROOT = re.compile(r"[0-9a-f]{64}")
+_UNWRITABLE = re.compile("[\x00-\x1f\x7f\ud800-\udfff]")
+"""Characters that no id of the store has."""
 
 
 def events_key(prefix: str, environment: str) -> str:
@@ -108,6 +123,7 @@ class RobotStatus:
         overlays: digest of the closures in the installed map.
         holds: version and root of the map that the robot has loaded, whatever ``state`` is about; the root ``NO_ROOT``
             if it has none; None if not reported.
+        place: where the robot is and what it drives next; None if not reported.
     """
 
     channel: str
@@ -119,6 +135,7 @@ class RobotStatus:
     sequence: int | None = None
     overlays: str | None = None
     holds: tuple[int, str] | None = None
+    place: RobotPlace | None = None
 
     @classmethod
     def from_json(cls, data: bytes | str) -> RobotStatus:
@@ -160,10 +177,13 @@ class RobotStatus:
         check("overlays", overlays is None or hashed, "64 hexadecimal digits")
         holds = _read_holds(body.get("holds"))
         check("holds", (body.get("holds") is None) == (holds is None), "a version and its root")
+        place, place_problems = read_place(body)
+        problems += place_problems
         if problems:
             raise Invalid("; ".join(f"{p.where} {p.problem}" for p in problems), problems)
         robot_state = next(s for s in ROBOT_STATES if s == state)
-        return cls(str(channel), int(version or 0), str(root), robot_state, detail, time, sequence, overlays, holds)
+        more = (detail, time, sequence, overlays, holds, place or None)
+        return cls(str(channel), int(version or 0), str(root), robot_state, *more)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the members of the status that are set."""
@@ -177,6 +197,7 @@ class RobotStatus:
             "sequence": self.sequence,
             "overlays": self.overlays,
             "holds": None if self.holds is None else {"version": self.holds[0], "root": self.holds[1]},
+            **({} if self.place is None else self.place.as_dict()),
         }
         return {name: value for name, value in members.items() if value is not None}
 
@@ -193,6 +214,51 @@ def _read_holds(value: Any) -> tuple[int, str] | None:
     if not _is_number(version) or not isinstance(root, str) or _ROOT.fullmatch(root) is None:
         return None
     return int(version or 0), root
+
+
+def read_place(body: Mapping[str, Any]) -> tuple[RobotPlace, list[Problem]]:
+    """Parse the members ``pose``, ``node`` and ``route`` of a status. Returns the place and what is wrong with them."""
+    pose, node, route = body.get("pose"), body.get("node"), body.get("route")
+    problems = []
+    if pose is not None and not _is_pose(pose):
+        reason = f"must be {{x, y, yaw, level?}}: metres within ±{MAX_POSE_METRES:g} and radians within ±{MAX_YAW:g}"
+        problems.append(Problem(reason, where="pose"))
+    if node is not None and not _is_id(node):
+        problems.append(Problem(f"must be an id of 1 to {MAX_ID} characters without control characters", where="node"))
+    if route is not None and not _is_route(route):
+        limits = f"at most {MAX_ROUTE} ids with at most {MAX_ROUTE_CHARACTERS} characters together"
+        problems.append(Problem(f"must be a list of {limits}", where="route"))
+    if problems:
+        return RobotPlace(), problems
+    parsed = None
+    if pose is not None:
+        parsed = Pose(float(pose["x"]), float(pose["y"]), float(pose["yaw"]), pose.get("level"))
+    return RobotPlace(parsed, node, None if route is None else tuple(route)), []
+
+
+def _is_pose(value: Any) -> bool:
+    if not isinstance(value, Mapping) or not {"x", "y", "yaw"} <= set(value) <= {"x", "y", "yaw", "level"}:
+        return False
+    bounds = (("x", MAX_POSE_METRES), ("y", MAX_POSE_METRES), ("yaw", MAX_YAW))
+    level = value.get("level")
+    return all(_is_within(value[name], bound) for name, bound in bounds) and (
+        level is None or (_is_id(level) and len(level) <= MAX_LEVEL)
+    )
+
+
+def _is_within(value: Any, bound: float) -> bool:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and math.isfinite(value) and abs(value) <= bound
+
+
+def _is_id(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= MAX_ID and _UNWRITABLE.search(value) is None
+
+
+def _is_route(value: Any) -> bool:
+    if not isinstance(value, (list, tuple)) or len(value) > MAX_ROUTE or not all(map(_is_id, value)):
+        return False
+    return sum(map(len, value)) <= MAX_ROUTE_CHARACTERS
 
 
 def dumps(value: Mapping[str, Any]) -> bytes:

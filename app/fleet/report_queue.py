@@ -46,7 +46,7 @@ def report_from_status(status: RobotStatus) -> RobotReport:
         with contextlib.suppress(ValueError, OverflowError):
             reported_at = datetime.fromisoformat(status.time)
             reported_at = reported_at.astimezone(UTC) if reported_at.tzinfo is not None else None
-    more = (status.sequence, reported_at, status.overlays, status.holds)
+    more = (status.sequence, reported_at, status.overlays, status.holds, status.place)
     return RobotReport(status.channel, status.version, status.root, status.state, status.detail, *more)
 
 

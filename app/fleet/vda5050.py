@@ -11,11 +11,15 @@ state, maps are enabled (in use) or disabled (stored on the vehicle); optional f
 from __future__ import annotations
 
 import re
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, Literal
 
 from app.errors import Invalid, Problem
+from app.event_types import MAX_ROUTE, MAX_ROUTE_CHARACTERS, RobotPlace
+from app.events.messages import read_place
 from app.model.frame import GROUND
 from app.store.values import Version
 
@@ -71,6 +75,57 @@ def level_map_id(site: str, level: str | None) -> str:
 def site_name(map_id: str) -> str:
     """Return the site of a level's ``mapId``: the part before the first slash."""
     return map_id.partition("/")[0]
+
+
+@dataclass(frozen=True, slots=True)
+class VehiclePlace:
+    """Place of a vehicle. map_id: of the map in which its position is; None if the state has no position."""
+
+    map_id: str | None
+    place: RobotPlace
+
+
+def read_vehicle_place(message: Mapping[str, Any]) -> VehiclePlace | None:
+    """Read position, last node and remaining order of a state message. Raises Invalid.
+
+    A position that the vehicle does not trust (``positionInitialized``, 3.0: ``localized``) is none. Nodes and edges
+    are joined by their ``sequenceId``; a state of a vehicle without an order has an empty route.
+    """
+    pose, map_id = None, None
+    for name, trusted in (("agvPosition", "positionInitialized"), ("mobileRobotPosition", "localized")):
+        position = message.get(name)
+        if position is None:
+            continue
+        if not isinstance(position, Mapping):
+            raise _invalid_state_error("must be an object", name)
+        map_id = _text(position, "mapId", name)
+        if position.get(trusted) is not False:
+            level = map_id.partition("/")[2] or None
+            pose = {"x": position.get("x"), "y": position.get("y"), "yaw": position.get("theta")}
+            pose |= {} if level is None else {"level": level}
+    place, problems = read_place({"pose": pose, "node": message.get("lastNodeId") or None, "route": _route(message)})
+    for problem in problems:
+        raise _invalid_state_error(problem.problem, f"position, lastNodeId or order ({problem.where})")
+    return VehiclePlace(map_id, place) if place else None
+
+
+def _route(message: Mapping[str, Any]) -> list[Any] | None:
+    """Return the ids of the nodes and edges that a vehicle has still to drive; None if the state has no such lists.
+
+    An order that is longer than a stored route is cut.
+    """
+    if message.get("nodeStates") is None and message.get("edgeStates") is None:
+        return None
+    steps: list[tuple[int, Any]] = []
+    for name, word in (("nodeStates", "nodeId"), ("edgeStates", "edgeId")):
+        for k, item in enumerate(_list(message, name, MAX_ACTIONS)):
+            sequence = item.get("sequenceId")
+            if isinstance(sequence, bool) or not isinstance(sequence, int):
+                raise _invalid_state_error("must be an integer", f"{name}[{k}].sequenceId")
+            steps.append((sequence, _text(item, word, f"{name}[{k}]")))
+    ids = [item_id for _, item_id in sorted(steps, key=lambda step: step[0])][:MAX_ROUTE]
+    lengths = list(accumulate(map(len, ids)))
+    return ids[: bisect_right(lengths, MAX_ROUTE_CHARACTERS)]
 
 
 def merge_levels(floors: Sequence[VehicleMaps]) -> VehicleMaps:

@@ -8,7 +8,7 @@ from app.ingest.commit_request import CommitRequest
 from app.ingest.derivation import DerivationRequest
 from app.ingest.generation import GenerationRequest
 from app.ingest.online import Provider
-from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload, dry_run_as_json
+from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload, check_depth, dry_run_as_json
 from app.ingest.templates import TemplateUpdate
 
 __all__ = [
@@ -22,5 +22,6 @@ __all__ = [
     "SpooledFile",
     "TemplateUpdate",
     "Upload",
+    "check_depth",
     "dry_run_as_json",
 ]

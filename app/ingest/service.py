@@ -101,9 +101,7 @@ class Ingest:
 
     def edit(self, environment: str, changes: Sequence[Mapping[str, Any]], commit: CommitRequest) -> CommitResult:
         """Commit edits as one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
-        if _exceeds_depth(MAX_DEPTH, changes):
-            reason = f"nested deeper than {MAX_DEPTH} lists and objects"
-            raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
+        check_depth(changes)
         key = commit.idempotency(_digest(["edit", list(changes), commit.message]))
         return self._edit(environment, lambda _: changes, commit, key)
 
@@ -496,6 +494,13 @@ def _fingerprint(upload: Upload, commit: CommitRequest) -> str:
     values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, commit.message, commit.dry_run]
     files = sorted([f.name, f.sha256] for f in upload.files)
     return _digest(["upload", values, dict(sorted(hints.options.items())), files])
+
+
+def check_depth(changes: Sequence[Mapping[str, Any]]) -> None:
+    """Raise Invalid for edits that are nested too deeply to be stored."""
+    if _exceeds_depth(MAX_DEPTH, changes):
+        reason = f"nested deeper than {MAX_DEPTH} lists and objects"
+        raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
 
 
 def _exceeds_depth(limit: int, value: Any) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,9 +55,9 @@ def crossings(networks: Layers, around: Layers, *, shape_of: str | None = None) 
     out: list[Problem] = []
     for key, part in networks.vector("topology").items():
         grids = {k: g for k, g in around.grids().items() if k.level == key.level}
-        grid_key = _obstacle_grid(grids)
+        grid_key = obstacle_grid(grids)
         grid = None if grid_key is None else grids[grid_key]
-        bodies = _bodies(around, key.level)
+        bodies = ground_plans(around, key.level, is_body)
         edges = [k for k, p in enumerate(part.properties) if p.get("kind") == "edge"][:MAX_EDGES]
         if not edges or (grid is None and not bodies):
             continue
@@ -67,11 +68,13 @@ def crossings(networks: Layers, around: Layers, *, shape_of: str | None = None) 
         lines = _courses(part, geometry, edges, shape_of)
         blocked = np.zeros(len(edges), bool)
         if grid is not None and grid_key is not None:
-            segments, owner = _segments(lines)
+            segments, owner = line_segments(lines)
             blocked[owner[_crossed_cells(segments, grid)[0]]] = True
             name = f"occupied cells of the occupancy grid {grid_key.name!r}"
             out += _problems([part.ids[edges[n]] for n in np.flatnonzero(blocked).tolist()], name, key)
-        hit = _crosses_bodies(lines, bodies, grid) & ~blocked
+        hit = np.zeros(len(edges), bool)
+        hit[plan_crossings(lines, bodies, grid).line] = True
+        hit &= ~blocked
         out += _problems([part.ids[edges[n]] for n in np.flatnonzero(hit).tolist()], "buildings or walls", key)
     return out
 
@@ -103,17 +106,53 @@ def _courses(
     return lines
 
 
-def _segments(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
+def line_segments(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
     """Split lines into straight pieces, float64 [n, 2, 2], with the index of each piece's line."""
     at, owner = shapely.get_coordinates(lines, return_index=True)
     same = owner[1:] == owner[:-1]
     return np.stack([at[:-1], at[1:]], axis=1)[same], owner[:-1][same].astype(np.int64)
 
 
-def _obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
+def obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
     """Return a level's grid of obstacles: ``map``, else the only one that is no costmap filter mask."""
     keys = [k for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties]
     return next((k for k in keys if k.name == MAP), keys[0] if len(keys) == 1 else None)
+
+
+def sample_points(segments: Array, step: float) -> Iterator[tuple[NDArray[np.int64], Array]]:
+    """Yield points along straight pieces, about ``step`` metres apart, in blocks: indices of pieces, float64 [n, 2].
+
+    Both ends of each piece are among them. Long networks have a wider spacing.
+    """
+    length = np.hypot(*(segments[:, 1] - segments[:, 0]).T)
+    step = max(step, float(length.sum()) / MAX_SAMPLES)
+    count = np.ceil(length / step).astype(np.int64) + 1
+    bound = np.concatenate([[0], np.cumsum(count)])
+    begin = 0
+    while begin < len(segments):
+        end = max(begin + 1, int(np.searchsorted(bound, bound[begin] + SAMPLES, side="right")) - 1)
+        number = np.repeat(np.arange(begin, end), count[begin:end])
+        share = (np.arange(len(number)) + bound[begin] - bound[number]) / (count[number] - 1).clip(1)
+        yield number, segments[number, 0] + (segments[number, 1] - segments[number, 0]) * share[:, None]
+        begin = end
+
+
+def cells_at(grid: OccupancyGrid, points: Array) -> NDArray[np.uint8]:
+    """Return the values of the cells at points in metres, float64 [n, 2]; UNKNOWN outside of the grid."""
+    x, y, yaw = grid.origin
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    turned = (points - np.array([x, y])) @ np.array([[cosine, -sine], [sine, cosine]])
+    column, row = np.floor(turned / grid.resolution).astype(np.int64).T
+    inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
+    out = np.full(len(points), UNKNOWN, np.uint8)
+    out[inside] = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million cells
+    return out
+
+
+def is_occupied(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which cells are occupied by the grid's own threshold."""
+    out: NDArray[np.bool_] = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
+    return out
 
 
 def _crossed_cells(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -122,81 +161,83 @@ def _crossed_cells(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.boo
     They are sampled at half the cell size.
     """
     grid = unknown_grey_as_unknown(grid)
-    x, y, yaw = grid.origin
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    turned = (segments - np.array([x, y])) @ np.array([[cosine, -sine], [sine, cosine]])
     hit, unseen = np.zeros(len(segments), bool), np.zeros(len(segments), bool)
-    length = np.hypot(*(turned[:, 1] - turned[:, 0]).T)
-    step = max(grid.resolution / 2, float(length.sum()) / MAX_SAMPLES)
-    count = np.ceil(length / step).astype(np.int64) + 1
-    bound = np.concatenate([[0], np.cumsum(count)])
-    begin = 0
-    while begin < len(turned):
-        end = max(begin + 1, int(np.searchsorted(bound, bound[begin] + SAMPLES, side="right")) - 1)
-        number = np.repeat(np.arange(begin, end), count[begin:end])
-        share = (np.arange(len(number)) + bound[begin] - bound[number]) / (count[number] - 1).clip(1)
-        at = turned[number, 0] + (turned[number, 1] - turned[number, 0]) * share[:, None]
-        column, row = np.floor(at / grid.resolution).astype(np.int64).T
-        inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
-        cells = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million cells
-        occupied = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
-        hit[number[inside][occupied]] = True
-        unseen[number[~inside]] = True
-        unseen[number[inside][cells == UNKNOWN]] = True
-        begin = end
+    for number, points in sample_points(segments, grid.resolution / 2):
+        cells = cells_at(grid, points)
+        hit[number[is_occupied(grid, cells)]] = True
+        unseen[number[cells == UNKNOWN]] = True
     return hit, unseen
 
 
-def _bodies(around: Layers, level: str) -> list[Any]:
-    """Return the ground plans of a level's buildings and walls, in metres."""
-    bodies: list[Any] = []
+@dataclass(frozen=True, slots=True)
+class GroundPlan:
+    """Ground that an object covers, in metres. id: of the object."""
+
+    id: str
+    area: Any
+
+
+def ground_plans(around: Layers, level: str, is_chosen: Callable[[Properties], bool]) -> list[GroundPlan]:
+    """Return the ground plans of a level's chosen objects."""
+    out: list[GroundPlan] = []
     solids = Solids({})
-    for key, part in around.vector("objects").items():
-        rows = [k for k, p in enumerate(part.properties) if _is_body(p)] if key.level == level else []
-        chosen = part.select(rows[: MAX_BODIES - len(bodies)])
+    for part in around.vector("objects", level).values():
+        rows = [k for k, p in enumerate(part.properties) if is_chosen(p)]
+        chosen = part.select(rows[: MAX_BODIES - len(out)])
         try:
             shapes = chosen.in_local(around.frame)
         except (MissingDatum, Invalid):
             continue
-        for p, geometry in zip(chosen.properties, shapes, strict=True):
+        for item, p, geometry in zip(chosen.ids, chosen.properties, shapes, strict=True):
             try:
-                body = object_footprint({**p, "shapes": None}, geometry, solids)
+                area = object_footprint({**p, "shapes": None}, geometry, solids)
             except FleetMapError:  # invalid shapes or pose: its derivations report it
                 continue
-            if body is not None and not body.is_empty:
-                bodies.append(body)
-    return bodies
+            if area is not None and not area.is_empty:
+                out.append(GroundPlan(item, area))
+    return out
 
 
-def _crosses_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: OccupancyGrid | None) -> NDArray[np.bool_]:
-    """Return which lines cross a ground plan, except for the way from an end inside to the outside.
+@dataclass(frozen=True, slots=True)
+class PlanCrossings:
+    """Lines that cross ground plans: index of the line, index of the plan, and a point on the stretch inside."""
 
-    grid: of the obstacles: a line whose cells are all known in it crosses no body.
+    line: NDArray[np.int64]
+    plan: NDArray[np.int64]
+    points: Array
+
+
+def plan_crossings(
+    lines: NDArray[np.object_], plans: Sequence[GroundPlan], grid: OccupancyGrid | None
+) -> PlanCrossings:
+    """Return where lines cross ground plans, except for the way from an end inside to the outside.
+
+    grid: of the obstacles: a line whose cells are all known in it crosses no plan.
     """
-    hit = np.zeros(len(lines), bool)
-    if not bodies:
-        return hit
-    grounds = np.array(bodies, object)
+    if not plans or not len(lines):
+        return PlanCrossings(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
+    grounds = np.array([plan.area for plan in plans], object)
     owner, ground = shapely.STRtree(grounds).query(lines, predicate="crosses")
     inside = shapely.line_merge(shapely.intersection(lines[owner], grounds[ground]))
     parts, pair = shapely.get_parts(inside, return_index=True)
     is_long = shapely.length(parts) >= MIN_CROSSING_METRES
-    parts, owner = parts[is_long], owner[pair[is_long]]
+    parts, owner, ground = parts[is_long], owner[pair[is_long]], ground[pair[is_long]]
     passing = np.ones(len(parts), bool)
     for index in (0, -1):
         ends = shapely.get_point(lines[owner], index)
         passing &= ~(shapely.distance(parts, ends) <= END_METRES)
-    parts, owner = parts[passing], owner[passing]
+    parts, owner, ground = parts[passing], owner[passing], ground[passing]
     if grid is not None:
-        segments, number = _segments(parts)
+        segments, number = line_segments(parts)
         unknown = np.zeros(len(parts), bool)
         unknown[number[_crossed_cells(segments, grid)[1]]] = True
-        owner = owner[unknown]
-    hit[owner] = True
-    return hit
+        parts, owner, ground = parts[unknown], owner[unknown], ground[unknown]
+    points = shapely.get_coordinates(shapely.line_interpolate_point(parts, 0.5, normalized=True))
+    return PlanCrossings(owner.astype(np.int64), ground.astype(np.int64), points)
 
 
-def _is_body(properties: Properties) -> bool:
+def is_body(properties: Properties) -> bool:
+    """Return whether an object is a building or a wall that stands in the way of robots."""
     base = properties.get("base")
     raised = isinstance(base, (int, float)) and base >= CLEARANCE_METRES
     return str(properties.get("kind")) in BODIES and not raised

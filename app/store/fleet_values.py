@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any, Final, Literal
 
-from app.event_types import RobotState
+from app.event_types import RobotPlace, RobotState
 from app.model.closures import NO_CLOSURES, Closure, Closures
 from app.store.values import rfc3339
 
@@ -110,7 +110,7 @@ class RobotReport:
 
     reported_at: by the robot's clock. sequence: of the last event that it has processed. holds: version and root that
     it has loaded, ``NO_ROOT`` for none; None if not reported; not part of the history. overlays: digest of the closures
-    in the loaded map; None from robots without support for closures.
+    in the loaded map; None from robots without support for closures. place: not part of the history.
     """
 
     channel: str
@@ -122,6 +122,7 @@ class RobotReport:
     reported_at: datetime | None = None
     overlays: str | None = None
     holds: tuple[int, str] | None = None
+    place: RobotPlace | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +164,7 @@ class Robot:
     time: of its last report. since: when it first reported the same. on_bus: its liveliness on the bus, as of
         ``presence_at``; None if it never was on the bus.
     vouched: whether any of its reports was authenticated, so that it counts in rollouts.
+    place: the last one that it reported, and placed: when the server received it; None if it never did.
     """
 
     robot: str
@@ -174,6 +176,8 @@ class Robot:
     on_bus: bool | None = None
     presence_at: datetime | None = None
     vouched: bool = True
+    place: RobotPlace | None = None
+    placed: datetime | None = None
 
     def has_failed_with(self, root: str) -> bool:
         """Return whether it reports a failure of a version."""

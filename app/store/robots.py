@@ -10,6 +10,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, Row, Select, delete, func, insert, select, tuple_, update
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
+from app.event_types import RobotPlace
 from app.store import tables
 from app.store.base import environment_row, storable_text, upsert
 from app.store.database import Database
@@ -160,6 +161,8 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
         values["since"] = received.time
     values["vouched"] = received.vouched or (row is not None and row.vouched)
     values |= _held_values(report, row, received.time)
+    if report.place is not None and not _is_delayed(report, row):
+        values |= {"place": report.place.as_dict(), "placed": received.time}
     if row is not None:
         connection.execute(update(table).where(*conditions).values(values))
     else:
@@ -171,6 +174,11 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     if not again:
         _remember(connection, environment_id, received, report_columns)
     return None
+
+
+def _is_delayed(report: RobotReport, row: Row[Any] | None) -> bool:
+    """Return whether the stored report is newer by the robot's clock, so that its place counts."""
+    return row is not None and None not in (row.said, report.reported_at) and report.reported_at < row.said
 
 
 def _held_values(report: RobotReport, row: Row[Any] | None, time: datetime) -> dict[str, Any]:
@@ -255,6 +263,6 @@ def _as_robot(row: Row[Any]) -> Robot:
     active_map = None
     if row.held_root is not None:
         active_map = ActiveMap(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
-    return Robot(
-        row.robot, row.environment, _as_report(row), row.time, row.since, active_map, row.there, row.seen, row.vouched
-    )
+    more = (active_map, row.there, row.seen, row.vouched)
+    place = None if row.place is None else RobotPlace.from_dict(row.place)
+    return Robot(row.robot, row.environment, _as_report(row), row.time, row.since, *more, place, row.placed)

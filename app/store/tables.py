@@ -404,11 +404,14 @@ robot = Table(
     Column("held_overlays", String(64), nullable=True),
     Column("held_since", UtcDateTime, nullable=True),
     Column("vouched", Boolean, nullable=False, server_default=true()),
+    Column("place", JSON(none_as_null=True), nullable=True),
+    Column("placed", UtcDateTime, nullable=True),
 )
 """Current state of robots, for each environment. since: when they first reported it.
 
 held: the active map, which a report
-of a map that is still being fetched does not change. vouched: whether any report was authenticated.
+of a map that is still being fetched does not change. vouched: whether any report was authenticated. place: result of
+``RobotPlace.as_dict``, from the report at ``placed``.
 """
 
 robot_history = Table(

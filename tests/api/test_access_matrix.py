@@ -91,7 +91,8 @@ ROWS = [
         f"GET {V}/preview.png, "
         f"GET {V}/layers/{{layer}}, GET {V}/maps, GET {V}/reports/{{format}}, POST {V}/links, GET {E}/diff, "
         f"GET {E}/diff/tiles/{{name}}, GET {E}/diff/tiles/{{name}}/{{z}}/{{row}}/{{col}}.png, GET {V}/losses, "
-        f"GET {V}/delta, GET {E}/channels, GET {E}/transform, GET {E}/templates, GET {E}/templates/{{format}}, "
+        f"GET {V}/delta, GET {V}/checks, POST {V}/checks, GET {E}/impact, "
+        f"GET {E}/channels, GET {E}/transform, GET {E}/templates, GET {E}/templates/{{format}}, "
         f"GET {V}/manifest, GET {V}/provenance, GET {E}/overlays, GET {E}/overlays/nav2, GET {E}/overlays/rmf, "
         f"GET {E}/overlays/vda5050, GET {V}/vda5050/actions, GET {V}/maps/{{format}}, "
         f"GET {V}/maps/{{format}}/{{file}}, GET /maps/{{env}}/{{format}}, GET /maps/{{env}}/{{format}}/{{file}}",
