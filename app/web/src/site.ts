@@ -8,15 +8,16 @@ import {
   asApiError,
   ask,
   type Channel,
+  type DryRun,
   type Environment,
   type LayerPart,
+  type Raster,
   requestJson,
   type Version,
 } from "./api/client";
 import { EventStream } from "./api/events";
 import { type Box, type Feature, fromWire, joinBoxes, type LayerName, type WireFeature } from "./map/features";
 import { createFrame, type Frame } from "./map/frame";
-import type { TileSet } from "./map/tiles";
 
 export const VECTOR_LAYERS: LayerName[] = ["zones", "objects", "topology", "location"];
 
@@ -24,10 +25,15 @@ export const VECTOR_LAYERS: LayerName[] = ["zones", "objects", "topology", "loca
 export const MAX_FEATURES = 60_000;
 const PAGE = 10_000;
 
+/** A version as addresses name it. */
+export function refOf(version: Version | DryRun): string {
+  return version.version === null ? version.id : String(version.version);
+}
+
 export class Site {
   readonly environment = signal<Environment | null>(null);
   readonly channels = signal<Channel[]>([]);
-  readonly version = signal<Version | null>(null);
+  readonly version = signal<Version | DryRun | null>(null);
   readonly parts = signal<LayerPart[]>([]);
   readonly features = signal<Feature[]>([]);
   readonly frame = signal<Frame | null>(null);
@@ -103,18 +109,24 @@ export class Site {
     return ["environments", this.name, ...parts];
   }
 
-  /** Number of the version shown; null before it is loaded. */
+  /** Number of the version shown; null for a dry run, and before it is loaded. */
   get number(): number | null {
     return this.version.value?.version ?? null;
+  }
+
+  /** The version shown, as addresses name it: its number, or `dry:…`. */
+  get exact(): string {
+    const version = this.version.value;
+    return version ? refOf(version) : "latest";
   }
 
   channelsAt(version: number): string[] {
     return this.channels.value.filter((one) => one.version === version).map(({ channel }) => channel);
   }
 
-  async tiles(part: LayerPart): Promise<TileSet> {
-    const path = this.path("versions", this.number ?? "latest", "tiles", part.layer, part.name);
-    return requestJson<TileSet>(apiPath(path, { level: part.level }));
+  async tiles(part: LayerPart): Promise<Raster> {
+    const path = this.path("versions", this.exact, "tiles", part.layer, part.name);
+    return requestJson<Raster>(apiPath(path, { level: part.level }));
   }
 
   /** Reads the environment and its channels again, and the version if its channel has moved. */
@@ -151,13 +163,15 @@ export class Site {
     this.control = new AbortController();
     const { signal: stop } = this.control;
     try {
-      const version = await ask(api.GET("/api/v1/environments/{env}/versions/{v}", { params, signal: stop }));
+      const answer = await ask(api.GET("/api/v1/environments/{env}/versions/{v}", { params, signal: stop }));
+      const version = answer as Version | DryRun;
       if (version.root === this.version.peek()?.root) {
         this.version.value = version;
-        return;
+        return; // the same content under another number
       }
       this.loading.value = true;
-      const exact = { path: { env: this.name, v: String(version.version) } };
+      const shown = refOf(version);
+      const exact = { path: { env: this.name, v: shown } };
       const parts = await ask(
         api.GET("/api/v1/environments/{env}/versions/{v}/layers", { params: exact, signal: stop }),
       );
@@ -165,11 +179,11 @@ export class Site {
       for (const { layer, count } of parts) counts.set(layer, (counts.get(layer) ?? 0) + count);
       const chosen = VECTOR_LAYERS.filter((layer) => counts.get(layer));
       const small = chosen.filter((layer) => (counts.get(layer) ?? 0) <= MAX_FEATURES);
-      const lists = await Promise.all(small.map((layer) => this.loadLayer(version.version ?? 0, layer, stop)));
+      const lists = await Promise.all(small.map((layer) => this.loadLayer(shown, layer, stop)));
       if (stop.aborted) return;
       batch(() => {
         this.version.value = version;
-        this.parts.value = parts;
+        this.parts.value = parts as LayerPart[];
         this.features.value = lists.flat();
         this.partial.value = chosen.filter((layer) => !small.includes(layer));
         this.problem.value = null;
@@ -181,7 +195,7 @@ export class Site {
     }
   }
 
-  private async loadLayer(version: number, layer: LayerName, stop: AbortSignal, bbox?: Box): Promise<Feature[]> {
+  private async loadLayer(version: string, layer: LayerName, stop: AbortSignal, bbox?: Box): Promise<Feature[]> {
     const query = bbox ? { crs: "local", bbox: bbox.join(","), limit: PAGE } : { crs: "local" };
     const path = apiPath(this.path("versions", version, "layers", layer), query);
     const { features } = await requestJson<{ features: WireFeature[] }>(path, { signal: stop });
@@ -190,11 +204,11 @@ export class Site {
 
   private async loadByExtent(extent: Box | null): Promise<void> {
     const layers = this.partial.value;
-    const version = this.version.peek()?.version;
-    if (!layers.length || !extent || version === null || version === undefined) return;
+    const version = this.version.peek();
+    if (!layers.length || !extent || !version) return;
     const { signal: stop } = this.control;
     try {
-      const lists = await Promise.all(layers.map((layer) => this.loadLayer(version, layer, stop, extent)));
+      const lists = await Promise.all(layers.map((layer) => this.loadLayer(refOf(version), layer, stop, extent)));
       if (stop.aborted) return;
       const others = this.features.peek().filter(({ layer }) => !layers.includes(layer as LayerName));
       this.features.value = [...others, ...lists.flat()];

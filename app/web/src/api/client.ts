@@ -6,6 +6,8 @@ import type { components, paths } from "./schema";
 export type Schemas = components["schemas"];
 export type Environment = Schemas["EnvironmentOut"];
 export type Version = Schemas["VersionOut"];
+export type DryRun = Schemas["DryRunOut"];
+export type Raster = Schemas["RasterOut"];
 export type LayerPart = Schemas["LayerOut"];
 export type Channel = Schemas["ChannelOut"];
 export type Robot = Schemas["RobotOut"];

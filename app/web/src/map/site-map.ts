@@ -283,8 +283,7 @@ export class SiteMap {
     try {
       const set = await this.site.tiles(part);
       if (this.rasters.has(key) || !this.site.rasters.peek().includes(part)) return;
-      const version = this.site.number ?? 0;
-      const base = `/api/v1/${this.site.path("versions", version, "tiles", part.layer, part.name).map(encodeURIComponent).join("/")}`;
+      const base = `/api/v1/${this.site.path("versions", this.site.exact, "tiles", part.layer, part.name).map(encodeURIComponent).join("/")}`;
       const tiles = new Tiles(set, (z, row, column) => {
         const search = new URLSearchParams({ level: part.level });
         const slice = this.slice.peek();

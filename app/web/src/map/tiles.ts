@@ -1,24 +1,9 @@
 /** Tiles of one raster, coloured and cached. */
+import type { Raster } from "../api/client";
 import type { TileReply, TileRequest } from "./tile-worker";
 
-/** What the server tells of a raster (`…/tiles/{kind}/{name}`). */
-export interface TileSet {
-  kind: string;
-  name: string;
-  level: string;
-  width: number;
-  height: number;
-  resolution: number;
-  origin: [number, number, number];
-  /** Pixel (column, row from the top) to local metres: x = a·column + b·row + c, y = d·column + e·row + f. */
-  transform: [number, number, number, number, number, number];
-  tile: number;
-  levels: number;
-  bounds: [number, number, number, number];
-  hash: string;
-  z_min?: number | null;
-  z_max?: number | null;
-}
+/** Size, place and levels of detail of a raster: what tiles are drawn by. */
+export type TileSet = Pick<Raster, "width" | "height" | "transform" | "tile" | "levels" | "bounds" | "hash">;
 
 const MAX_TILES = 400;
 
