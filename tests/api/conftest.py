@@ -125,7 +125,7 @@ def running(settings: Settings, verify: ssl.SSLContext | bool = False) -> Iterat
             api.close()
     finally:
         server.should_exit = True
-        thread.join(30)
+        thread.join(60)
         assert not thread.is_alive(), "the server did not stop"
 
 

@@ -304,7 +304,7 @@ def test_manifest_lists_more_maps_than_the_cache_holds(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, cache_bytes=0)) as api:
         api.post("environments", {"name": "small"})
         api.upload("small", {"n.tmap2.yaml": many()})
-        body = api.get("environments/small/versions/latest/manifest?formats=tmap2,geojson", timeout=30).json()
+        body = api.get("environments/small/versions/latest/manifest?formats=tmap2,geojson").json()
         assert {file["format"] for file in body["files"]} == {"tmap2", "geojson"}
         for file in body["files"]:
             data = api.get(f"/maps/small/{file['format']}/{file['name']}").content
