@@ -109,8 +109,8 @@ def test_repeated_request_is_served_from_memory(api: Api, farm: str) -> None:
 
 
 @pytest.mark.parametrize("formats", ["", "nothing", "tmap2,nothing"])
-def test_unknown_formats_are_refused(api: Api, farm: str, formats: str) -> None:
-    api.problem("GET", f"environments/{farm}/versions/latest/manifest?formats={formats}", 422)
+def test_unknown_formats_are_refused(api: Api, unchanged_farm: str, formats: str) -> None:
+    api.problem("GET", f"environments/{unchanged_farm}/versions/latest/manifest?formats={formats}", 422)
 
 
 def test_unavailable_format_reports_missing_inputs(api: Api, bare: str) -> None:
@@ -212,8 +212,8 @@ def test_delta_skips_dictionaries_below_minimum_size(api: Api, bare: str) -> Non
         {"accept-encoding": "gzip"},
     ],
 )
-def test_unknown_dictionary_gives_the_complete_file(api: Api, farm: str, headers: dict[str, str]) -> None:
-    path = f"/maps/{farm}/tmap2/network.tmap2.yaml"
+def test_unknown_dictionary_gives_the_complete_file(api: Api, unchanged_farm: str, headers: dict[str, str]) -> None:
+    path = f"/maps/{unchanged_farm}/tmap2/network.tmap2.yaml"
     content = api.get(path).content
     answer, body = raw(api, path, {**offered(content), **headers} if "available-dictionary" not in headers else headers)
     assert answer.status_code == 200
