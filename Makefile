@@ -55,6 +55,7 @@ chaos: install-dev
 fuzz: install-dev
 	@$(BIN)/python -m pytest -q -n auto -m hypothesis --hypothesis-profile fuzz
 	@FLEETMAP_WORDS=50 $(BIN)/python -m pytest -q -n auto tests/hostile/test_property_types.py
+	@FLEETMAP_FENCES=40 $(BIN)/python -m pytest -q -n auto tests/generate/test_fields.py -k random_fences
 	@$(BIN)/python -m tests.hostile.fuzz $(ARGS)
 
 # The two tables of docs/security.md: hostile input and faults.

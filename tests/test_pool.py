@@ -47,7 +47,7 @@ def work_write(path: str, text: str) -> str:
 
 
 def work_call(port: int) -> str:
-    with socket.create_connection(("127.0.0.1", port), timeout=5) as s:
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as s:
         return str(s.getpeername()[1])
 
 
@@ -108,7 +108,7 @@ def test_ended_worker_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch)
     stop.attach(worker.process)
     assert worker.process.pid is not None
     os.kill(worker.process.pid, signal.SIGKILL)
-    worker.process.join(20)
+    worker.process.join(60)
     stop()
     with pytest.raises(WorkerDied):
         pool.run(work_double, 1)
@@ -141,7 +141,7 @@ def test_cancel_stops_running_and_waiting_jobs(pool: Pool) -> None:
         time.sleep(0.3)  # one runs, the other waits
     for stop, thread in reversed(list(zip(stops, threads, strict=True))):
         stop()
-        thread.join(20)
+        thread.join(60)
         assert not thread.is_alive()
     assert len(errors) == 2
     with pytest.raises(Cancelled):
@@ -191,7 +191,7 @@ def test_waiting_job_raises_unavailable_when_pool_closes(pool: Pool) -> None:
         time.sleep(0.3)
     pool.close()
     for thread in threads:
-        thread.join(10)
+        thread.join(60)
         assert not thread.is_alive()
     assert errors == [WorkerDied, Unavailable]
 

@@ -6,6 +6,8 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -69,23 +71,35 @@ def samples() -> list[Any]:
     facts = json.loads(path.read_text())["files"]
     maps = {n: e for n, e in facts.items() if e["kind"] in KINDS and (e["kind"] != "sdf" or e["facts"]["worlds"])}
     accepted = sorted((n for n in maps if n not in REFUSED), key=lambda n: (path.parent / n).stat().st_size)
-    largest = {maps[n]["kind"]: n for n in accepted}.values()
-    rows = [("sqlite", n) for n in maps] + [("postgres", n) for n in largest]
+    largest = set({maps[n]["kind"]: n for n in accepted}.values())
+    rows = [(database, n) for n in maps for database in ("sqlite", "postgres") if database == "sqlite" or n in largest]
     return [pytest.param(database, n, KINDS[maps[n]["kind"]], id=f"{database}-{n}") for database, n in rows]
 
 
-@pytest.fixture(scope="module", params=["sqlite", "postgres"])
-def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    folder = tmp_path_factory.mktemp("server")
-    url = None
-    if request.param == "postgres":
-        cluster: Cluster = request.getfixturevalue("postgres_cluster")
-        url = cluster.url(cluster.create_database())
-        store = Store(url, folder / "blobs")
-        store.migrate()
-        store.close()
-    with running(settings_for(folder, database_url=url)) as server:
-        yield server
+@pytest.fixture(scope="module")
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Api]]:
+    """Return a function: database -> its server, which runs until the end of the module."""
+    with ExitStack() as stack:
+
+        @cache
+        def start(database: str) -> Api:
+            folder = tmp_path_factory.mktemp("server")
+            url = None
+            if database == "postgres":
+                cluster: Cluster = request.getfixturevalue("postgres_cluster")
+                url = cluster.url(cluster.create_database())
+                store = Store(url, folder / "blobs")
+                store.migrate()
+                store.close()
+            return stack.enter_context(running(settings_for(folder, database_url=url)))
+
+        yield start
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def api(request: pytest.FixtureRequest, server: Callable[[str], Api]) -> Api:
+    """A module's fixture would be set up for each sample: pytest parametrizes it together with direct arguments."""
+    return server(request.param)
 
 
 def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:

@@ -12,6 +12,8 @@ import orjson
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.limits import Limits
 
+_CONTAINERS = (dict, list)
+
 MAX_DEPTH = 128
 """Maximum nesting of arrays and objects. Real files have about ten; recursive parsers fail near a thousand."""
 
@@ -58,5 +60,9 @@ def sort_keys(value: Any, key_ranks: Mapping[str, int]) -> Any:
     """
     if isinstance(value, dict):
         last = len(key_ranks)
-        return {k: sort_keys(value[k], key_ranks) for k in sorted(value, key=lambda k: (key_ranks.get(k, last), k))}
-    return [sort_keys(v, key_ranks) for v in value] if isinstance(value, list) else value
+        keys = sorted(value, key=lambda k: (key_ranks.get(k, last), k))
+        # Most values are numbers: a call for each would be half the time of a large network.
+        return {k: sort_keys(v, key_ranks) if isinstance(v := value[k], _CONTAINERS) else v for k in keys}
+    if isinstance(value, list):
+        return [sort_keys(v, key_ranks) if isinstance(v, _CONTAINERS) else v for v in value]
+    return value

@@ -128,7 +128,7 @@ class Robot:
                 return line
         return None
 
-    def wait(self, event: str, seconds: float = 30.0, after: int = 0, **members: Any) -> dict[str, Any]:
+    def wait(self, event: str, seconds: float = 60.0, after: int = 0, **members: Any) -> dict[str, Any]:
         """Until such a line came."""
         with self._news:
             self._news.wait_for(lambda: self.saw(event, after, **members) or not self._reader.is_alive(), seconds)
@@ -144,7 +144,7 @@ class Robot:
     def file(self, name: str = "tmap2/network.tmap2.yaml") -> bytes:
         return (self.into / "current" / name).read_bytes()
 
-    def end(self, seconds: float = 20.0) -> int:
+    def end(self, seconds: float = 60.0) -> int:
         """Until it ends by itself: its exit status."""
         try:
             return self.process.wait(seconds)
@@ -161,8 +161,8 @@ class Robot:
         """As the power goes."""
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait(10)
-        self._reader.join(10)
+        self.process.wait(60)
+        self._reader.join(60)
         if self.process.stdout is not None:
             self.process.stdout.close()
 
@@ -286,7 +286,7 @@ class Gate:
     def close(self) -> None:
         self._server.shutdown()
         self._server.server_close()
-        self._thread.join(10)
+        self._thread.join(60)
 
 
 @pytest.fixture

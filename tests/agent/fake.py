@@ -80,7 +80,7 @@ class Fake:
     def close(self) -> None:
         self._server.shutdown()
         self._server.server_close()
-        self._thread.join(10)
+        self._thread.join(60)
 
     def put(self, files: Files) -> int:
         """A version with these files; its number."""
@@ -201,7 +201,7 @@ def run(one: One) -> Iterator[None]:
         yield
     finally:
         one.agent.stop()
-        thread.join(30)
+        thread.join(60)
         assert not thread.is_alive(), "it does not end"
         one.agent.close()
 

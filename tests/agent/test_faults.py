@@ -116,7 +116,7 @@ def test_forged_events_cost_little_and_change_nothing(
     assert len(manifest_paths) < 30, len(manifest_paths)
     assert one.standing["version"] == 1
     api.upload(place, {"n.tmap2.yaml": network(1)})
-    one.wait("active", 15, version=2)
+    one.wait("active", version=2)
     one.wait("hook", version=2)
     assert (tmp_path / "layers").read_text().split() == ["topology", "topology"]
     assert one.stop() == 0

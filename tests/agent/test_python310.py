@@ -97,20 +97,35 @@ def test_agent_on_python_3_10_follows_server(
     assert one.stop() == 0
 
 
+REPETITIONS = (
+    "test_kill_at_random_moments_of_hooks_ends_consistently",
+    "(test_agent_recovers_from_disk_error_at_each_step and killed)",
+    "test_hook_printing_a_gigabyte_is_rolled_back",
+    "test_hook_variables_of_many_changed_files_are_truncated",
+    "test_topological_hook_checks_published_map",
+)
+"""Tests that repeat what a shorter test beside them does, many times or with much data: on one Python."""
+
+PARTS = 3
+
 OWN = sorted(p for p in Path(__file__).parent.rglob("test_*.py") if not SERVER.search(p.read_text()))
 
 
 def test_agent_tests_are_found() -> None:
     assert {"test_hooks.py", "test_bad_server.py", "test_grids.py", "test_node.py"} <= {p.name for p in OWN}
+    text = "".join(path.read_text() for path in OWN)
+    for name in re.findall(r"test_\w+", " ".join(REPETITIONS)):
+        assert text.count(f"def {name}(") == 1, name
 
 
-@pytest.mark.parametrize("file", OWN, ids=lambda path: path.stem)
-def test_agent_tests_pass_on_python_3_10(python310: Path, file: Path, tmp_path: Path) -> None:
-    """Tests of this folder that need no server, one file a test."""
+@pytest.mark.parametrize("part", range(PARTS))
+def test_agent_tests_pass_on_python_3_10(python310: Path, part: int, tmp_path: Path) -> None:
+    """Tests of this folder that need no server: each process imports for seconds, so it takes several files."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTEST_", "FLEETMAP_"))}
     ended = subprocess.run(
         [python310, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", ROOT / "pyproject.toml", "--rootdir", ROOT,
-         "--confcutdir", ROOT / "tests" / "agent", "--basetemp", tmp_path / "tests", file],
+         "--confcutdir", ROOT / "tests" / "agent", "--basetemp", tmp_path / "tests",
+         "-k", f"not ({' or '.join(REPETITIONS)})", *OWN[part::PARTS]],
         cwd=ROOT, env=clean, capture_output=True, text=True, timeout=280, check=False,
     )  # fmt: skip
     assert ended.returncode == 0, ended.stdout[-8000:] + ended.stderr[-2000:]

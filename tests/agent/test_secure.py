@@ -71,7 +71,7 @@ def test_agent_follows_over_tls(secure: Api, authority: Authority, tmp_path: Pat
         one.wait("active", version=1)
         one.wait("connected")
         secure.upload(env, {"n.tmap2.yaml": network(0.25, count=20)})
-        one.wait("active", 20, version=2)
+        one.wait("active", version=2)
         assert one.standing["version"] == 2
         assert eventually(lambda: (r := robot_of(secure, "tractor")) and r["online"] and r["version"] == 2)
         assert one.stop() == 0
@@ -91,7 +91,7 @@ def test_agent_with_wrong_password_still_polls(secure: Api, authority: Authority
     try:
         one.wait("active", version=1)
         secure.upload(env, {"n.tmap2.yaml": network(0.5, count=20)})
-        one.wait("active", 20, version=2)
+        one.wait("active", version=2)
         assert one.saw("connected") is None
         assert "use --robot tractor" in one.wait("user")["detail"]
         assert eventually(lambda: (r := robot_of(secure, "plough")) and r["version"] == 2), "over HTTPS"

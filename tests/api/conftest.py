@@ -125,7 +125,7 @@ def running(settings: Settings, verify: ssl.SSLContext | bool = False) -> Iterat
             api.close()
     finally:
         server.should_exit = True
-        thread.join(30)
+        thread.join(60)
         assert not thread.is_alive(), "the server did not stop"
 
 
@@ -152,15 +152,25 @@ def fresh() -> Callable[[], str]:
     return lambda: f"env-{next(_count)}"
 
 
-@pytest.fixture
-def farm(api: Api, fresh: Callable[[], str]) -> str:
+def create_farm(api: Api, name: str) -> str:
     """Create an environment with a datum (version 1), a network (2) and a grid (3)."""
-    name = fresh()
     api.post("environments", {"name": name, "title": "Farm", "tags": ["wheat"]})
     api.upload(name, {"datum.yaml": samples.DATUM}, message="measured")
     api.upload(name, {"network.tmap2.yaml": samples.tmap2()}, message="driven")
     api.upload(name, samples.grid(), message="mapped")
     return name
+
+
+@pytest.fixture
+def farm(api: Api, fresh: Callable[[], str]) -> str:
+    """Create an environment of the test's own, as ``create_farm`` does."""
+    return create_farm(api, fresh())
+
+
+@pytest.fixture(scope="session")
+def unchanged_farm(api: Api) -> str:
+    """Return the environment that tests share which only read, or whose requests are refused."""
+    return create_farm(api, "unchanged-farm")
 
 
 @pytest.fixture

@@ -102,11 +102,11 @@ RING: Json = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]
     ],
 )
 def test_features_need_the_geometry_of_their_kind(
-    api: Api, farm: str, layer: str, geometry: Json | None, properties: Json, message: str
+    api: Api, unchanged_farm: str, layer: str, geometry: Json | None, properties: Json, message: str
 ) -> None:
     feature = {"type": "Feature", "id": "new", "geometry": geometry, "properties": properties}
     change = put(layer, feature, crs="local")
-    problem = api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
+    problem = api.problem("POST", f"environments/{unchanged_farm}/edits", 422, json={"changes": [change]})
     assert message in problem["detail"]
     assert problem["errors"][0]["where"] == "changes[0]"
 

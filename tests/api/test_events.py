@@ -16,7 +16,7 @@ from tests.api.conftest import API, Api
 
 def stream(api: Api, **query: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     headers = query.pop("headers", {})
-    with api.http.stream("GET", f"{API}/events", params=query, headers=headers, timeout=30) as answer:
+    with api.http.stream("GET", f"{API}/events", params=query, headers=headers, timeout=60) as answer:
         assert answer.status_code == 200, answer.read()
         assert answer.headers["content-type"].startswith("text/event-stream")
         fields: dict[str, str] = {}
@@ -105,17 +105,17 @@ def test_streams_at_one_position_share_reads(api: Api, bare: str, monkeypatch: p
     def follow(client: Api) -> None:
         following = stream(client, environment=bare, since=0)
         next(following)
-        begun.wait(30)
+        begun.wait(60)
         versions.append(next(following)[2]["version"])
 
     threads = [threading.Thread(target=follow, args=(api.as_(api.token),)) for _ in range(count)]
     for thread in threads:
         thread.start()
-    begun.wait(30)
+    begun.wait(60)
     monkeypatch.setattr(events, "page", counted)
     api.upload(bare, samples.grid())
     for thread in threads:
-        thread.join(30)
+        thread.join(60)
     assert versions == [1] * count
     assert reads.count((bare, 1)) < count / 2
 
@@ -127,6 +127,6 @@ def test_invalid_streams_are_refused(api: Api, bare: str) -> None:
     assert api.get("events?since=-1", expect=None).status_code == 422
     head = api("HEAD", f"events?environment={bare}", 200)
     assert (head.headers["content-type"], head.content) == ("text/event-stream; charset=utf-8", b"")
-    api.get("/healthz", timeout=10)  # on the same connection
+    api.get("/healthz", timeout=60)  # on the same connection
     for query in (f"environment={bare}&since=2", f"since={10**9}"):
         assert "is beyond the event log" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]

@@ -109,8 +109,8 @@ def test_repeated_request_is_served_from_memory(api: Api, farm: str) -> None:
 
 
 @pytest.mark.parametrize("formats", ["", "nothing", "tmap2,nothing"])
-def test_unknown_formats_are_refused(api: Api, farm: str, formats: str) -> None:
-    api.problem("GET", f"environments/{farm}/versions/latest/manifest?formats={formats}", 422)
+def test_unknown_formats_are_refused(api: Api, unchanged_farm: str, formats: str) -> None:
+    api.problem("GET", f"environments/{unchanged_farm}/versions/latest/manifest?formats={formats}", 422)
 
 
 def test_unavailable_format_reports_missing_inputs(api: Api, bare: str) -> None:
@@ -212,8 +212,8 @@ def test_delta_skips_dictionaries_below_minimum_size(api: Api, bare: str) -> Non
         {"accept-encoding": "gzip"},
     ],
 )
-def test_unknown_dictionary_gives_the_complete_file(api: Api, farm: str, headers: dict[str, str]) -> None:
-    path = f"/maps/{farm}/tmap2/network.tmap2.yaml"
+def test_unknown_dictionary_gives_the_complete_file(api: Api, unchanged_farm: str, headers: dict[str, str]) -> None:
+    path = f"/maps/{unchanged_farm}/tmap2/network.tmap2.yaml"
     content = api.get(path).content
     answer, body = raw(api, path, {**offered(content), **headers} if "available-dictionary" not in headers else headers)
     assert answer.status_code == 200
@@ -304,7 +304,7 @@ def test_manifest_lists_more_maps_than_the_cache_holds(tmp_path: Path) -> None:
     with running(settings_for(tmp_path, cache_bytes=0)) as api:
         api.post("environments", {"name": "small"})
         api.upload("small", {"n.tmap2.yaml": many()})
-        body = api.get("environments/small/versions/latest/manifest?formats=tmap2,geojson", timeout=30).json()
+        body = api.get("environments/small/versions/latest/manifest?formats=tmap2,geojson").json()
         assert {file["format"] for file in body["files"]} == {"tmap2", "geojson"}
         for file in body["files"]:
             data = api.get(f"/maps/small/{file['format']}/{file['name']}").content

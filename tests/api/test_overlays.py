@@ -218,11 +218,11 @@ def test_overlay_of_an_earlier_release_becomes_a_closure(api: Api, farm: str, wh
         ([[0, 0], [1, 1], [1, 0], [0, 1], [0, 0]], "local", "valid"),
     ],
 )
-def test_area_that_cannot_be_placed_is_refused(api: Api, farm: str, ring: Any, crs: str, text: str) -> None:
+def test_area_that_cannot_be_placed_is_refused(api: Api, unchanged_farm: str, ring: Any, crs: str, text: str) -> None:
     body = {"kind": "blocked", "crs": crs, "polygon": {"type": "Polygon", "coordinates": [ring]}}
-    problem = api.problem("POST", f"environments/{farm}/overlays", 422, json=body)
+    problem = api.problem("POST", f"environments/{unchanged_farm}/overlays", 422, json=body)
     assert text in problem["detail"]
-    api.get(f"/maps/{farm}/tmap2")
+    api.get(f"/maps/{unchanged_farm}/tmap2")
 
 
 def test_polygon_is_stored_without_foreign_members(api: Api, farm: str, bare: str) -> None:

@@ -20,8 +20,18 @@ LANE = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</na
 
 @pytest.fixture
 def env(api: Api, request: pytest.FixtureRequest) -> str:
+    """Create an environment of the test's own, as ``draw`` does."""
+    return draw(api, f"t-{abs(hash(request.node.name)) % 10**9}")
+
+
+@pytest.fixture(scope="module")
+def unchanged(api: Api) -> str:
+    """Return the environment of tests whose requests are refused."""
+    return draw(api, "t-unchanged")
+
+
+def draw(api: Api, name: str) -> str:
     """Create a datum (version 1) and a drawn network (2) without action, tolerances and influence zones."""
-    name = f"t-{abs(hash(request.node.name)) % 10**9}"
     datum = {"latitude": samples.LATITUDE, "longitude": samples.LONGITUDE}
     api.post("environments", {"name": name, "datum": datum})
     api.upload(name, {"lanes.kml": LANE}, layer="topology")
@@ -204,12 +214,12 @@ def test_templates_honour_if_match_keys_and_dry_run(api: Api, env: str) -> None:
     ],
 )
 def test_invalid_templates_name_the_member(
-    api: Api, env: str, what: str, body: Any, status: int, where: str | None
+    api: Api, unchanged: str, what: str, body: Any, status: int, where: str | None
 ) -> None:
-    problem = api.problem("PUT", f"environments/{env}/templates{what}", status, json=body)
+    problem = api.problem("PUT", f"environments/{unchanged}/templates{what}", status, json=body)
     if where is not None:
         assert [e["where"] for e in problem["errors"]] == [where]
-    assert api.get(f"environments/{env}").json()["version"] == 2
+    assert api.get(f"environments/{unchanged}").json()["version"] == 2
 
 
 def test_environment_package_uses_templates(api: Api, env: str) -> None:

@@ -129,7 +129,7 @@ def test_compressed_bodies_return_415(tight: Api) -> None:
 
 def test_declared_length_is_enough_to_refuse(tight: Api) -> None:
     place = urlsplit(tight.url)
-    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=10)
+    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=60)
     connection.putrequest("POST", "/api/v1/environments/farm/versions")
     connection.putheader("Authorization", f"Bearer {ADMIN}")
     connection.putheader("Content-Type", f"multipart/form-data; boundary={BOUNDARY}")
@@ -152,7 +152,7 @@ def test_json_body_size_is_limited(tight: Api) -> None:
 
 def _request(api: Api, head: str) -> socket.socket:
     place = urlsplit(api.url)
-    line = socket.create_connection((place.hostname or "", place.port or 0), timeout=15)
+    line = socket.create_connection((place.hostname or "", place.port or 0), timeout=60)
     line.sendall(head.encode())
     return line
 
@@ -167,7 +167,7 @@ def test_stalled_body_returns_408(tight: Api) -> None:
         started = time.monotonic()
         answer = line.recv(65536)
         assert answer.startswith(b"HTTP/1.1 408 ")
-        assert 0.5 < time.monotonic() - started < 10
+        assert 0.5 < time.monotonic() - started < 50
     assert spool_is_empty(tight)
 
 

@@ -290,9 +290,9 @@ def test_cells_in_a_polygon_are_set(api: Api, farm: str) -> None:
          "coordinates": ["x", None]}, "properties": {"kind": "node"}}},
     ],
 )  # fmt: skip
-def test_invalid_edits_are_refused(api: Api, farm: str, change: object) -> None:
-    api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
-    assert api.get(f"environments/{farm}").json()["version"] == 3
+def test_invalid_edits_are_refused(api: Api, unchanged_farm: str, change: object) -> None:
+    api.problem("POST", f"environments/{unchanged_farm}/edits", 422, json={"changes": [change]})
+    assert api.get(f"environments/{unchanged_farm}").json()["version"] == 3
 
 
 def test_edits_honour_if_match_and_idempotency_key(api: Api, farm: str) -> None:
@@ -318,6 +318,6 @@ def test_edits_honour_if_match_and_idempotency_key(api: Api, farm: str) -> None:
         '{"message": 1e999, "changes": []}',
     ],
 )
-def test_invalid_json_returns_400(api: Api, farm: str, text: str | bytes) -> None:
+def test_invalid_json_returns_400(api: Api, unchanged_farm: str, text: str | bytes) -> None:
     headers = {"Content-Type": "application/json"}
-    api.problem("POST", f"environments/{farm}/edits", 400, content=text, headers=headers)
+    api.problem("POST", f"environments/{unchanged_farm}/edits", 400, content=text, headers=headers)

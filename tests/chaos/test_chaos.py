@@ -83,9 +83,9 @@ def check(fleet: Fleet) -> None:
     created = [event["version"] for event in events if event["type"] == "version.created"]
     assert created == list(range(1, head["version"] + 1)), "an event is missing or duplicate"
     expected = list(range(1, last + 1))
-    eventually(lambda: fleet.reader.sequences[-1:] == [last], 30)
+    eventually(lambda: fleet.reader.sequences[-1:] == [last])
     assert fleet.reader.sequences == expected, "server-sent events: a gap or a repeat"
-    eventually(lambda: fleet.listener.sequences()[-1:] == [last], 30)
+    eventually(lambda: fleet.listener.sequences()[-1:] == [last])
     assert fleet.listener.sequences() == expected, "Zenoh: a gap"
     check_robots(fleet, head)
 

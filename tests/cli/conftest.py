@@ -110,7 +110,7 @@ class ServerProcess:
         """Wait for /healthz; the seconds since ``start``, which is a time of ``time.monotonic``."""
         return seconds_until_healthy(self.address, start)
 
-    def stop(self, number: int = signal.SIGTERM, seconds: float = 30.0) -> int:
+    def stop(self, number: int = signal.SIGTERM, seconds: float = 60.0) -> int:
         """Signal it and wait: its exit status. Whatever is left of its group is killed."""
         if self.process.poll() is None:
             self.process.send_signal(number)
@@ -119,8 +119,8 @@ class ServerProcess:
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait(5)
-            self._reader.join(5)
+            self.process.wait(60)
+            self._reader.join(60)
             assert self.process.stdout is not None
             self.process.stdout.close()
 

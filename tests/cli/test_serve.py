@@ -173,7 +173,7 @@ def test_workers_stop_with_parent_process(tmp_path: Path) -> None:
     address = process.ready()
     process.process.kill()
     process.process.wait(10)
-    process._reader.join(30)  # its output ends when the last worker has closed it
+    process._reader.join(60)  # its output ends when the last worker has closed it
     ended = not process._reader.is_alive()
     process.stop()
     assert ended

@@ -155,7 +155,7 @@ def test_image_serves_maps_from_postgis(
         wait_ready(address)
         assert server.run(server.healthcheck).returncode == 0
         with pytest.raises(urllib.error.HTTPError) as refused:
-            urllib.request.urlopen(f"{address}/api/v1/environments", timeout=10)
+            urllib.request.urlopen(f"{address}/api/v1/environments", timeout=60)
         refused.value.close()
         assert refused.value.code == 401
 
@@ -168,7 +168,7 @@ def test_image_serves_maps_from_postgis(
         moved = out.with_suffix(".tmap2.yaml")
         moved.write_text(out.read_text().replace("xy_goal_tolerance: 0.3", "xy_goal_tolerance: 0.4"))
         assert offline("import", moved, "-e", "copy", *access).status == 0
-        with urllib.request.urlopen(f"{address}/readyz", timeout=10) as ready:
+        with urllib.request.urlopen(f"{address}/readyz", timeout=60) as ready:
             assert ready.status == 200
     finally:
         began = time.monotonic()

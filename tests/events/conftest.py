@@ -62,12 +62,12 @@ class Listener:
         """Each sequence once, in the order they first came."""
         return list(dict.fromkeys(e["sequence"] for e in self.events))
 
-    def wait(self, condition: Callable[[Listener], bool], seconds: float = 20.0) -> None:
+    def wait(self, condition: Callable[[Listener], bool], seconds: float = 60.0) -> None:
         with self._news:
             assert self._news.wait_for(lambda: condition(self), seconds), [e["sequence"] for e in self.events]
 
 
-def eventually(condition: Callable[[], Any], seconds: float = 20.0) -> Any:
+def eventually(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
     deadline = time.monotonic() + seconds
     while True:
         value = condition()

@@ -39,7 +39,7 @@ def test_maps_over_zenoh_equal_http(api: Api, session: zenoh.Session) -> None:
     api.upload("asked", samples.grid())
 
     def get(key: str) -> Any:
-        reply = next(iter(session.get(key, timeout=20.0)))
+        reply = next(iter(session.get(key, timeout=60.0)))
         return reply.ok if reply.ok is not None else reply.err
 
     for version in ("1", "latest"):
@@ -82,7 +82,7 @@ def test_environments_by_position_equal_http(api: Api, session: zenoh.Session) -
             api.upload(name, files)
 
     def get(parameters: str) -> Any:
-        reply = next(iter(session.get(f"fleetmap/server/where{parameters}", timeout=20.0)))
+        reply = next(iter(session.get(f"fleetmap/server/where{parameters}", timeout=60.0)))
         return reply.ok if reply.ok is not None else reply.err
 
     answer = get("?lat=53.2687;lon=-0.5246")
@@ -118,16 +118,16 @@ def test_conversion_does_not_block_other_queries(
     make = maps.fetch
 
     def slow(*args: Any, **more: Any) -> Any:
-        assert go.wait(30)
+        assert go.wait(60)
         return make(*args, **more)
 
     monkeypatch.setattr(maps, "fetch", slow)
     try:
         for _ in range(10):
-            session.get("fleetmap/busy/latest/maps/geojson/map.geojson", late.append, timeout=30.0)
+            session.get("fleetmap/busy/latest/maps/geojson/map.geojson", late.append, timeout=60.0)
         with zenoh.open(client_config(port)) as leaves:
-            leaves.get("fleetmap/busy/latest/maps/geojson", lambda _: None, timeout=30.0)
-            quick = next(iter(session.get("fleetmap/busy/1/version", timeout=20.0)))
+            leaves.get("fleetmap/busy/latest/maps/geojson", lambda _: None, timeout=60.0)
+            quick = next(iter(session.get("fleetmap/busy/1/version", timeout=60.0)))
         assert quick.ok is not None
         assert not late
     finally:
@@ -148,11 +148,11 @@ def test_complete_site_over_zenoh_equals_http(api: Api, session: zenoh.Session) 
         (f"/{folder}/nav.yaml", "level=*;grid=*"),
         ("/map.yaml", "level=*"),
     ):
-        reply = next(iter(session.get(f"fleetmap/{base}{rest}?{query}", timeout=20.0)))
+        reply = next(iter(session.get(f"fleetmap/{base}{rest}?{query}", timeout=60.0)))
         assert reply.ok is not None, bytes(reply.err.payload)
         path = f"environments/tower/versions/latest/maps/occupancy_grid{quote(rest)}?{query.replace(';', '&')}"
         assert bytes(reply.ok.payload) == api.get(path).content
-    reply = next(iter(session.get(f"fleetmap/{base}/L9/map.yaml", timeout=20.0)))
+    reply = next(iter(session.get(f"fleetmap/{base}/L9/map.yaml", timeout=60.0)))
     assert json.loads(bytes(reply.err.payload))["status"] == 404
 
 
@@ -169,7 +169,7 @@ def test_file_too_large_for_zenoh_is_not_read(
         return replace(cached_map, files=tuple(replace(f, size=2**40, path=Path("/nowhere")) for f in cached_map.files))
 
     monkeypatch.setattr(api.app.state.services.maps, "get_cached", huge)
-    reply = next(iter(session.get("fleetmap/large/latest/maps/occupancy_grid/map.pgm", timeout=20.0)))
+    reply = next(iter(session.get("fleetmap/large/latest/maps/occupancy_grid/map.pgm", timeout=60.0)))
     problem = json.loads(bytes(reply.err.payload))
     assert (problem["status"], problem["title"]) == (413, "Too large")
     assert "1099511627776 bytes; the limit over Zenoh is 67108864: fetch it over HTTP" in problem["detail"]
@@ -186,7 +186,7 @@ def test_damaged_data_is_logged_as_critical_for_zenoh_queries(
 
         with monkeypatch.context() as patch:
             patch.setattr(api.app.state.services.store.versions, "get", fail)
-            reply = next(iter(session.get("fleetmap/rotten/0/version", timeout=20.0)))
+            reply = next(iter(session.get("fleetmap/rotten/0/version", timeout=60.0)))
         assert json.loads(bytes(reply.err.payload))["status"] == 500
         assert [r.levelname for r in caplog.records if r.levelname == level]
     assert "a secret" not in caplog.text
@@ -212,5 +212,5 @@ def test_status_keys_with_wildcards_are_ignored(
 
 
 def test_server_has_liveliness_token(api: Api, session: zenoh.Session) -> None:
-    tokens = [str(r.ok.key_expr) for r in session.liveliness().get("fleetmap/server", timeout=5.0) if r.ok]
+    tokens = [str(r.ok.key_expr) for r in session.liveliness().get("fleetmap/server", timeout=60.0) if r.ok]
     assert tokens == ["fleetmap/server"]

@@ -143,11 +143,11 @@ def test_relay_uses_external_router(tmp_path: Path, caplog: pytest.LogCaptureFix
     endpoint = f"tcp/127.0.0.1:{port}"
     with running(settings_for(tmp_path, zenoh_mode="client", zenoh_connect=endpoint, log_level="info")) as api:
         api.post("environments", {"name": "patient"})
-        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "down", 30)
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "down")
         router = Router(router_configuration(BusOptions(listen=endpoint)))
         assert router.problem is None
         try:
-            eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected", 30)
+            eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
             session = zenoh.open(client_config(port))
             try:
                 Listener(session, "fleetmap/patient/events").wait(lambda e: e.sequences() == [1])
@@ -156,7 +156,7 @@ def test_relay_uses_external_router(tmp_path: Path, caplog: pytest.LogCaptureFix
             assert f"event relay: connected to Zenoh at {endpoint}" in caplog.text
         finally:
             router.close()
-        bus_state = eventually(lambda: (e := api.get("/readyz").json()["events"])["state"] == "down" and e, 30)
+        bus_state = eventually(lambda: (e := api.get("/readyz").json()["events"])["state"] == "down" and e)
         assert bus_state["detail"] == f"lost the connection to the router at {endpoint}: reconnecting"
 
 
@@ -291,12 +291,12 @@ def test_router_dying_at_start_is_restarted(monkeypatch: pytest.MonkeyPatch) -> 
     options = BusOptions(mode="router", listen=f"tcp/127.0.0.1:{free_port()}")
     bus = Bus(options, query_handler=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
     try:
-        eventually(bus.ensure_connected, 30)
+        eventually(bus.ensure_connected)
         started[0]._process.kill()
         started[0]._process.wait()
         assert not bus.ensure_connected()
         assert started[1].problem is not None
-        eventually(bus.ensure_connected, 30)
+        eventually(bus.ensure_connected)
         assert len(started) == 3
     finally:
         bus.close()

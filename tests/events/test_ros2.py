@@ -236,7 +236,7 @@ class Heard:
 
 
 def tokens(session: zenoh.Session, key: str) -> set[str]:
-    return {str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=5.0) if reply.ok}
+    return {str(reply.ok.key_expr) for reply in session.liveliness().get(key, timeout=60.0) if reply.ok}
 
 
 def picture(*occupied: tuple[int, int], width: int = 8, height: int = 6) -> dict[str, bytes]:
@@ -418,7 +418,7 @@ def test_ros2_topics_survive_killed_router(api: Api, session: zenoh.Session, por
     def last() -> Any:
         return early.samples and grid_of(bytes(early.samples[-1].payload))["cells"][2, 2] == 100
 
-    eventually(last, 30)
+    eventually(last)
     with zenoh.open(client_config(port)) as other:
         late = Heard(other, f"5/rough_hall/map/{GRID}")
         assert grid_of(late.wait(1, 30))["cells"][2, 2] == 100

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 from typing import Any
 
 LETTERS = {"F4": "f", "F8": "d", "U1": "B", "U2": "H", "U4": "I", "U8": "Q", "I1": "b", "I2": "h", "I4": "i", "I8": "q"}
 PLY = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
 
 
+@lru_cache(maxsize=2)
 def pcd(data: bytes) -> tuple[dict[str, str], list[list[Any]]]:
     """Return header and points, each a list of all values without padding, floats in their own precision."""
     head, _, rest = data.partition(b"DATA ")

@@ -82,7 +82,7 @@ def test_sample_matches_expected_facts() -> None:
 
 
 def test_file_of_reference_writer_round_trips() -> None:
-    data, node_rows, graph = reference_output((200, 120), 300)
+    data, node_rows, graph = reference_output((200, 120), 120)
     assert formats.detect("prm_autogen.yaml", data) is FORMAT
     files = {
         "config/topological/prm_autogen.yaml": data,

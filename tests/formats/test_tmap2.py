@@ -75,6 +75,10 @@ def bounds(part: Features) -> list[list[float]]:
     return [xyz.min(0).tolist(), xyz.max(0).tolist()]
 
 
+LARGE_BYTES = 1_000_000
+"""The comparator takes seconds for larger files; ``tests/test_real_maps.py`` compares them as they are served."""
+
+
 def real(shared: Path) -> list[Path]:
     data = shared / "data"
     paths = [p for end in ("*.tmap2.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in data.rglob(end)]
@@ -93,7 +97,8 @@ def test_real_files_round_trip(shared: Path, same: Same, facts_json: dict[str, A
         assert [g.main for g in formats.group({path.name: data}, "tmap2")[0]] == [path.name]
         layers, _ = read(data, path.name)
         served, context = again(layers)
-        assert same("tmap2", {path.name: data}, {"network.tmap2.yaml": served}) == [], path
+        if len(data) < LARGE_BYTES:
+            assert same("tmap2", {path.name: data}, {"network.tmap2.yaml": served}) == [], path
         assert context.dropped == []
         once_more, _ = again(read(served)[0])
         assert once_more == served, path
@@ -126,7 +131,7 @@ def test_written_files_are_valid_for_schema_and_other_readers(shared: Path) -> N
         if path.stat().st_size > 400_000:
             continue
         served, _ = again(read(path.read_bytes(), path.name)[0])
-        check_schema(yaml.safe_load(served))
+        check_schema(yaml.load(served, yaml.CSafeLoader))
         ryml.parse_in_arena(served)
         assert b"*" not in served.replace(b"'*", b"")
 

@@ -48,7 +48,7 @@ def digests(files: Files) -> frozenset[tuple[str, str]]:
 def upload_until_dead(address: str, ledger: Ledger, dice: random.Random) -> None:
     """Upload one grid after another, some of them large, until the server dies."""
     with (
-        httpx.Client(base_url=address, headers=HEADERS, timeout=20, verify=False) as client,
+        httpx.Client(base_url=address, headers=HEADERS, timeout=60, verify=False) as client,
         contextlib.suppress(httpx.HTTPError),
     ):
         while True:
@@ -83,7 +83,7 @@ def serving(folder: Path, starts: list[float]) -> Iterator[tuple[ServerProcess, 
 
 def check(folder: Path, address: str, ledger: Ledger) -> int:
     """Check the invariants after a fault; return the number of versions."""
-    with httpx.Client(base_url=address, headers=HEADERS, timeout=20, verify=False) as client:
+    with httpx.Client(base_url=address, headers=HEADERS, timeout=60, verify=False) as client:
         head = client.get(ENVIRONMENT).json()["version"]
         versions = client.get(f"{ENVIRONMENT}/versions", params={"limit": 1000}).json()
         assert [v["version"] for v in versions] == list(range(head, -1, -1)), "a gap, a fork or a number used twice"
@@ -134,7 +134,7 @@ def kill_while_uploads_arrive(tmp_path: Path, dice: random.Random, kills: int) -
             time.sleep(dice.uniform(0.0, 0.6))
             process.process.send_signal(signal.SIGKILL)
             for sender in senders:
-                sender.join(30)
+                sender.join(60)
                 assert not sender.is_alive()
     with serving(tmp_path, starts) as (_, address):
         heads.append(check(tmp_path, address, ledger))
