@@ -231,7 +231,7 @@ class _Writer:
         ends = np.array([(c.a, c.b) for c in connections], np.intp)
         lines = shapely.linestrings(xy[ends])
         tree = shapely.STRtree(lines)
-        portion, pair_count = min(500, max(1, 20_000_000 // n)), 0
+        portion, pair_count = max(1, 20_000_000 // n), 0
         for begin in range(0, n, portion):
             if pair_count > MANY_CROSSINGS * n + 1_000_000:
                 crossing[begin:] = True
