@@ -66,8 +66,8 @@ const RAMPS: Record<PaletteName, Record<"light" | "dark", Ramp>> = {
   },
 };
 
-/** Returns RGBA for each of the 256 values. opaqueUnknown: whether unknown cells hide what is below. */
-export function coloursOf(name: PaletteName, theme: "light" | "dark", opaqueUnknown = true): Uint32Array {
+/** Returns RGBA for each of the 256 values. overPicture: free and unknown cells let a picture below be seen. */
+export function coloursOf(name: PaletteName, theme: "light" | "dark", overPicture = false): Uint32Array {
   const { stops, unknown } = RAMPS[name][theme];
   const out = new Uint32Array(256);
   for (let value = 0; value <= 100; value++) {
@@ -78,10 +78,11 @@ export function coloursOf(name: PaletteName, theme: "light" | "dark", opaqueUnkn
     const [low, from] = stops[upper - 1] as [number, Rgb];
     const [high, to] = stops[upper] as [number, Rgb];
     const share = (value - low) / (high - low);
-    out[value] = rgba(from.map((part, index) => Math.round(part + share * ((to[index] ?? 0) - part))) as Rgb, 255);
+    const mixed = from.map((part, index) => Math.round(part + share * ((to[index] ?? 0) - part))) as Rgb;
+    out[value] = rgba(mixed, overPicture ? Math.min(255, value * 4) : 255);
   }
   out.fill(rgba([255, 0, 200], 255), 101, 255); // not a cell's value: to be seen
-  out[255] = rgba(unknown, opaqueUnknown ? 255 : 0);
+  out[255] = rgba(unknown, overPicture ? 0 : 255);
   return out;
 }
 

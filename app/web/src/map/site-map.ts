@@ -310,7 +310,7 @@ export class SiteMap {
   private colourTiles(part: LayerPart, tiles: Tiles): void {
     if (part.layer === "imagery") tiles.recolour(null);
     else if (isMask(part)) tiles.recolour(maskColours(part.name.includes("speed") ? [214, 137, 16] : [196, 43, 68]));
-    else tiles.recolour(coloursOf(palette.value, theme.value, part.layer !== "voxels" && !this.hasPictureBelow()));
+    else tiles.recolour(coloursOf(palette.value, theme.value, part.layer === "voxels" || this.hasPictureBelow()));
   }
 
   private hasPictureBelow(): boolean {
