@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import mimetypes
-from functools import cache
+import re
+from functools import lru_cache
 from pathlib import Path
 
 from fastapi import APIRouter, Request
@@ -41,6 +43,8 @@ HEADERS = {
 FOREVER = "public, max-age=31536000, immutable"
 """For files whose names contain their hash."""
 
+_FILE = re.compile(r"(assets/)?\w[\w.-]*")
+
 root_router = APIRouter()
 
 
@@ -74,10 +78,10 @@ def _file(request: Request, name: str, cache_control: str) -> Response:
         raise Unavailable(
             "the web page is not built: run `make run`, or install a wheel; /docs describes the HTTP calls"
         )
-    content = _read(name)
-    if content is None:
+    path = FOLDER / name
+    if not _FILE.fullmatch(name) or not path.is_file():
         raise NotFound("no such file of the page: open /")
-    plain, packed, etag = content
+    plain, packed, etag = _read(path, path.stat().st_mtime_ns)
     headers = {**HEADERS, "cache-control": cache_control, "etag": etag, "vary": "accept-encoding"}
     if none_match(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
@@ -88,21 +92,10 @@ def _file(request: Request, name: str, cache_control: str) -> Response:
     return Response(body, headers=headers, media_type=mimetypes.guess_type(name)[0] or "application/octet-stream")
 
 
-@cache
-def _read(name: str) -> tuple[bytes, bytes | None, str] | None:
-    """Return a file's bytes, its gzip form if that is smaller, and its weak ETag; None if there is no such file."""
-    import gzip
-
-    path = FOLDER / name
-    if name not in _names() or not path.is_file():
-        return None
+@lru_cache(maxsize=256)
+def _read(path: Path, changed: int) -> tuple[bytes, bytes | None, str]:
+    """Return a file's bytes, its gzip form if that is smaller, and its weak ETag. changed: time of its last change."""
     plain = path.read_bytes()
     packed = gzip.compress(plain, 9, mtime=0)
     etag = f'W/"{hashlib.sha256(plain).hexdigest()[:32]}"'
     return plain, packed if len(packed) < len(plain) else None, etag
-
-
-@cache
-def _names() -> frozenset[str]:
-    """List the files of the build: nothing else is served, whatever the address."""
-    return frozenset(path.relative_to(FOLDER).as_posix() for path in FOLDER.rglob("*") if path.is_file())
