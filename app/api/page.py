@@ -93,8 +93,11 @@ def _file(request: Request, name: str, cache_control: str) -> Response:
 
 
 @lru_cache(maxsize=256)
-def _read(path: Path, changed: int) -> tuple[bytes, bytes | None, str]:
-    """Return a file's bytes, its gzip form if that is smaller, and its weak ETag. changed: time of its last change."""
+def _read(path: Path, _changed: int) -> tuple[bytes, bytes | None, str]:
+    (
+        """Return a file's bytes, its gzip form if that is smaller, and its weak ETag. The time of its last change is part of the key."""
+        ""
+    )
     plain = path.read_bytes()
     packed = gzip.compress(plain, 9, mtime=0)
     etag = f'W/"{hashlib.sha256(plain).hexdigest()[:32]}"'
