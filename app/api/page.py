@@ -95,7 +95,7 @@ def _file(request: Request, name: str, cache_control: str) -> Response:
 @lru_cache(maxsize=256)
 def _read(path: Path, _changed: int) -> tuple[bytes, bytes | None, str]:
     (
-        """Return a file's bytes, its gzip form if that is smaller, and its weak ETag. The time of its last change is part of the key."""
+        """Return a file's bytes, its gzip form if that is smaller, and its weak ETag; cached until the file changes."""
         ""
     )
     plain = path.read_bytes()

@@ -15,6 +15,8 @@ export interface Paint {
   dotColour?: string;
   /** Sign of points for those who cannot tell colours: drawn at any zoom. */
   sign?: "plus" | "cross" | "triangle" | "square" | "ring";
+  /** Colour of a rim around lines, so that they are seen on pictures. */
+  rim?: string;
   arrows?: boolean;
   labels?: boolean;
   /** Coarsest resolution, in metres per pixel, at which points are drawn. Default: any. */
@@ -116,6 +118,12 @@ export class FeatureLayer extends PaintedLayer {
       if (group.hasAreas && paint.fill) {
         context.fillStyle = paint.fill;
         context.fill(group.areas, "evenodd");
+      }
+      if (paint.rim && group.hasLines) {
+        context.strokeStyle = paint.rim;
+        context.lineWidth = ((paint.width ?? 1) + 2) * pixel;
+        context.stroke(group.lines);
+        context.lineWidth = (paint.width ?? 1) * pixel;
       }
       if (paint.stroke) {
         context.strokeStyle = paint.stroke;

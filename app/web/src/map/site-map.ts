@@ -404,9 +404,10 @@ export class SiteMap {
 
   private networkPaints() {
     const isNear = this.resolution.peek() < 0.06;
+    const rim = this.hasPictureBelow() ? colour("halo") : undefined;
     return {
-      "two-way": { stroke: colour("edge"), width: 1.75 },
-      "one-way": { stroke: colour("edge"), width: 1.75, arrows: true },
+      "two-way": { stroke: colour("edge"), width: 1.75, rim },
+      "one-way": { stroke: colour("edge"), width: 1.75, rim, arrows: true },
       node: { dot: isNear ? 8 : 5, dotColour: colour("node"), dotsBelow: this.nodeResolution(), labels: isNear },
     };
   }
