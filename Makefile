@@ -19,7 +19,7 @@ ROBOT := app/__init__.py app/errors.py app/event_types.py app/events/__init__.py
 # Sources of the web page. Installing builds it (app/web/build.py) with Node 20.19 or newer, which pip brings if there is none.
 PAGE := $(shell find app/web -path app/web/node_modules -prune -o -path app/web/dist -prune -o -type f -not -name openapi.json -not -name schema.d.ts -print)
 
-.PHONY: run test lint docs bench chaos fuzz figures install install-dev clean
+.PHONY: run test lint docs bench bench-web chaos fuzz figures install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -45,6 +45,10 @@ docs: install-dev
 
 bench: install-dev
 	@$(BIN)/python -m tests.bench $(ARGS)
+
+# The web page in Chromium against its bounds; ARGS=--large adds a grid of 27 000 × 24 000 cells.
+bench-web: install-dev
+	@$(BIN)/python -m tests.bench.web $(ARGS)
 
 # Kills of the server, the router and the database at random moments: 50 of each; `make test` does 10.
 chaos: install-dev

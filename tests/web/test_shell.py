@@ -35,22 +35,19 @@ def test_site_is_found_and_drawn(open_page: Open) -> None:
     expect(page.get_by_role("heading", name="Orchard")).to_be_visible()
     expect(page.get_by_text("v1", exact=False).first).to_be_visible()
     expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
-    assert distinct_colours(page) > 5
+    wait_until_drawn(page)
 
 
-def distinct_colours(page: Page) -> int:
-    """Count the colours on the painted layers of the map, when all have been drawn."""
-    page.wait_for_function("document.querySelectorAll('.painted-layer canvas').length >= 4")
-    page.wait_for_load_state("networkidle")
-    return int(
-        page.evaluate(
-            """() => { const seen = new Set();
+def wait_until_drawn(page: Page) -> None:
+    """Wait until the layers of the map show many colours: the picture, the grid and the features."""
+    page.wait_for_function(
+        """() => { const seen = new Set();
             for (const canvas of document.querySelectorAll('.painted-layer canvas')) {
               const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
               const words = new Uint32Array(data.buffer);
               for (let i = 0; i < words.length; i += 7) if (words[i]) seen.add(words[i]);
-            } return seen.size; }"""
-        )
+            } return seen.size > 50; }""",
+        polling=500,
     )
 
 
@@ -95,7 +92,7 @@ def test_last_map_stays_readable_offline(open_page: Open) -> None:
     page.evaluate("navigator.serviceWorker.ready.then(() => 1)")
     page.reload()  # now through the service worker, which keeps what it sees
     expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
-    page.wait_for_load_state("networkidle")
+    wait_until_drawn(page)
     page.context.set_offline(True)
     page.reload()
     expect(page.get_by_role("button", name="Hide Network")).to_be_visible()

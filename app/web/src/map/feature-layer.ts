@@ -71,6 +71,10 @@ export class FeatureLayer extends PaintedLayer {
     this.build();
   }
 
+  protected override isEmpty(): boolean {
+    return this.groups.size === 0;
+  }
+
   private build(): void {
     this.groups = new Map();
     const first = this.features[0];

@@ -43,6 +43,11 @@ export abstract class PaintedLayer extends Layer {
   /** Draws all that is to be seen in a view. */
   protected abstract paint(context: CanvasRenderingContext2D, view: PaintedView): void;
 
+  /** Whether there is nothing to draw: then the layer costs nothing. */
+  protected isEmpty(): boolean {
+    return false;
+  }
+
   /** Asks for another painting, because the content has changed. */
   repaint(): void {
     this.stale = true;
@@ -50,6 +55,12 @@ export abstract class PaintedLayer extends Layer {
   }
 
   override render(frame: FrameState): HTMLElement {
+    this.holder.hidden = this.isEmpty();
+    if (this.holder.hidden) {
+      this.canvas.width = this.canvas.height = 0;
+      this.painted = null;
+      return this.holder;
+    }
     const { center, resolution, rotation } = frame.viewState;
     const [width = 0, height = 0] = frame.size;
     const isMoving = Boolean(frame.viewHints[ViewHint.ANIMATING] || frame.viewHints[ViewHint.INTERACTING]);

@@ -1,5 +1,5 @@
 /** The map of a site: OpenLayers' view and gestures, our painted layers. */
-import { effect, signal, untracked } from "@preact/signals";
+import { computed, effect, signal, untracked } from "@preact/signals";
 import {
   DoubleClickZoom,
   DragPan,
@@ -63,6 +63,7 @@ export class SiteMap {
   private readonly rasters = new Map<string, RasterLayer>();
   private readonly stops: (() => void)[] = [];
   private fitted = "";
+  private isFirstPainting = true;
 
   constructor(
     readonly site: Site,
@@ -108,6 +109,7 @@ export class SiteMap {
       effect(() => this.showFeatures()),
       effect(() => this.showRasters()),
       effect(() => this.paintAgain()),
+      effect(() => this.showOpacity()),
       effect(() => this.selection.setFeatures(this.selected.value ? [this.selected.value] : [])),
     );
   }
@@ -310,29 +312,36 @@ export class SiteMap {
   private colourTiles(part: LayerPart, tiles: Tiles): void {
     if (part.layer === "imagery") tiles.recolour(null);
     else if (isMask(part)) tiles.recolour(maskColours(part.name.includes("speed") ? [214, 137, 16] : [196, 43, 68]));
-    else tiles.recolour(coloursOf(palette.value, theme.value, part.layer === "voxels" || this.hasPictureBelow()));
+    else tiles.recolour(coloursOf(palette.value, theme.value, part.layer === "voxels" || this.hasPicture.value));
   }
 
-  private hasPictureBelow(): boolean {
-    return this.site.rasters.value.some((part) => part.layer === "imagery" && !isHidden(rasterKey(part)));
-  }
+  /** Whether a picture lies below the grids and features. */
+  private readonly hasPicture = computed(() =>
+    this.site.rasters.value.some((part) => part.layer === "imagery" && !isHidden(rasterKey(part))),
+  );
 
-  /** Draws anew after a change of theme, palette, opacity or slice. */
+  /** Draws anew after a change of theme, palette or slice, or when a picture comes below. */
   private paintAgain(): void {
     theme.value;
-    const opacity = this.opacity.value;
-    this.slice.value;
     palette.value;
-    this.hasPictureBelow();
+    this.slice.value;
+    this.hasPicture.value;
+    if (this.isFirstPainting) {
+      this.isFirstPainting = false;
+      return;
+    }
     requestAnimationFrame(() => {
       for (const layer of [...Object.values(this.layers), this.selection]) layer.repaint();
-      for (const layer of this.rasters.values()) {
-        const part = layer.get("part") as LayerPart;
-        this.colourTiles(part, layer.tiles);
-        layer.setOpacity(opacity[rasterKey(part)] ?? 1);
-      }
-      for (const [name, layer] of Object.entries(this.layers)) layer.setOpacity(opacity[name] ?? 1);
+      for (const layer of this.rasters.values()) this.colourTiles(layer.get("part") as LayerPart, layer.tiles);
     });
+  }
+
+  private showOpacity(): void {
+    const opacity = this.opacity.value;
+    for (const layer of this.rasters.values()) {
+      layer.setOpacity(opacity[rasterKey(layer.get("part") as LayerPart)] ?? 1);
+    }
+    for (const [name, layer] of Object.entries(this.layers)) layer.setOpacity(opacity[name] ?? 1);
   }
 
   private style(layer: "zones" | "objects" | "topology" | "location"): FeatureStyle {
@@ -404,7 +413,7 @@ export class SiteMap {
 
   private networkPaints() {
     const isNear = this.resolution.peek() < 0.06;
-    const rim = this.hasPictureBelow() ? colour("halo") : undefined;
+    const rim = this.hasPicture.value ? colour("halo") : undefined;
     return {
       "two-way": { stroke: colour("edge"), width: 1.75, rim },
       "one-way": { stroke: colour("edge"), width: 1.75, rim, arrows: true },
