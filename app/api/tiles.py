@@ -133,6 +133,7 @@ async def get_tile(
 
     Tiles of numbered versions never change, and may be cached for good.
     """
+    generation = services.response_cache.generation()
     raster = await run_in_threadpool(_find, services, env, v, kind, name, level)
     address = TileAddress(z, row, col)
     tiles, entry = services.tiles, raster.entry
@@ -153,6 +154,7 @@ async def get_tile(
         png = await services.response_cache.join(key, call)
     elif png is None:
         png = await _draw(services, entry, address)
+    services.response_cache.store_response(request, env, raster.headers, png, generation, "image/png")
     return Response(png, headers=raster.headers, media_type="image/png")
 
 

@@ -99,14 +99,20 @@ class ResponseCache:
         return self._tallies.setdefault(route, [0, 0])
 
     def store_response(
-        self, request: Request, environment: str, headers: Mapping[str, str], body: bytes, generation: int
+        self,
+        request: Request,
+        environment: str,
+        headers: Mapping[str, str],
+        body: bytes,
+        generation: int,
+        media_type: str = "application/json",
     ) -> None:
         """Cache another response (200, with an ``etag``) that a whole fleet requests; valid until the next commit.
 
         generation: value from before the store was read. All callers with access to the environment get the response.
         """
         bare = [(name.encode(), value.encode()) for name, value in headers.items()]
-        full = [*bare, (b"content-length", str(len(body)).encode()), (b"content-type", b"application/json")]
+        full = [*bare, (b"content-length", str(len(body)).encode()), (b"content-type", media_type.encode())]
         full.append((b"x-content-type-options", b"nosniff"))
         response = CachedResponse(
             environment=environment,
