@@ -119,9 +119,7 @@ function ClosureItem({ closure, store, fleetMap }: ItemProps) {
   const isChosen = closure.overlays.some(({ id }) => id === chosen);
   const element = useRef<HTMLLIElement>(null);
   useEffect(() => {
-    if (!isChosen) return;
-    element.current?.scrollIntoView({ block: "nearest" });
-    reveal(closure, fleetMap);
+    if (isChosen) element.current?.scrollIntoView({ block: "nearest" });
   }, [isChosen]);
   return (
     <li ref={element} class={`closure ${state}${isChosen ? " chosen" : ""}`}>
@@ -129,7 +127,10 @@ function ClosureItem({ closure, store, fleetMap }: ItemProps) {
         type="button"
         class="row"
         aria-pressed={isChosen}
-        onClick={() => go({ closure: isChosen ? null : closure.id, robot: null })}
+        onClick={() => {
+          go({ closure: isChosen ? null : closure.id, robot: null });
+          if (!isChosen) reveal(closure, fleetMap);
+        }}
       >
         <span class="grow">
           <b>{closure.title}</b>

@@ -4,6 +4,7 @@ import { go, param } from "../../address";
 import type { FeatureLayer } from "../../map/feature-layer";
 import { type Feature, FeatureIndex, linesOf, type Position } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
+import { can } from "../../session";
 import { colour, theme } from "../../theme";
 import { closuresOf, featuresOf } from "./closures";
 import { type Marker, RobotLayer } from "./robot-layer";
@@ -41,7 +42,15 @@ export class FleetMap {
     this.robots = new RobotLayer({ zIndex: 23 });
     map.map.addLayer(this.robots);
     map.onPick = (feature, point, event) => this.pick(feature, point, event);
-    this.stops = [effect(() => this.showRobots()), effect(() => this.showClosures()), effect(() => this.showRoute())];
+    const viewport = map.map.getViewport();
+    const menu = (event: MouseEvent) => this.closeStreet(event);
+    viewport?.addEventListener("contextmenu", menu);
+    this.stops = [
+      () => viewport?.removeEventListener("contextmenu", menu),
+      effect(() => this.showRobots()),
+      effect(() => this.showClosures()),
+      effect(() => this.showRoute()),
+    ];
   }
 
   close(): void {
@@ -97,6 +106,14 @@ export class FleetMap {
       return true;
     }
     return false;
+  }
+
+  /** A right click or long press on a street starts closing it. */
+  private closeStreet(event: MouseEvent): void {
+    const edge = can("editor") && !this.onTap && this.map.pick(this.map.positionOf(event), 16).find(isEdge);
+    if (!edge) return;
+    event.preventDefault();
+    go({ fleet: "closures", close: "street", edge: edge.id, closure: null, robot: null });
   }
 
   private showRobots(): void {

@@ -60,7 +60,7 @@ export function RobotCard({ store, fleetMap, name }: CardProps) {
         {!robot.online && can("editor") && <Forget store={store} robot={robot} />}
         <Button quiet icon={X} label="Close the robot" onClick={() => go({ robot: null, ...backToNow() })} />
       </header>
-      <Facts robot={robot} />
+      <Facts store={store} robot={robot} />
       <Show of={detail as Loaded<RobotDetail>}>
         {({ history }) => (
           <>
@@ -73,13 +73,13 @@ export function RobotCard({ store, fleetMap, name }: CardProps) {
   );
 }
 
-function Facts({ robot }: { robot: Robot }) {
+function Facts({ store, robot }: { store: FleetStore; robot: Robot }) {
   const { holds, place } = robot;
   return (
     <dl>
       <dt>channel</dt>
       <dd>
-        {robot.channel}: {lagText(robot, now.value)}
+        {robot.channel}: {lagText(robot, store.site.channels.value, now.value)}
       </dd>
       {robot.detail && (
         <>
@@ -123,8 +123,12 @@ function Facts({ robot }: { robot: Robot }) {
 
 /** The time machine: the version, and the closures, that this robot held at a time. */
 function TimeMachine({ name, history }: { name: string; history: readonly Report[] }) {
-  const [text, setText] = useState(localTime(param("time") ?? new Date().toISOString()));
+  const [text, setText] = useState(localTime(new Date().toISOString()));
   const [missing, setMissing] = useState(false);
+  const time = param("time");
+  useEffect(() => {
+    if (time) setText(localTime(time));
+  }, [time]);
   const submit = (event: Event) => {
     event.preventDefault();
     const at = new Date(text);

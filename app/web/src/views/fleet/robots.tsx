@@ -10,8 +10,8 @@ import { count } from "../../ui/text";
 import type { FleetMap } from "./fleet-map";
 import { RobotCard } from "./robot-card";
 import { backToNow, StandingMark } from "./standing-mark";
-import { lagText, STANDING_NAMES, STANDINGS, type Standing, standingOf, stateText } from "./status";
-import { type FleetStore, now } from "./store";
+import { lagText, lasting, STANDING_NAMES, STANDINGS, type Standing, standingOf, stateText } from "./status";
+import type { FleetStore } from "./store";
 
 const SHOWN = 100;
 
@@ -155,5 +155,13 @@ function RowLag({ store, name }: { store: FleetStore; name: string }) {
   const robot = store.robot(name)?.value;
   if (!robot) return null;
   const standing = standingOf(robot);
-  return <small class={`lag ${standing}`}>{robot.online ? lagText(robot, now.peek()) : "silent"}</small>;
+  const [what, since] = (
+    robot.online ? lagText(robot, store.site.channels.value) : `silent since ${lasting(robot.received)}`
+  ).split(" since ");
+  return (
+    <small class={`lag ${standing}`}>
+      {what}
+      {since && <span>since {since}</span>}
+    </small>
+  );
 }

@@ -22,13 +22,16 @@ export function standingOf(robot: Robot): Standing {
   return robot.lag ? "behind" : "current";
 }
 
-/** Lag in plain words, such as "2 changes behind since 5 min ago". */
-export function lagText(robot: Robot, now = Date.now()): string {
+/** Lag in plain words, such as "2 changes behind since 5 min". */
+export function lagText(robot: Robot, channels: readonly Channel[], now = Date.now()): string {
   const { lag } = robot;
   if (!lag) return "its channel has no version";
   if (!lag.differs) return "up to date";
+  const channel = channels.find((one) => one.channel === robot.channel);
+  if (channel && robot.holds?.root === channel.root && lag.since)
+    return `closures not taken since ${lasting(lag.since, now)}`;
   const behind = lag.events ? `${count(lag.events, "change")} behind` : "not the map of its channel";
-  return lag.since ? `${behind} for ${lasting(lag.since, now)}` : behind;
+  return lag.since ? `${behind} since ${lasting(lag.since, now)}` : behind;
 }
 
 /** A duration as people say it: "5 min". */
