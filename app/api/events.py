@@ -1,7 +1,8 @@
 """Events as resumable server-sent events, and replies to Zenoh queries.
 
 The ids of a stream are the ``sequence`` of one environment, or log positions if the stream has several. Streams at
-the same position share each read of the log. A stream ends soon after its token or session.
+the same position share each read of the log. With ``robots=true`` a stream also has changes of robots, which are not in
+the log and have no id. A stream ends soon after its token or session.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from app.api.http.protocol import ON_STOP
 from app.api.http.responses import api_router
 from app.api.http.schemas import problem_responses
 from app.api.http.single_flight import SingleFlight
+from app.api.robot_feed import RobotFeed, RobotSubscription
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
@@ -69,11 +71,23 @@ class EventFeed:
         self._checks: SingleFlight[tuple[Credentials, int], Principal] = SingleFlight()
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
+        self.robots = RobotFeed(services)
         self.streams = 0
         self.ending = False
 
-    async def wait(self, seconds: float) -> None:
-        """Wait for a commit, but no longer than ``seconds``."""
+    async def wait(self, seconds: float, robots: RobotSubscription | None = None) -> None:
+        """Wait for a commit or a change of ``robots``, but no longer than ``seconds``."""
+        if robots is None:
+            await self._wait_for_commit(seconds)
+            return
+        waits = [asyncio.create_task(self._wait_for_commit(seconds)), asyncio.create_task(robots.wait())]
+        try:
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for waiting in waits:
+                waiting.cancel()
+
+    async def _wait_for_commit(self, seconds: float) -> None:
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._read_counter())
         changed = self._changed
@@ -150,10 +164,22 @@ async def stream_events(
         str | None, Header(alias="Last-Event-ID", description="Id of the last received event: resume after it.")
     ] = None,
     follow: Annotated[bool, Query(description="`false`: end after the stored events.")] = True,
+    robots: Annotated[
+        bool, Query(description="Also stream `robot.status`: the new status of robots. Excludes `follow=false`.")
+    ] = False,
 ) -> Response:
-    """Stream server-sent events: `event` is the type, `data` the JSON, `id` the number from which to resume."""
+    """Stream server-sent events: `event` is the type, `data` the JSON, `id` the number from which to resume.
+
+    With `robots=true`, `robot.status` has the status of a robot as in `GET /robots`, after each change and at most once
+    per second. It has no `id`, because it is not stored: read `GET /robots` after the stream has opened again.
+    """
     if environment is not None:
         principal.require_environment(environment)
+    if robots and not follow:
+        raise Invalid(
+            "robots=true excludes follow=false: changes of robots are not stored, so follow the stream",
+            [Problem("excludes follow=false", where="robots")],
+        )
     start = since
     if last_event_id is not None and last_event_id.strip():
         text = last_event_id.strip()
@@ -175,7 +201,8 @@ async def stream_events(
         return StreamingResponse(_empty_stream(), media_type="text/event-stream", headers=headers)
     state[ON_STOP] = feed.close
     bearer = _StreamAuth(services.access, feed, principal, Credentials.from_scope(request.scope))
-    stream = _stream(feed, bearer, environment, start, follow=follow)
+    subscription = await feed.robots.subscribe(environment) if robots else None
+    stream = _stream(feed, bearer, environment, start, subscription, follow=follow)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
@@ -237,7 +264,13 @@ class _StreamAuth:
 
 
 async def _stream(
-    feed: EventFeed, bearer: _StreamAuth, environment: str | None, start: int, *, follow: bool
+    feed: EventFeed,
+    bearer: _StreamAuth,
+    environment: str | None,
+    start: int,
+    robots: RobotSubscription | None,
+    *,
+    follow: bool,
 ) -> AsyncIterator[bytes]:
     feed.streams += 1
     try:
@@ -263,19 +296,24 @@ async def _stream(
                     event.environment
                 ):  # an event may carry a former name of its environment
                     yield event.line
-            if page:
+            changes = b"" if robots is None else robots.take(bearer.principal)
+            if changes:
+                yield changes
+            if page or changes:
                 quiet = 0.0
                 continue
             if not follow or feed.ending:
                 return
             before = loop.time()
-            await feed.wait(KEEP_ALIVE_SECONDS)
+            await feed.wait(KEEP_ALIVE_SECONDS, robots)
             quiet += loop.time() - before
             if quiet >= KEEP_ALIVE_SECONDS:
                 quiet = 0.0
                 yield b": keep-alive\n\n"
     finally:
         feed.streams -= 1
+        if robots is not None:
+            robots.close()
 
 
 def _line(event: Event, number: int) -> bytes:

@@ -199,7 +199,7 @@ def list_robots(
     robots, following = services.store.robots.page(
         environment, channel=channel, limit=limit, cursor=cursor, allowed=principal.environments
     )
-    return page_response(request, _robots_as_json(services, robots), following)
+    return page_response(request, robots_as_json(services, robots), following)
 
 
 @router.get("/{robot}", responses=problem_responses(RobotDetailOut, 404), summary="Get a robot with its history")
@@ -302,12 +302,12 @@ def store_report(services: Services, environment: str, robot: str, report: Robot
 
 def _only_robot(services: Services, robots: Sequence[Robot]) -> dict[str, Any]:
     """Convert the only robot to JSON. Raises NotFound if the robot or its environment was deleted meanwhile."""
-    for body in _robots_as_json(services, robots):
+    for body in robots_as_json(services, robots):
         return body
     raise NotFound("the robot or its environment was deleted meanwhile")
 
 
-def _robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
+def robots_as_json(services: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
     """Convert robots to JSON, skipping those whose environment was deleted meanwhile."""
     now = datetime.now(UTC)
     channels: dict[str, dict[str, Channel]] = {}

@@ -7,7 +7,7 @@ from datetime import datetime
 from fnmatch import fnmatchcase
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, Select, delete, func, insert, select, tuple_, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, delete, func, insert, select, true, tuple_, update
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.event_types import RobotPlace
@@ -54,14 +54,11 @@ class Robots:
 
     def all(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
         """List robots by environment and name, of environments that are not deleted. Raises NotFound."""
-        table, owner = tables.robot, tables.environment
-        with self._database.read() as connection:
-            query = _robots().where(owner.c.deleted.is_(None)).order_by(owner.c.name, table.c.robot)
-            if environment is not None:
-                query = query.where(table.c.environment_id == environment_row(connection, environment).id)
-            if robot is not None:
-                query = query.where(table.c.robot == robot)
-            return [_as_robot(row) for row in connection.execute(query)]
+        return self._list(environment, true() if robot is None else tables.robot.c.robot == robot)
+
+    def received_since(self, environment: str | None, since: datetime) -> list[Robot]:
+        """List robots whose last report was received after ``since``, by environment and name. Raises NotFound."""
+        return self._list(environment, tables.robot.c.time > since)
 
     def page(
         self,
@@ -135,6 +132,14 @@ class Robots:
                     connection.execute(update(table).where(table.c.robot == name).values(there=is_present, time=now))
                     continue
                 upsert(connection, table, {"robot": name}, {"there": is_present, "time": now})
+
+    def _list(self, environment: str | None, condition: ColumnElement[bool]) -> list[Robot]:
+        table, owner = tables.robot, tables.environment
+        with self._database.read() as connection:
+            query = _robots().where(owner.c.deleted.is_(None), condition).order_by(owner.c.name, table.c.robot)
+            if environment is not None:
+                query = query.where(table.c.environment_id == environment_row(connection, environment).id)
+            return [_as_robot(row) for row in connection.execute(query)]
 
 
 def _note(connection: Connection, environment_id: str, received: ReceivedReport) -> FleetMapError | None:

@@ -81,7 +81,7 @@ export class EventStream {
     for (const type of TYPES) {
       source.addEventListener(type, (message: MessageEvent<string>) => {
         if (message.lastEventId) this.last = message.lastEventId;
-        const event = JSON.parse(message.data) as FleetEvent;
+        const event = { ...JSON.parse(message.data), type } as FleetEvent; // a robot's status has no type
         for (const listener of this.listeners) listener(event);
       });
     }
