@@ -65,8 +65,9 @@ export class FeatureLayer extends PaintedLayer {
 
   /** Leaves features out, because something else draws them (while they are dragged). */
   hide(ids: Iterable<string>): void {
+    const before = this.hidden;
     this.hidden = new Set(ids);
-    this.build();
+    if (before.size || this.hidden.size) this.build();
   }
 
   private build(): void {
