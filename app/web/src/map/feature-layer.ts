@@ -67,8 +67,9 @@ export class FeatureLayer extends PaintedLayer {
 
   /** Leaves features out, because something else draws them (while they are dragged). */
   hide(ids: Iterable<string>): void {
+    const before = this.hidden;
     this.hidden = new Set(ids);
-    this.build();
+    if (before.size || this.hidden.size) this.build();
   }
 
   protected override isEmpty(): boolean {

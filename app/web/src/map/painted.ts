@@ -27,6 +27,8 @@ export interface PaintedView {
 }
 
 export abstract class PaintedLayer extends Layer {
+  /** Whether a change is painted in the next frame: for few features that follow the pointer. */
+  prompt = false;
   private readonly canvas = document.createElement("canvas");
   private readonly holder = document.createElement("div");
   private painted: PaintedView | null = null;
@@ -66,7 +68,8 @@ export abstract class PaintedLayer extends Layer {
     const isMoving = Boolean(frame.viewHints[ViewHint.ANIMATING] || frame.viewHints[ViewHint.INTERACTING]);
     if (this.needsPainting(frame, isMoving)) {
       const since = performance.now() - this.paintedAt;
-      if (since > PAUSE || !this.painted || (!isMoving && !this.stale)) this.paintNow(frame);
+      if (since > PAUSE || (this.prompt && this.stale) || !this.painted || (!isMoving && !this.stale))
+        this.paintNow(frame);
       else if (!this.timer) {
         this.timer = window.setTimeout(() => {
           this.timer = 0;

@@ -53,6 +53,8 @@ export class SiteMap {
   /** Slice of voxels in metres; null: all heights. */
   readonly slice = signal<[number, number] | null>(null);
   readonly rasterProblems = signal<string[]>([]);
+  /** Features shown instead of the version's, such as those of a draft; null: the version's. */
+  readonly shown = signal<readonly Feature[] | null>(null);
   index = new FeatureIndex([]);
   /** Views may take clicks and drags instead of selection. */
   readonly pan = new DragPan();
@@ -121,8 +123,9 @@ export class SiteMap {
   }
 
   /** Adds a layer of features above those of the version. */
-  addLayer(style: FeatureStyle, zIndex: number = Z.overlay): FeatureLayer {
+  addLayer(style: FeatureStyle, zIndex: number = Z.overlay, { prompt = false } = {}): FeatureLayer {
     const layer = new FeatureLayer(style, zIndex);
+    layer.prompt = prompt;
     this.map.addLayer(layer);
     return layer;
   }
@@ -151,6 +154,7 @@ export class SiteMap {
     this.layers.topology.hide(list);
     this.layers.objects.hide(list);
     this.layers.zones.hide(list);
+    this.layers.location.hide(list);
   }
 
   /** Switches the version's features off as a whole, for a view that shows others. */
@@ -243,7 +247,7 @@ export class SiteMap {
   /** Shows the features of the level; the first time, the place in the address or the whole site. */
   private showFeatures(): void {
     const level = this.site.level.value;
-    const features = this.site.features.value.filter((feature) => feature.level === level);
+    const features = (this.shown.value ?? this.site.features.value).filter((feature) => feature.level === level);
     const hidden = (["zones", "objects", "topology", "location"] as const).filter((name) => isHidden(name));
     this.index = new FeatureIndex(features);
     for (const [name, layer] of Object.entries(this.layers)) {
@@ -399,7 +403,7 @@ export class SiteMap {
   private pairsSet = new Set<string>();
 
   private get pairs(): Set<string> {
-    const features = this.site.features.peek();
+    const features = this.shown.peek() ?? this.site.features.peek();
     if (features !== this.pairsOf) {
       this.pairsOf = features;
       this.pairsSet = new Set(

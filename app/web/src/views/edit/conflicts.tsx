@@ -1,0 +1,135 @@
+/** What two people changed alike: mine, theirs or both, one by one on the map. */
+import { useEffect, useState } from "preact/hooks";
+import type { Feature } from "../../map/features";
+import { colour } from "../../theme";
+import { Button } from "../../ui/button";
+import { count } from "../../ui/text";
+import type { Editor, Pending } from "./editor";
+import { type Choice, type Conflict, canKeepBoth } from "./merge";
+import { titleOf } from "./words";
+
+const CHOICES: { choice: Choice; title: string }[] = [
+  { choice: "mine", title: "Keep mine" },
+  { choice: "theirs", title: "Keep theirs" },
+  { choice: "both", title: "Keep both" },
+];
+
+export function Conflicts({ editor, pending }: { editor: Editor; pending: Pending }) {
+  const { conflicts } = pending.merge;
+  const [at, setAt] = useState(0);
+  const conflict = conflicts[Math.min(at, conflicts.length - 1)];
+  const open = conflicts.filter(({ key }) => !pending.choices.has(key)).length;
+  useEffect(() => {
+    if (conflict) return showOnMap(editor, conflict);
+  }, [editor, conflict]);
+  if (!conflict) return null;
+  const decide = (choice: Choice) => {
+    editor.choose(conflict, choice);
+    const next = conflicts.findIndex(({ key }, index) => index > at && !pending.choices.has(key));
+    if (next >= 0) setAt(next);
+  };
+  return (
+    <section class="edit-conflicts" aria-label="Conflicts">
+      <h2>
+        {count(conflicts.length, "conflict")} with v{pending.version} by {pending.author}
+      </h2>
+      <p class="muted">
+        Both of you changed the same. Choose for each; everything else is merged. On the map yours is orange, theirs
+        purple.
+      </p>
+      <ol class="rows">
+        {conflicts.map((one, index) => (
+          <li key={one.key}>
+            <button type="button" class="row" aria-current={one === conflict} onClick={() => setAt(index)}>
+              <span class="grow">{nameOf(one)}</span>
+              <small>{CHOICES.find(({ choice }) => choice === pending.choices.get(one.key))?.title ?? "open"}</small>
+            </button>
+          </li>
+        ))}
+      </ol>
+      <div class="edit-conflict" role="group" aria-label={nameOf(conflict)}>
+        <dl>
+          <dt>Mine</dt>
+          <dd>{said(conflict.before, conflict.mine)}</dd>
+          <dt>Theirs</dt>
+          <dd>{said(conflict.before, conflict.theirs)}</dd>
+        </dl>
+        <div class="actions">
+          {CHOICES.filter(({ choice }) => choice !== "both" || canKeepBoth(conflict)).map(({ choice, title }) => (
+            <Button key={choice} pressed={pending.choices.get(conflict.key) === choice} onClick={() => decide(choice)}>
+              {title}
+            </Button>
+          ))}
+        </div>
+      </div>
+      <div class="actions">
+        <Button
+          main
+          disabled={open > 0}
+          onClick={() => {
+            const { resume } = pending;
+            editor.finishMerge(pending);
+            resume?.();
+          }}
+        >
+          {open > 0 ? `${open} still open` : pending.resume ? "Merge and save" : "Merge"}
+        </Button>
+        <Button
+          onClick={() => {
+            editor.pending.value = null;
+          }}
+        >
+          Later
+        </Button>
+      </div>
+    </section>
+  );
+}
+
+function nameOf({ before, mine, theirs }: Conflict): string {
+  const feature = mine ?? theirs ?? before;
+  return feature ? titleOf(feature) : "";
+}
+
+function said(before: Feature | null, after: Feature | null): string {
+  if (!after) return "deleted";
+  if (!before) return "added";
+  const parts: string[] = [];
+  if (JSON.stringify(before.geometry) !== JSON.stringify(after.geometry)) {
+    const at = after.geometry.type === "Point" ? after.geometry.coordinates : null;
+    parts.push(
+      at
+        ? `moved to ${at
+            .slice(0, 2)
+            .map((value) => value.toFixed(3))
+            .join(", ")}`
+        : "another shape",
+    );
+  }
+  for (const name of new Set([...Object.keys(before.properties), ...Object.keys(after.properties)])) {
+    const [old, now] = [before.properties[name], after.properties[name]].map((value) => JSON.stringify(value));
+    if (old !== now) parts.push(now === undefined ? `without ${name}` : `${name} = ${now.slice(0, 60)}`);
+  }
+  return parts.join(", ") || "unchanged";
+}
+
+/** Draws both forms and moves the map there. */
+function showOnMap(editor: Editor, { mine, theirs, before }: Conflict): () => void {
+  const { map } = editor;
+  const tagged = (feature: Feature | null, side: string): Feature[] =>
+    feature ? [{ ...feature, id: side, properties: { ...feature.properties, name: side, side } }] : [];
+  const layer = map.addLayer(
+    {
+      classOf: (feature) => String(feature.properties.side),
+      paints: () => ({
+        theirs: { stroke: colour("robot"), width: 4, dot: 14, dash: [6, 4], labels: true },
+        mine: { stroke: colour("accent"), width: 3, dot: 9, labels: true },
+      }),
+    },
+    40,
+  );
+  const features = [...tagged(theirs, "theirs"), ...tagged(mine, "mine")];
+  layer.setFeatures(features.length ? features : tagged(before, "mine"));
+  map.fitFeatures([mine, theirs, before].filter((feature) => feature !== null));
+  return () => map.removeLayer(layer);
+}

@@ -1,0 +1,58 @@
+/** The features of the draft as a list: to search, and for those who do not use a pointer. */
+import { useState } from "preact/hooks";
+import { nameOf } from "../../map/features";
+import { keyOf } from "./draft";
+import type { Editor } from "./editor";
+import { titleOf } from "./words";
+
+const SHOWN = 60;
+
+export function DraftList({ editor }: { editor: Editor }) {
+  const [text, setText] = useState("");
+  const [open, setOpen] = useState(false);
+  editor.revision.value;
+  const level = editor.site.level.value;
+  const wanted = text.trim().toLowerCase();
+  const found = open
+    ? editor.draft
+        .features()
+        .filter(
+          (feature) =>
+            feature.level === level &&
+            (!wanted ||
+              `${feature.id} ${nameOf(feature)} ${String(feature.properties.kind)}`.toLowerCase().includes(wanted)),
+        )
+    : [];
+  return (
+    <details class="feature-list" onToggle={(event) => setOpen(event.currentTarget.open)}>
+      <summary>Features</summary>
+      <label class="field">
+        <span class="visually-hidden">Search features</span>
+        <input
+          type="search"
+          placeholder="Search by name, id or kind"
+          value={text}
+          onInput={(event) => setText(event.currentTarget.value)}
+        />
+      </label>
+      <ul class="rows">
+        {found.slice(0, SHOWN).map((feature) => (
+          <li key={keyOf(feature)}>
+            <button
+              type="button"
+              class="row"
+              aria-pressed={editor.selection.value.has(keyOf(feature))}
+              onClick={(event) => {
+                editor.select(editor.wholeOf(feature), { toggle: event.shiftKey || editor.options.peek().several });
+                editor.map.reveal(feature);
+              }}
+            >
+              <span class="grow">{titleOf(feature)}</span>
+            </button>
+          </li>
+        ))}
+      </ul>
+      {found.length > SHOWN && <p class="muted">{found.length - SHOWN} more: search to find them.</p>}
+    </details>
+  );
+}

@@ -1,0 +1,223 @@
+/** The changes in words, a message, and saving. */
+import { Crosshair, Undo2 } from "lucide-preact";
+import { useEffect, useState } from "preact/hooks";
+import { type ApiError, asApiError, online, type Version } from "../../api/client";
+import { type Feature } from "../../map/features";
+import { expired } from "../../session";
+import { Button } from "../../ui/button";
+import { Dialog } from "../../ui/dialog";
+import { Findings, Problem } from "../../ui/states";
+import { count } from "../../ui/text";
+import { notify } from "../../ui/toast";
+import type { Desk } from "./desk";
+import type { Editor } from "./editor";
+import { dryRun, save } from "./save";
+import { type ChangeRow, cellTitle, groupsOf, summary } from "./words";
+
+const SHOWN = 200;
+
+export function Review({ desk }: { desk: Desk }) {
+  const { editor } = desk;
+  const [busy, setBusy] = useState(false);
+  const [problem, setProblem] = useState<ApiError | null>(null);
+  const close = () => {
+    desk.review.value = false;
+  };
+  const isOpen = desk.review.value && editor.pending.value === null;
+  useEffect(() => setProblem(null), [isOpen]);
+  const submit = async () => {
+    setBusy(true);
+    setProblem(null);
+    try {
+      const result = await save(editor, () => void submit());
+      if (result !== "conflict") {
+        close();
+        const { version, warnings } = result.version;
+        notify(`Saved as v${version}${warnings?.length ? `, with ${count(warnings.length, "warning")}` : ""}`);
+      }
+    } catch (error) {
+      setProblem(asApiError(error));
+    }
+    setBusy(false);
+  };
+  const total = editor.count.value;
+  return (
+    <Dialog
+      open={isOpen}
+      title="Review and save"
+      onClose={close}
+      wide
+      actions={
+        <>
+          <DiscardButton editor={editor} close={close} />
+          <span class="spacer" />
+          <Button onClick={close}>Go on editing</Button>
+          <Button
+            main
+            busy={busy}
+            disabled={total === 0 || !online.value || expired.value}
+            onClick={() => void submit()}
+          >
+            Save {count(total, "change")}
+          </Button>
+        </>
+      }
+    >
+      {problem && <Problem error={problem} />}
+      {!online.value && (
+        <p class="note" role="status">
+          Offline: your changes are kept on this device. Save when the server answers again.
+        </p>
+      )}
+      {editor.isBehind && (
+        <p class="note" role="status">
+          v{editor.site.number} was saved in the meantime. Saving merges your changes with it.
+        </p>
+      )}
+      <ChangeList editor={editor} close={close} />
+      <Warnings editor={editor} open={isOpen} />
+      <label class="field">
+        <span>Message</span>
+        <textarea
+          rows={2}
+          maxLength={1000}
+          placeholder={summary(editor.changes.value, editor.cells.value)}
+          value={editor.message.value}
+          onInput={(event) => editor.setMessage(event.currentTarget.value)}
+        />
+        <small>What changed and why, for those who look at the history.</small>
+      </label>
+    </Dialog>
+  );
+}
+
+function DiscardButton({ editor, close }: { editor: Editor; close: () => void }) {
+  const [asked, setAsked] = useState(false);
+  if (editor.count.value === 0) return null;
+  return (
+    <Button
+      danger
+      onClick={() => {
+        if (!asked) return setAsked(true);
+        editor.discard();
+        setAsked(false);
+        close();
+      }}
+    >
+      {asked ? "Discard all for good" : "Discard all"}
+    </Button>
+  );
+}
+
+function ChangeList({ editor, close }: { editor: Editor; close: () => void }) {
+  const groups = groupsOf(editor.changes.value);
+  const cells = editor.cells.value;
+  if (!groups.length && !cells.length) return <p class="muted">Nothing has changed yet.</p>;
+  const show = (features: Feature[], keys: string[]) => {
+    editor.select(keys.filter((key) => editor.draft.get(key)));
+    editor.map.fitFeatures(features);
+    close();
+  };
+  return (
+    <>
+      {groups.map(({ layer, rows }) => (
+        <section key={layer} class="edit-changes" aria-label={`${layer}: changes`}>
+          <h3>
+            {layer} <small>{count(rows.length, "change")}</small>
+          </h3>
+          <ul>
+            {rows.slice(0, SHOWN).map((row) => (
+              <Row key={row.change.key} row={row} editor={editor} show={show} />
+            ))}
+          </ul>
+          {rows.length > SHOWN && <p class="muted">and {rows.length - SHOWN} more</p>}
+        </section>
+      ))}
+      {cells.length > 0 && (
+        <section class="edit-changes" aria-label="Cells: changes">
+          <h3>
+            Cells <small>{count(cells.length, "change")}</small>
+          </h3>
+          <ul>
+            {cells.map((cell) => (
+              <li key={cell.id}>
+                <span class="chip changed">changed</span>
+                <span class="grow">{cellTitle(cell)}</span>
+                <Button
+                  quiet
+                  icon={Undo2}
+                  label={`Take back: ${cellTitle(cell)}`}
+                  onClick={() => editor.dropCells(cell.id)}
+                />
+              </li>
+            ))}
+          </ul>
+        </section>
+      )}
+    </>
+  );
+}
+
+interface RowProps {
+  row: ChangeRow;
+  editor: Editor;
+  show: (features: Feature[], keys: string[]) => void;
+}
+
+function Row({ row, editor, show }: RowProps) {
+  const { before, after } = row.change;
+  const revert = () => editor.revert(editor.changes.peek().filter(({ key }) => row.keys.includes(key)));
+  return (
+    <li>
+      <span class={`chip ${row.kind}`}>{row.kind}</span>
+      <span class="grow">
+        {row.title}
+        {row.detail && <small>{row.detail}</small>}
+      </span>
+      <Button
+        quiet
+        icon={Crosshair}
+        label={`Show ${row.title} on the map`}
+        onClick={() =>
+          show(
+            [after ?? before].filter((one) => one !== null),
+            row.keys,
+          )
+        }
+      />
+      <Button quiet icon={Undo2} label={`Take back: ${row.title}`} onClick={revert} />
+    </li>
+  );
+}
+
+/** What the server would warn of; a server without dry runs says nothing. */
+function Warnings({ editor, open }: { editor: Editor; open: boolean }) {
+  const [answer, setAnswer] = useState<{ warnings: Version["warnings"]; problem: ApiError | null } | null>(null);
+  const revision = editor.revision.value;
+  useEffect(() => {
+    setAnswer(null);
+    if (!open || editor.count.peek() === 0 || !online.peek() || editor.isBehind) return;
+    let isOver = false;
+    dryRun(editor).then(
+      ({ warnings }) => {
+        if (!isOver) setAnswer({ warnings, problem: null });
+      },
+      (error) => {
+        const problem = asApiError(error);
+        if (!isOver && problem.status === 422 && !problem.message.includes("dry_run"))
+          setAnswer({ warnings: [], problem });
+      },
+    );
+    return () => {
+      isOver = true;
+    };
+  }, [open, revision, editor]);
+  if (answer?.problem) return <Problem error={answer.problem} />;
+  if (!answer?.warnings?.length) return null;
+  return (
+    <div class="note" role="status">
+      <b>The server would warn:</b>
+      <Findings items={answer.warnings} />
+    </div>
+  );
+}

@@ -1,0 +1,66 @@
+/** Saving a draft as one version; what others saved in the meantime is merged first. */
+import { apiPath, asApiError, requestJson, type Version } from "../../api/client";
+import { toWire } from "./draft";
+import type { Editor } from "./editor";
+import { summary } from "./words";
+
+export type Saved = { version: Version } | "conflict";
+
+const MAX_ROUNDS = 5;
+
+/** Throws ApiError. `resume` is called when conflicts that hold it up are decided. */
+export async function save(editor: Editor, resume: () => void): Promise<Saved> {
+  for (let round = 0; ; round++) {
+    if (editor.isBehind && !editor.mergeWithHead(resume)) return "conflict";
+    try {
+      const version = await send(editor);
+      editor.saved(version.version ?? 0);
+      void editor.site.refresh();
+      return { version };
+    } catch (error) {
+      if (asApiError(error).status !== 412 || round >= MAX_ROUNDS) throw error;
+      await editor.site.refresh();
+      if (!editor.isBehind) throw editor.site.problem.peek() ?? error;
+    }
+  }
+}
+
+/** What the server would say of the draft, without storing it. */
+export async function dryRun(editor: Editor): Promise<Version> {
+  return requestJson<Version>(apiPath(editor.site.path("edits")), {
+    method: "POST",
+    headers: { "content-type": "application/json" },
+    body: bodyOf(editor, { dry_run: true }),
+  });
+}
+
+async function send(editor: Editor): Promise<Version> {
+  const body = bodyOf(editor);
+  return requestJson<Version>(apiPath(editor.site.path("edits")), {
+    method: "POST",
+    headers: {
+      "content-type": "application/json",
+      "if-match": `"${editor.base.peek()}"`,
+      // The same draft has the same key: a repeated save whose answer was lost is not saved twice.
+      "idempotency-key": `edit-${editor.draftId}-${editor.base.peek()}-${hash(body)}`,
+    },
+    body,
+  });
+}
+
+function bodyOf(editor: Editor, more: Record<string, unknown> = {}): string {
+  const [changes, cells] = [editor.draft.changes(), editor.draft.cells()];
+  const message = editor.message.peek().trim() || `Edited: ${summary(changes, cells)}`;
+  return JSON.stringify({ message, changes: toWire(changes, cells), ...more });
+}
+
+/** FNV-1a, twice with different seeds. */
+function hash(text: string): string {
+  let [one, two] = [0x811c9dc5, 0x01000193];
+  for (let index = 0; index < text.length; index++) {
+    const code = text.charCodeAt(index);
+    one = Math.imul(one ^ code, 0x01000193);
+    two = Math.imul(two ^ code, 0x5bd1e995);
+  }
+  return `${(one >>> 0).toString(16)}${(two >>> 0).toString(16)}${text.length.toString(16)}`;
+}
