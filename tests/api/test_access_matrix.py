@@ -59,7 +59,11 @@ STATUS = {"environment": "{env}", "channel": "latest", "version": 1, "root": "0"
 STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]}
 NAMED = "environment={env}"
 ROWS = [
-    *rows("open", open="GET /, GET /openapi.json, GET /docs, GET /docs/{name}, GET /healthz, GET /readyz"),
+    *rows(
+        "open",
+        open="GET /, GET /icon.svg, GET /service-worker.js, GET /assets/{name}, GET /openapi.json, GET /docs, "
+        "GET /docs/{name}, GET /healthz, GET /readyz",
+    ),
     *rows("server", viewer="GET /metrics", admin=f"GET {API}/tokens, DELETE {API}/tokens/{{id}}, POST {API}/keys"),
     *rows("server", admin=f"GET {API}/audit, GET {API}/stored/{{kind}}/{{sha256}}"),
     Row(f"POST {API}/tokens", "admin", "server", {"name": "x", "role": "viewer", "environments": OTHERS}),
