@@ -4,6 +4,7 @@ import { go, param } from "../../address";
 import type { Feature, LayerName } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
+import { count } from "../../ui/text";
 import { notify } from "../../ui/toast";
 import { type Change, type Command, Draft, EDITED_LAYERS, isEdge, isNode, keyOf } from "./draft";
 import { type Choice, type Conflict, compare, type Merge, merged, withFreshIds } from "./merge";
@@ -11,6 +12,7 @@ import type { Outcome } from "./operations";
 import type { SnapOptions } from "./snap";
 import { DraftStore } from "./storage";
 import { Transaction } from "./transaction";
+import { groupsOf } from "./words";
 
 export type ToolName = "select" | "path" | "split" | "zone" | "object" | "fence" | "cells" | "brush";
 
@@ -86,7 +88,11 @@ export class Editor {
     this.revision.value;
     return [...this.selection.value].map((key) => this.draft.get(key)).filter((feature) => feature !== undefined);
   });
-  readonly count = computed(() => this.changes.value.length + this.cells.value.length);
+  readonly groups = computed(() => groupsOf(this.changes.value));
+  /** Number of changes as people count them: a two-way street is one. */
+  readonly count = computed(
+    () => this.groups.value.reduce((sum, { rows }) => sum + rows.length, 0) + this.cells.value.length,
+  );
 
   private readonly store: DraftStore;
   private readonly stops: (() => void)[] = [];
@@ -256,7 +262,7 @@ export class Editor {
     this.draft = new Draft(this.draft.features());
     this.base.value = version;
     this.message.value = "";
-    this.notes.value = [];
+    this.notes.value = this.notes.peek().filter(({ id }) => id === "merged");
     this.keep(0);
     this.revision.value += 1;
   }
@@ -304,8 +310,7 @@ export class Editor {
     if (head.version === version) {
       this.draft = new Draft(features, log, head.position);
       this.base.value = version;
-      const count = this.draft.changes().length + this.draft.cells().length;
-      if (count) this.note("restored", `Restored ${count} ${count === 1 ? "change" : "changes"}, kept on this device.`);
+      this.noteRestored("");
       return;
     }
     // It builds on an older version: its features before each command are known from the log.
@@ -318,8 +323,14 @@ export class Editor {
     }
     this.draft = new Draft(older.values(), log, head.position);
     this.base.value = head.version;
-    this.note("restored", `Restored ${this.draft.changes().length} changes, made on v${head.version}.`);
+    this.noteRestored(`, made on v${head.version}`);
     this.meet(features, version, this.site.version.peek()?.author ?? "");
+  }
+
+  private noteRestored(more: string): void {
+    const number =
+      groupsOf(this.draft.changes()).reduce((sum, { rows }) => sum + rows.length, 0) + this.draft.cells().length;
+    if (number) this.note("restored", `Restored ${count(number, "change")}, kept on this device${more}.`);
   }
 
   private selectFromAddress(): void {
@@ -399,7 +410,7 @@ export class Editor {
     this.base.value = version;
     this.pending.value = null;
     this.dismiss("moved");
-    this.note("merged", `Merged with v${version}, saved by ${author}. Look once more, then save.`, details);
+    this.note("merged", `Merged with v${version}, saved by ${author}.`, details);
     this.keep(0);
     this.selection.value = new Set([...this.selection.peek()].filter((key) => this.draft.get(key)));
     this.revision.value += 1;

@@ -12,6 +12,7 @@ import { Button } from "../../ui/button";
 import { Bars, Empty } from "../../ui/states";
 import { count } from "../../ui/text";
 import type { ViewProps } from "../registry";
+import { Checks } from "./checks";
 import { Conflicts } from "./conflicts";
 import { Desk } from "./desk";
 import "./edit.css";
@@ -63,6 +64,7 @@ function Panel({ desk }: { desk: Desk }) {
         <>
           <ToolOptions desk={desk} />
           <Selection editor={editor} />
+          <Checks editor={editor} />
           <SnapSettings editor={editor} />
           <DraftList editor={editor} />
         </>

@@ -1,6 +1,5 @@
 /** The features of the draft as a list: to search, and for those who do not use a pointer. */
 import { useState } from "preact/hooks";
-import { nameOf } from "../../map/features";
 import { keyOf } from "./draft";
 import type { Editor } from "./editor";
 import { titleOf } from "./words";
@@ -19,8 +18,7 @@ export function DraftList({ editor }: { editor: Editor }) {
         .filter(
           (feature) =>
             feature.level === level &&
-            (!wanted ||
-              `${feature.id} ${nameOf(feature)} ${String(feature.properties.kind)}`.toLowerCase().includes(wanted)),
+            (!wanted || `${titleOf(feature)} ${String(feature.properties.kind)}`.toLowerCase().includes(wanted)),
         )
     : [];
   return (

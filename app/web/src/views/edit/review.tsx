@@ -12,7 +12,7 @@ import { notify } from "../../ui/toast";
 import type { Desk } from "./desk";
 import type { Editor } from "./editor";
 import { dryRun, save } from "./save";
-import { type ChangeRow, cellTitle, groupsOf, summary } from "./words";
+import { type ChangeRow, cellTitle, summary } from "./words";
 
 const SHOWN = 200;
 
@@ -81,7 +81,7 @@ export function Review({ desk }: { desk: Desk }) {
         <textarea
           rows={2}
           maxLength={1000}
-          placeholder={summary(editor.changes.value, editor.cells.value)}
+          placeholder={summary(editor.groups.value, editor.cells.value)}
           value={editor.message.value}
           onInput={(event) => editor.setMessage(event.currentTarget.value)}
         />
@@ -110,7 +110,7 @@ function DiscardButton({ editor, close }: { editor: Editor; close: () => void })
 }
 
 function ChangeList({ editor, close }: { editor: Editor; close: () => void }) {
-  const groups = groupsOf(editor.changes.value);
+  const groups = editor.groups.value;
   const cells = editor.cells.value;
   if (!groups.length && !cells.length) return <p class="muted">Nothing has changed yet.</p>;
   const show = (features: Feature[], keys: string[]) => {

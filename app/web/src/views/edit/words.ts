@@ -102,9 +102,9 @@ export function cellTitle({ grid, value }: CellEdit): string {
 }
 
 /** A message for those who write none. */
-export function summary(changes: readonly Change[], cells: readonly CellEdit[]): string {
+export function summary(groups: readonly ChangeGroup[], cells: readonly CellEdit[]): string {
   const counts = { added: 0, changed: 0, deleted: 0 };
-  for (const { before, after } of changes) counts[!before ? "added" : !after ? "deleted" : "changed"] += 1;
+  for (const { rows } of groups) for (const { kind } of rows) counts[kind] += 1;
   const parts = Object.entries(counts)
     .filter(([, value]) => value > 0)
     .map(([name, value]) => `${value} ${name}`);

@@ -78,7 +78,7 @@ export class SelectTool extends Tool {
 
   private dragFeatures(drag: Drag & { kind: "move" }, press: Press): void {
     const raw: Position = [drag.anchor[0] + press.at[0] - drag.from[0], drag.anchor[1] + press.at[1] - drag.from[1]];
-    const snapped = this.snap({ ...press, at: raw }, { without: drag.without, from: drag.anchor });
+    const snapped = this.snap({ ...press, at: raw }, { without: drag.without });
     this.onto = snapped;
     this.offset = [snapped.at[0] - drag.anchor[0], snapped.at[1] - drag.anchor[1]];
     const edits = new Transaction(this.editor.draft);
