@@ -56,6 +56,12 @@ export abstract class PaintedLayer extends Layer {
     this.changed();
   }
 
+  /** Shows only a part of the layer: shares of the map's width from its left side. */
+  clip(from: number, to: number): void {
+    const isWhole = from <= 0 && to >= 1;
+    this.holder.style.clipPath = isWhole ? "" : `inset(0 ${(1 - to) * 100}% 0 ${from * 100}%)`;
+  }
+
   override render(frame: FrameState): HTMLElement {
     this.holder.hidden = this.isEmpty();
     if (this.holder.hidden) {
