@@ -44,6 +44,11 @@ export class ApiError extends Error {
     this.name = "ApiError";
   }
 
+  static offline(): ApiError {
+    const detail = "the server does not answer: check the network; nothing is lost";
+    return new ApiError({ type: "urn:fleetmap:problem:offline", title: "Offline", status: 0, detail });
+  }
+
   get status(): number {
     return this.problem.status;
   }
@@ -102,19 +107,15 @@ async function watchedFetch(input: Request): Promise<Response> {
   } catch (error) {
     if (isAbort(error)) throw error;
     online.value = false;
-    throw new ApiError({
-      type: "urn:fleetmap:problem:offline",
-      title: "Offline",
-      status: 0,
-      detail: "the server does not answer: check the network; nothing is lost",
-    });
+    throw ApiError.offline();
   }
   online.value = response.headers.get("fleetmap-offline") === null; // the service worker marks what it kept
   if (response.status === 401) unauthenticated.value += 1;
   return response;
 }
 
-function asProblem(body: unknown, response: Response): Problem {
+export function asProblem(body: unknown, response: { status: number; statusText: string }): Problem {
   if (typeof body === "object" && body !== null && "detail" in body) return body as Problem;
-  return { type: "about:blank", title: response.statusText, status: response.status, detail: response.statusText };
+  const text = response.statusText || `HTTP status ${response.status}`;
+  return { type: "about:blank", title: text, status: response.status, detail: text };
 }

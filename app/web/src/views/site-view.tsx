@@ -1,10 +1,11 @@
 /** One site: the map, and the rail of views beside it. */
 import { ChevronLeft, ExternalLink, KeyRound, LogOut, WifiOff } from "lucide-preact";
 import { Suspense } from "preact/compat";
-import { useEffect, useRef, useState } from "preact/hooks";
+import { useCallback, useEffect, useRef, useState } from "preact/hooks";
 import { go, link, param, visit } from "../address";
 import { online } from "../api/client";
 import { live } from "../api/events";
+import { useFileDrop } from "../dropped";
 import { SiteMap } from "../map/site-map";
 import { can, session, signOut } from "../session";
 import type { Site } from "../site";
@@ -42,6 +43,10 @@ export function SiteView({ site }: { site: Site }) {
     addEventListener("keydown", press);
     return () => removeEventListener("keydown", press);
   }, [views, view]);
+  const isOver = useFileDrop(
+    can("editor"),
+    useCallback(() => go({ view: "upload" }), []),
+  );
   const View = view?.component;
   return (
     <div class={view ? "site" : "site no-panel"}>
@@ -120,6 +125,7 @@ export function SiteView({ site }: { site: Site }) {
         {site.loading.value && <div class="loading-bar" role="progressbar" aria-label="Loading the map" />}
         {map && <MapControls site={site} map={map} />}
       </div>
+      {isOver && <div class="drop-over">Drop the files to upload them to {title}</div>}
       <Access open={access} onClose={() => setAccess(false)} />
     </div>
   );
@@ -136,7 +142,8 @@ export function isTyping(event: Event): boolean {
 function VersionChip({ site }: { site: Site }) {
   const version = site.version.value;
   const head = site.environment.value?.version;
-  if (!version || version.version === null) return null;
+  if (!version) return null;
+  if (version.version === null) return <span class="chip warn">Trial: not saved</span>;
   const channels = site.channelsAt(version.version);
   const isOld = head !== undefined && version.version < head;
   return (

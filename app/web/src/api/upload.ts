@@ -1,0 +1,37 @@
+/** Uploads with progress, which `fetch` does not report. */
+import { ApiError, asProblem, online, unauthenticated } from "./client";
+
+interface SendOptions {
+  headers?: Record<string, string>;
+  signal?: AbortSignal;
+  /** Receives the share of the body that has been sent, 0 to 1. */
+  onProgress?: (share: number) => void;
+}
+
+/** Posts a form and returns the JSON of the response. Throws ApiError, or AbortError after an abort. */
+export function sendForm<T>(path: string, form: FormData, { headers, signal, onProgress }: SendOptions = {}) {
+  return new Promise<T>((resolve, reject) => {
+    const call = new XMLHttpRequest();
+    const abort = () => call.abort();
+    call.open("POST", path);
+    call.responseType = "json";
+    for (const [name, value] of Object.entries(headers ?? {})) call.setRequestHeader(name, value);
+    call.upload.onprogress = ({ loaded, total }) => onProgress?.(total ? loaded / total : 0);
+    call.upload.onload = () => onProgress?.(1);
+    call.onabort = () => reject(new DOMException("cancelled", "AbortError"));
+    call.onerror = () => {
+      online.value = false;
+      reject(ApiError.offline());
+    };
+    call.onload = () => {
+      online.value = true;
+      if (call.status === 401) unauthenticated.value += 1;
+      if (call.status >= 200 && call.status < 300) resolve(call.response as T);
+      else reject(new ApiError(asProblem(call.response, call)));
+    };
+    call.onloadend = () => signal?.removeEventListener("abort", abort);
+    if (signal?.aborted) return reject(new DOMException("cancelled", "AbortError"));
+    signal?.addEventListener("abort", abort);
+    call.send(form);
+  });
+}
