@@ -63,6 +63,15 @@ def parse_networks(text: str) -> list[ipaddress.IPv4Network | ipaddress.IPv6Netw
     return out
 
 
+_ORIGIN = re.compile(r"(https?://(?:[a-z0-9.-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?)/[!-~]*", re.IGNORECASE)
+
+
+def basemap_origin(url: str) -> str | None:
+    """Return the origin of a base map's tiles; None if the URL is no plain one with a host."""
+    match = _ORIGIN.fullmatch(url)
+    return match[1].lower() if match else None
+
+
 class Settings(BaseSettings):
     """Settings of the server. Times are in seconds. Sizes (``…_bytes``) are in bytes, or a number with a unit."""
 
@@ -303,6 +312,15 @@ class Settings(BaseSettings):
     imagery_attribution: str = Field(
         default="", description="Credits of the imagery, separated by `;`; part of maps and reports."
     )
+    basemap_url: str | None = Field(
+        default=None,
+        description="Base map of the web page: a URL of Web Mercator tiles with `{z}`, `{x}` and `{y}`, such as "
+        "`https://tiles.example.org/{z}/{x}/{y}.png`. Browsers load its tiles from that host, and learn the URL with "
+        "all it contains. Unset: no base map, and the page loads nothing from other hosts.",
+    )
+    basemap_attribution: str = Field(
+        default="", description="Credits of the base map, as text; the page shows them on the map."
+    )
     imagery_max_bytes: int = Field(
         default=64 * 2**20, ge=1024, description="Maximum number of bytes to fetch for one image of a site."
     )
@@ -396,6 +414,7 @@ class Settings(BaseSettings):
         "zenoh_config",
         "imagery_url",
         "imagery_token",
+        "basemap_url",
         "models_dir",
         mode="before",
     )
@@ -493,6 +512,16 @@ class Settings(BaseSettings):
             raise ValueError("imagery_url of tiles must contain {z}, {x} and {y} (or {-y}; WMTS: {TileMatrix} …)")
         if self.imagery_kind == "wms" and "LAYERS" not in query:
             raise ValueError("imagery_url of a WMS must contain its layers: https://host/wms?layers=…")
+        return self
+
+    @model_validator(mode="after")
+    def _basemap_url_is_complete(self) -> Self:
+        if self.basemap_url is None:
+            return self
+        if basemap_origin(self.basemap_url) is None:
+            raise ValueError("basemap_url must be a complete URL without a user: https://host/{z}/{x}/{y}.png")
+        if not all(name in self.basemap_url for name in ("{z}", "{x}", "{y}")):
+            raise ValueError("basemap_url must contain {z}, {x} and {y}")
         return self
 
     @property

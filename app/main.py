@@ -285,6 +285,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
             zenoh_advertise=settings.zenoh_advertise,
             ros2=bool(settings.ros2_environments.strip()),
             manifest_seconds=int(settings.manifest_seconds),
+            basemap_url=settings.basemap_url,
+            basemap_attribution=settings.basemap_attribution.strip(),
         ),
         store=store,
         pool=pool,

@@ -6,13 +6,19 @@ import gzip
 import hashlib
 import mimetypes
 import re
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 from fastapi import APIRouter, Request
+from pydantic import BaseModel, Field
 from starlette.responses import Response
 
+from app.api.http.auth import Viewer
 from app.api.http.caching import none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.responses import api_router, json_response
+from app.api.http.schemas import problem_responses
+from app.config import basemap_origin
 from app.errors import NotFound, Unavailable
 
 FOLDER = Path(__file__).resolve().parents[1] / "web" / "dist"
@@ -46,6 +52,30 @@ FOREVER = "public, max-age=31536000, immutable"
 _FILE = re.compile(r"(assets/)?\w[\w.-]*")
 
 root_router = APIRouter()
+router = api_router("session", "/page")
+
+
+class BaseMapOut(BaseModel):
+    """Base map below the sites, from a host that the operator has chosen."""
+
+    url: str = Field(description="URL of Web Mercator tiles with `{z}`, `{x}` and `{y}`.")
+    attribution: str = Field(description="Credits as text.")
+
+
+class PageOut(BaseModel):
+    """Settings of the web page."""
+
+    basemap: BaseMapOut | None = Field(description="Null: none is configured (`FLEETMAP_BASEMAP_URL`).")
+
+
+@router.get("", responses=problem_responses(PageOut), summary="Get the settings of the web page")
+def page_settings(services: ServicesDep, _: Viewer) -> Response:
+    """Return which base map the web page may draw."""
+    options = services.options
+    basemap = None
+    if options.basemap_url is not None:
+        basemap = {"url": options.basemap_url, "attribution": options.basemap_attribution}
+    return json_response({"basemap": basemap})
 
 
 @root_router.get("/", include_in_schema=False)
@@ -82,7 +112,15 @@ def _file(request: Request, name: str, cache_control: str) -> Response:
     if not _FILE.fullmatch(name) or not path.is_file():
         raise NotFound("no such file of the page: open /")
     plain, packed, etag = _read(path, path.stat().st_mtime_ns)
-    headers = {**HEADERS, "cache-control": cache_control, "etag": etag, "vary": "accept-encoding"}
+    services: Services = request.app.state.services
+    policy = policy_for(services.options.basemap_url)
+    headers = {
+        **HEADERS,
+        "content-security-policy": policy,
+        "cache-control": cache_control,
+        "etag": etag,
+        "vary": "accept-encoding",
+    }
     if none_match(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     body = plain
@@ -92,12 +130,16 @@ def _file(request: Request, name: str, cache_control: str) -> Response:
     return Response(body, headers=headers, media_type=mimetypes.guess_type(name)[0] or "application/octet-stream")
 
 
+@cache
+def policy_for(basemap_url: str | None) -> str:
+    """Return the policy, which allows images of the base map's origin if there is one."""
+    origin = basemap_origin(basemap_url) if basemap_url else None
+    return POLICY if origin is None else POLICY.replace("img-src 'self'", f"img-src 'self' {origin}")
+
+
 @lru_cache(maxsize=256)
 def _read(path: Path, _changed: int) -> tuple[bytes, bytes | None, str]:
-    (
-        """Return a file's bytes, its gzip form if that is smaller, and its weak ETag; cached until the file changes."""
-        ""
-    )
+    """Return a file's bytes, its gzip form if that is smaller, and its weak ETag; cached until the file changes."""
     plain = path.read_bytes()
     packed = gzip.compress(plain, 9, mtime=0)
     etag = f'W/"{hashlib.sha256(plain).hexdigest()[:32]}"'

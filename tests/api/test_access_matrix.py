@@ -69,7 +69,7 @@ ROWS = [
     Row(f"POST {API}/tokens", "admin", "server", {"name": "x", "role": "viewer", "environments": OTHERS}),
     *rows("filtered", viewer=f"GET {API}/formats, GET {API}/derivations, GET {API}/generators, GET {API}/templates"),
     *rows("filtered", viewer=f"GET {API}/keys, GET {API}/environments, GET {API}/robots, GET {API}/robots/{{robot}}"),
-    *rows("filtered", viewer=f"GET {API}/jobs, GET {API}/session"),
+    *rows("filtered", viewer=f"GET {API}/jobs, GET {API}/session, GET {API}/page"),
     Row(f"GET {API}/search", "viewer", "filtered", query="q=n"),
     Row(f"DELETE {API}/session", None, "open"),
     Row(f"POST {API}/session", None, "open", {"token": "TOKEN", "code": "CODE"}),

@@ -70,7 +70,7 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
         "/api/v1/audit": "get",
         "/api/v1/jobs": "get", "/api/v1/jobs/{id}": "get delete",
         "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete", "/api/v1/tokens/{id}/sign-in-code": "post",
-        "/api/v1/session": "get post delete", "/api/v1/search": "get",
+        "/api/v1/session": "get post delete", "/api/v1/page": "get", "/api/v1/search": "get",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
         "/api/v1/stored/{kind}/{sha256}": "get",
     }  # fmt: skip
