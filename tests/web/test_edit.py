@@ -217,7 +217,7 @@ def test_moving_by_touch(server: WebServer, edit: Edit) -> None:
     for step in range(1, 6):
         touch("touchMove", (22 + step * 0.4, 12 + step * 0.4))
     touch("touchEnd")
-    editing.changes("2 changes")
+    editing.changes("1 change")
     editing.save("b by touch", 2)
     found = features(server, site)
     assert at(found["b"]) == pytest.approx((24, 14), abs=2 * RESOLUTION)
