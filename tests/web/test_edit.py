@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
-
 from tests.web.conftest import TABLET, Open, WebServer
 
 RESOLUTION = 0.05
@@ -147,7 +146,8 @@ def test_draw_split_undo_reload_and_save(server: WebServer, edit: Edit) -> None:
     nodes = {item: at(one) for item, one in found.items() if one["properties"]["kind"] == "node"}
     middle = next(item for item in nodes if item not in ("a", "b", "n1", "n2"))
     assert set(nodes) == {"a", "b", "n1", "n2", middle}
-    assert nodes["n1"] == pytest.approx((20, 15), abs=RESOLUTION) and nodes["n2"][1] == nodes["n1"][1]
+    assert nodes["n1"] == pytest.approx((20, 15), abs=RESOLUTION)
+    assert nodes["n2"][1] == nodes["n1"][1]
     streets = {("a", "b"), ("b", "n1"), ("n1", middle), (middle, "n2")}
     edges = {(p["source"], p["target"]) for p in (one["properties"] for one in found.values()) if p["kind"] == "edge"}
     assert edges == streets | {(target, source) for source, target in streets}
@@ -217,7 +217,7 @@ def test_moving_by_touch(server: WebServer, edit: Edit) -> None:
     for step in range(1, 6):
         touch("touchMove", (22 + step * 0.4, 12 + step * 0.4))
     touch("touchEnd")
-    editing.changes("2 changes")
+    editing.changes("1 change")
     editing.save("b by touch", 2)
     found = features(server, site)
     assert at(found["b"]) == pytest.approx((24, 14), abs=2 * RESOLUTION)
@@ -272,7 +272,8 @@ def test_an_ended_session_keeps_the_draft(server: WebServer, edit: Edit) -> None
     page.get_by_role("button", name=re.compile("^Save ")).click()
     expect(page.get_by_text("Saved as v2")).to_be_visible()
     edges = [one["properties"] for one in features(server, site).values() if one["properties"]["kind"] == "edge"]
-    assert len(edges) == 1 and edges[0]["speed_limit"] == 0.8
+    assert len(edges) == 1
+    assert edges[0]["speed_limit"] == 0.8
 
 
 def test_cells_and_merging_by_dropping(server: WebServer, edit: Edit) -> None:

@@ -1,6 +1,6 @@
 /** Features drawn by class: all lines of a class are one path, so that ten thousand cost as much as ten. */
 import { apply } from "ol/transform";
-import { type Box, boxOf, centreOf, type Feature, isArea, linesOf, nameOf, pointsOf } from "./features";
+import { type Box, boxOf, centreOf, type Feature, type Geometry, isArea, linesOf, nameOf, pointsOf } from "./features";
 import { PaintedLayer, type PaintedView } from "./painted";
 
 /** How a class of features is drawn. Sizes are in CSS pixels. */
@@ -30,8 +30,7 @@ export interface FeatureStyle {
   paints: () => Record<string, Paint>;
 }
 
-interface Group {
-  features: Feature[];
+interface Paths {
   lines: Path2D;
   areas: Path2D;
   dots: Path2D;
@@ -40,6 +39,16 @@ interface Group {
   hasDots: boolean;
 }
 
+/** Some features of a class: what hides one of them traces only these anew. */
+interface Chunk extends Paths {
+  features: Feature[];
+}
+
+interface Group extends Chunk {
+  chunks: Chunk[];
+}
+
+const CHUNK = 1000;
 const MAX_LABELS = 250;
 const ARROW = 5;
 const MIN_ARROW_EDGE = 22;
@@ -69,7 +78,15 @@ export class FeatureLayer extends PaintedLayer {
   hide(ids: Iterable<string>): void {
     const before = this.hidden;
     this.hidden = new Set(ids);
-    if (before.size || this.hidden.size) this.build();
+    if (!before.size && !this.hidden.size) return;
+    for (const group of this.groups.values()) {
+      const touched = group.chunks.filter(({ features }) =>
+        features.some(({ id }) => before.has(id) !== this.hidden.has(id)),
+      );
+      for (const chunk of touched) this.trace(chunk);
+      if (touched.length) this.compose(group);
+    }
+    this.repaint();
   }
 
   protected override isEmpty(): boolean {
@@ -80,19 +97,37 @@ export class FeatureLayer extends PaintedLayer {
     this.groups = new Map();
     const first = this.features[0];
     this.anchor = first ? centreOf(first.geometry) : [0, 0];
-    const [x0, y0] = this.anchor;
     for (const feature of this.features) {
-      if (this.hidden.has(feature.id)) continue;
       const name = this.style.classOf(feature);
       if (!name) continue;
-      const group = this.groups.get(name) ?? newGroup();
+      const group = this.groups.get(name) ?? { ...newPaths(), features: [], chunks: [] };
       this.groups.set(name, group);
-      group.features.push(feature);
+      let chunk = group.chunks.at(-1);
+      if (!chunk || chunk.features.length >= CHUNK) {
+        chunk = { ...newPaths(), features: [] };
+        group.chunks.push(chunk);
+      }
+      chunk.features.push(feature);
+    }
+    for (const group of this.groups.values()) {
+      for (const chunk of group.chunks) this.trace(chunk);
+      this.compose(group);
+    }
+    this.repaint();
+  }
+
+  /** Puts the features of a chunk into its paths. */
+  private trace(chunk: Chunk): void {
+    const [x0, y0] = this.anchor;
+    Object.assign(chunk, newPaths());
+    for (const feature of chunk.features) {
+      if (this.hidden.has(feature.id)) continue;
       const isFilled = isArea(feature.geometry);
-      for (const line of linesOf(feature.geometry)) {
-        const path = isFilled ? group.areas : group.lines;
-        if (isFilled) group.hasAreas = true;
-        else group.hasLines = true;
+      const lines = isFilled ? wound(feature.geometry) : linesOf(feature.geometry);
+      for (const line of lines) {
+        const path = isFilled ? chunk.areas : chunk.lines;
+        if (isFilled) chunk.hasAreas = true;
+        else chunk.hasLines = true;
         line.forEach(([x = 0, y = 0], index) => {
           if (index) path.lineTo(x - x0, y - y0);
           else path.moveTo(x - x0, y - y0);
@@ -100,12 +135,27 @@ export class FeatureLayer extends PaintedLayer {
         if (isFilled) path.closePath();
       }
       for (const [x = 0, y = 0] of pointsOf(feature.geometry)) {
-        group.hasDots = true;
-        group.dots.moveTo(x - x0, y - y0);
-        group.dots.lineTo(x - x0 + 1e-3, y - y0); // a line of no length would not be drawn
+        chunk.hasDots = true;
+        chunk.dots.moveTo(x - x0, y - y0);
+        chunk.dots.lineTo(x - x0 + 1e-3, y - y0); // a line of no length would not be drawn
       }
     }
-    this.repaint();
+  }
+
+  /** Joins the chunks of a class: it is drawn at once. */
+  private compose(group: Group): void {
+    Object.assign(group, newPaths());
+    group.features = group.chunks.flatMap(({ features }) =>
+      this.hidden.size ? features.filter(({ id }) => !this.hidden.has(id)) : features,
+    );
+    for (const chunk of group.chunks) {
+      if (chunk.hasLines) group.lines.addPath(chunk.lines);
+      if (chunk.hasAreas) group.areas.addPath(chunk.areas);
+      if (chunk.hasDots) group.dots.addPath(chunk.dots);
+      group.hasLines ||= chunk.hasLines;
+      group.hasAreas ||= chunk.hasAreas;
+      group.hasDots ||= chunk.hasDots;
+    }
   }
 
   protected override paint(context: CanvasRenderingContext2D, view: PaintedView): void {
@@ -122,7 +172,7 @@ export class FeatureLayer extends PaintedLayer {
       context.lineWidth = (paint.width ?? 1) * pixel;
       if (group.hasAreas && paint.fill) {
         context.fillStyle = paint.fill;
-        context.fill(group.areas, "evenodd");
+        context.fill(group.areas);
       }
       if (paint.rim && group.hasLines) {
         context.strokeStyle = paint.rim;
@@ -205,9 +255,28 @@ export class FeatureLayer extends PaintedLayer {
   }
 }
 
-function newGroup(): Group {
+/** Returns the rings of an area, holes turned the other way: areas that overlap are filled, holes are not. */
+function wound(geometry: Geometry): number[][][] {
+  if (geometry.type === "MultiPolygon") {
+    return geometry.coordinates.flatMap((coordinates) => wound({ type: "Polygon", coordinates }));
+  }
+  if (geometry.type !== "Polygon") return linesOf(geometry);
+  return geometry.coordinates.map((ring, index) =>
+    isCounterClockwise(ring) === (index === 0) ? ring : ring.toReversed(),
+  );
+}
+
+function isCounterClockwise(ring: number[][]): boolean {
+  let sum = 0;
+  ring.forEach(([x = 0, y = 0], index) => {
+    const [nextX = 0, nextY = 0] = ring[(index + 1) % ring.length] ?? [];
+    sum += (nextX - x) * (nextY + y);
+  });
+  return sum < 0;
+}
+
+function newPaths(): Paths {
   return {
-    features: [],
     lines: new Path2D(),
     areas: new Path2D(),
     dots: new Path2D(),

@@ -28,8 +28,11 @@ const Z = { imagery: 0, voxels: 1, occupancy: 2, masks: 3, zones: 10, objects: 1
 
 /** Layers switched off, in the address, so that a link shows the same map. */
 export function isHidden(key: string): boolean {
-  return (param("hide") ?? "").split(",").includes(key);
+  return hidden.value.split(",").includes(key);
 }
+
+/** A value of its own: the map is not built anew when something else changes in the address. */
+const hidden = computed(() => param("hide") ?? "");
 
 export function toggleHidden(key: string): void {
   const hidden = new Set((param("hide") ?? "").split(",").filter(Boolean));

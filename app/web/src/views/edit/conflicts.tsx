@@ -1,6 +1,6 @@
 /** What two people changed alike: mine, theirs or both, one by one on the map. */
 import { useEffect, useState } from "preact/hooks";
-import type { Feature } from "../../map/features";
+import { boxOf, type Feature, joinBoxes } from "../../map/features";
 import { colour } from "../../theme";
 import { Button } from "../../ui/button";
 import { count } from "../../ui/text";
@@ -130,6 +130,10 @@ function showOnMap(editor: Editor, { mine, theirs, before }: Conflict): () => vo
   );
   const features = [...tagged(theirs, "theirs"), ...tagged(mine, "mine")];
   layer.setFeatures(features.length ? features : tagged(before, "mine"));
-  map.fitFeatures([mine, theirs, before].filter((feature) => feature !== null));
+  const box = joinBoxes([mine, theirs, before].filter((one) => one !== null).map(({ geometry }) => boxOf(geometry)));
+  if (box) {
+    const margin = Math.max(1, box[2] - box[0], box[3] - box[1]) / 3;
+    map.fit([box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin]);
+  }
   return () => map.removeLayer(layer);
 }

@@ -54,7 +54,6 @@ export class Desk {
     const take = () => true;
     const before = map.onPick;
     map.onPick = take;
-    map.selected.value = null;
     this.pointer = new EditPointer(
       this.editor,
       map,
@@ -69,6 +68,9 @@ export class Desk {
         this.tool.value = create(name, context);
       }),
       effect(() => this.drawCross()),
+      effect(() => {
+        if (map.selected.value) map.selected.value = null; // the draft has a selection of its own
+      }),
       listen(window, "keydown", (event) => this.key(event as KeyboardEvent)),
       listen(map.map.getViewport(), "pointermove", () => {
         this.cross.value = false;

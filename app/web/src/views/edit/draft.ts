@@ -32,6 +32,16 @@ export interface Change {
   after: Feature | null;
 }
 
+/** What a person decides of a feature: a lane's ends follow from its nodes. */
+export function core(feature: Feature | null): unknown {
+  if (!feature) return null;
+  const { id, layer, level, part, geometry, properties } = feature;
+  if (isEdge(feature) && geometry.type === "LineString") {
+    return { id, layer, level, part, properties, inner: geometry.coordinates.slice(1, -1) };
+  }
+  return { id, layer, level, part, properties, geometry };
+}
+
 /** A change as `POST …/edits` takes it. */
 export type WireChange = Record<string, unknown>;
 
@@ -78,15 +88,16 @@ export class Draft {
   private readonly current = new Map<string, Feature>();
   private readonly edges = new Map<string, Set<string>>();
   private readonly nodes = new Map<string, Set<string>>();
-  /** All ids that are or were in use: a deleted one is not given to something else. */
-  private readonly ids = new Set<string>();
+  /** Ids of the version: a deleted one is not given to something else. */
+  private readonly baseIds = new Set<string>();
+  /** How many features have an id now. */
+  private readonly ids = new Map<string, number>();
   private list: Feature[] | null = null;
 
   constructor(features: Iterable<Feature>, commands: Command[] = [], position = commands.length) {
     this.addBase(features);
     this.log = commands;
     for (const command of commands.slice(0, position)) this.apply(command.edits, "to");
-    for (const command of commands) for (const { from, to } of command.edits) this.ids.add((to ?? from)?.id ?? "");
     this.position = position;
   }
 
@@ -97,6 +108,7 @@ export class Draft {
       const key = keyOf(feature);
       if (this.base.has(key)) continue;
       this.base.set(key, feature);
+      this.baseIds.add(feature.id);
       this.set(key, feature);
     }
   }
@@ -115,13 +127,13 @@ export class Draft {
   }
 
   isIdUsed(id: string): boolean {
-    return this.ids.has(id);
+    return this.baseIds.has(id) || this.ids.has(id);
   }
 
   /** Returns an id that is not in use: `n1`, `n2`, … */
   freshId(prefix: string, taken: ReadonlySet<string> = new Set()): string {
     let number = 1;
-    while (this.ids.has(`${prefix}${number}`) || taken.has(`${prefix}${number}`)) number += 1;
+    while (this.isIdUsed(`${prefix}${number}`) || taken.has(`${prefix}${number}`)) number += 1;
     return `${prefix}${number}`;
   }
 
@@ -229,7 +241,7 @@ export class Draft {
     if (old) this.unlink(key, old);
     if (feature) {
       this.current.set(key, feature);
-      this.ids.add(feature.id);
+      this.ids.set(feature.id, (this.ids.get(feature.id) ?? 0) + 1);
       if (isEdge(feature)) for (const end of endsOf(feature)) add(this.edges, end, key);
       else if (isNode(feature)) add(this.nodes, feature.id, key);
     } else this.current.delete(key);
@@ -237,6 +249,9 @@ export class Draft {
   }
 
   private unlink(key: string, feature: Feature): void {
+    const count = this.ids.get(feature.id) ?? 0;
+    if (count > 1) this.ids.set(feature.id, count - 1);
+    else this.ids.delete(feature.id);
     if (isEdge(feature)) for (const end of endsOf(feature)) this.edges.get(end)?.delete(key);
     else this.nodes.get(feature.id)?.delete(key);
   }

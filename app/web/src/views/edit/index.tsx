@@ -69,7 +69,7 @@ function Panel({ desk }: { desk: Desk }) {
           <DraftList editor={editor} />
         </>
       )}
-      {area && createPortal(<Toolbar desk={desk} />, area)}
+      {area && !pending && createPortal(<Toolbar desk={desk} />, area)}
       <Review desk={desk} />
       <Keys desk={desk} />
     </div>

@@ -1,6 +1,6 @@
 /** Three-way merge of a draft with a version that was saved in the meantime, feature by feature. */
 import type { Feature } from "../../map/features";
-import { type Change, type Command, Draft, isEdge, isNode, keyOf, same } from "./draft";
+import { type Change, type Command, core, Draft, isEdge, isNode, keyOf, same } from "./draft";
 import { Transaction } from "./transaction";
 
 /** A feature that both have changed. */
@@ -84,16 +84,6 @@ function moved(after: Feature, before: Feature | null): Change {
   return { key: keyOf(after), before, after };
 }
 
-/** What a person has decided of a feature: a lane's ends follow from its nodes. */
-function core(feature: Feature | null): unknown {
-  if (!feature) return null;
-  const { id, layer, level, part, geometry, properties } = feature;
-  if (isEdge(feature) && geometry.type === "LineString") {
-    return { id, layer, level, part, properties, inner: geometry.coordinates.slice(1, -1) };
-  }
-  return { id, layer, level, part, properties, geometry };
-}
-
 /** Whether mine can be kept beside theirs, under a new id. */
 export function canKeepBoth({ mine, theirs }: Conflict): boolean {
   return mine !== null && theirs !== null && mine.layer !== "location";
@@ -143,7 +133,7 @@ function stage(edits: Transaction, key: string, feature: Feature | null): void {
 
 function copyOf(edits: Transaction, feature: Feature): Feature {
   const id = isEdge(feature)
-    ? edits.edgeId(String(feature.properties.source), String(feature.properties.target))
+    ? edits.edgeId(String(feature.properties.source), String(feature.properties.target), feature)
     : edits.freshId(`${feature.id}-`);
   return { ...feature, id };
 }

@@ -90,7 +90,7 @@ function ZoneOptions({ editor }: { editor: Editor }) {
       <label class="field">
         <span>Kind of zone</span>
         <select value={options.zoneKind} onChange={(event) => editor.set({ zoneKind: event.currentTarget.value })}>
-          <option value="keepout">Keepout: robots stay out</option>
+          <option value="keepout">Keepout</option>
           <option value="speed">Speed limit</option>
           <option value="preferred">Preferred</option>
         </select>

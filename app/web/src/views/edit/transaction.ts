@@ -35,12 +35,15 @@ export class Transaction {
     return id;
   }
 
-  /** Returns the id of a new edge: `a_b`, or `a_b#2` where that is taken. */
-  edgeId(source: string, target: string): string {
+  /** Returns the id of a new edge: `a_b`, or `a_b#2` where that is taken. A deleted edge that was the same returns. */
+  edgeId(source: string, target: string, where: { level: string; part: string }): string {
     const id = `${source}_${target}`;
     for (let number = 1; ; number++) {
       const free = number === 1 ? id : `${id}#${number}`;
-      if (this.draft.isIdUsed(free) || this.newIds.has(free)) continue;
+      const key = keyOf({ ...where, layer: "topology", id: free });
+      const before = this.draft.before(key)?.properties;
+      const returns = before?.source === source && before.target === target && !this.get(key);
+      if ((this.draft.isIdUsed(free) && !returns) || this.newIds.has(free)) continue;
       this.newIds.add(free);
       return free;
     }
@@ -60,7 +63,7 @@ export class Transaction {
   addEdge(source: Feature, target: Feature, properties: Record<string, unknown> = {}, inner: number[][] = []): Feature {
     const coordinates = [placeOf(source), ...inner, placeOf(target)];
     return this.put({
-      id: this.edgeId(source.id, target.id),
+      id: this.edgeId(source.id, target.id, source),
       layer: "topology",
       level: source.level,
       part: source.part,

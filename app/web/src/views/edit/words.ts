@@ -1,6 +1,6 @@
 /** Changes in words, for the review. */
 import { type Feature, nameOf, type Position } from "../../map/features";
-import { type CellEdit, type Change, isEdge, isNode, same } from "./draft";
+import { type CellEdit, type Change, core, isEdge, isNode, same } from "./draft";
 import { distance } from "./geometry";
 import { placeOf } from "./transaction";
 
@@ -30,6 +30,7 @@ export function groupsOf(changes: readonly Change[]): ChangeGroup[] {
   const streets = new Map<string, ChangeRow>();
   for (const change of changes) {
     const feature = (change.after ?? change.before) as Feature;
+    if (change.before && change.after && same(core(change.before), core(change.after))) continue; // follows its nodes
     const row = rowOf(change, feature);
     const rows = groups.get(feature.layer) ?? [];
     groups.set(feature.layer, rows);
