@@ -61,6 +61,13 @@ function ChannelCard({ store, channel, found }: { store: FleetStore; channel: Ch
       {planned && (
         <p class="note" role="status">
           {planned}
+          {channel.planned && found.total > 0 && (
+            <progress
+              max={found.total}
+              value={found.ready}
+              aria-label={`Robots of ${name} that have v${channel.planned.version}`}
+            />
+          )}
           {channel.planned && can("editor") && <Button onClick={() => void cancel()}>Cancel the move</Button>}
         </p>
       )}

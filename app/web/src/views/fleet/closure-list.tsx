@@ -122,7 +122,7 @@ function ClosureItem({ closure, store, fleetMap }: ItemProps) {
     if (isChosen) element.current?.scrollIntoView({ block: "nearest" });
   }, [isChosen]);
   return (
-    <li ref={element} class={`closure ${state}${isChosen ? " chosen" : ""}`}>
+    <li ref={element} id={`closure-${closure.id}`} class={`closure ${state}${isChosen ? " chosen" : ""}`}>
       <button
         type="button"
         class="row"
@@ -209,6 +209,7 @@ function Actions({ closure, store, isChosen }: { closure: Closure; store: FleetS
     const done = await attempt(() => decide(store, closure, decision));
     setBusy(null);
     if (!done) return store.load();
+    keepFocus(closure);
     const version = decision === "keep" ? done.at(-1)?.version : null;
     const more = version ? ` in v${version}: promote it before the closure ends` : "";
     notify(`${DONE[decision]}: ${closure.title}${more}.`, {
@@ -236,6 +237,15 @@ function Actions({ closure, store, isChosen }: { closure: Closure; store: FleetS
         button("keep", "Make permanent", { label: "Creates a version in which it is blocked for good" })}
     </div>
   );
+}
+
+/** The pressed button is gone with its state: the focus stays on the closure, or on the tab if that is folded away. */
+function keepFocus(closure: Closure): void {
+  requestAnimationFrame(() => {
+    if (document.activeElement !== document.body) return;
+    const row = document.querySelector<HTMLElement>(`#closure-${CSS.escape(closure.id)} button`);
+    (row?.checkVisibility() ? row : document.getElementById("fleet-tab-closures"))?.focus();
+  });
 }
 
 function reveal(closure: Closure, fleetMap: FleetMap): void {

@@ -15,6 +15,8 @@ import type { Overlay, Robot } from "./types";
 const ROBOT_PIXELS = 18;
 const TOUCH_PIXELS = 26;
 const MAX_TICKING = 200;
+const MANY = 100;
+const PAUSE = 400;
 
 export class FleetMap {
   /** Features of the version by id: the edges and nodes that closures and robots name. */
@@ -26,6 +28,8 @@ export class FleetMap {
   /** Takes taps and drags while something is drawn. Returns whether it did. */
   onTap: ((feature: Feature | null, point: Position) => void) | null = null;
   private index = new FeatureIndex([]);
+  private painting = 0;
+  private paintedAt = 0;
   private readonly robots: RobotLayer;
   private readonly route: FeatureLayer;
   private readonly closures: FeatureLayer;
@@ -55,6 +59,7 @@ export class FleetMap {
 
   close(): void {
     for (const stop of this.stops) stop();
+    clearTimeout(this.painting);
     this.map.onPick = null;
     for (const layer of [this.route, this.closures, this.drawn]) this.map.removeLayer(layer);
     this.map.map.removeLayer(this.robots);
@@ -135,7 +140,19 @@ export class FleetMap {
         });
       }
     }
-    this.robots.setMarkers(markers);
+    this.paintLater(markers);
+  }
+
+  /** Paints a big fleet a few times a second only: all of it is drawn each time. */
+  private paintLater(markers: readonly Marker[]): void {
+    clearTimeout(this.painting);
+    const pause = markers.length > MANY ? PAUSE - (performance.now() - this.paintedAt) : 0;
+    const paint = () => {
+      this.paintedAt = performance.now();
+      this.robots.setMarkers(markers);
+    };
+    if (pause > 0) this.painting = window.setTimeout(paint, pause);
+    else paint();
   }
 
   private showClosures(): void {

@@ -1,6 +1,6 @@
 /** One robot: what it runs, where it is, what it reported before, and the map as it held it at a time. */
 import { Crosshair, Trash2, X } from "lucide-preact";
-import { useEffect, useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { go, param } from "../../address";
 import { apiPath, request, requestJson } from "../../api/client";
 import { type Loaded, useLoaded } from "../../api/loaded";
@@ -33,7 +33,9 @@ export function RobotCard({ store, fleetMap, name }: CardProps) {
   useEffect(() => {
     if (since && detail.data && since !== detail.data.since) detail.reload();
   }, [since]);
+  const element = useRef<HTMLElement>(null);
   useEffect(() => {
+    element.current?.scrollIntoView({ block: "nearest" });
     if (robot && !param("time")) fleetMap.reveal(robot);
   }, [name, robot === undefined]);
   if (!robot) {
@@ -45,7 +47,7 @@ export function RobotCard({ store, fleetMap, name }: CardProps) {
     );
   }
   return (
-    <article class="feature-card robot-card" aria-label={`Robot ${name}`}>
+    <article ref={element} class="feature-card robot-card" aria-label={`Robot ${name}`}>
       <header>
         <StandingMark standing={standingOf(robot)} />
         <span class="grow">
@@ -58,7 +60,15 @@ export function RobotCard({ store, fleetMap, name }: CardProps) {
           <Button quiet icon={Crosshair} label="Show on the map" onClick={() => fleetMap.reveal(robot)} />
         )}
         {!robot.online && can("editor") && <Forget store={store} robot={robot} />}
-        <Button quiet icon={X} label="Close the robot" onClick={() => go({ robot: null, ...backToNow() })} />
+        <Button
+          quiet
+          icon={X}
+          label="Close the robot"
+          onClick={() => {
+            go({ robot: null, ...backToNow() });
+            document.getElementById(`robot-${name}`)?.focus();
+          }}
+        />
       </header>
       <Facts store={store} robot={robot} />
       <Show of={detail as Loaded<RobotDetail>}>
@@ -182,6 +192,7 @@ function History({ name, history }: { name: string; history: readonly Report[] }
             <span class="grow">
               {report.state} v{report.version}
               {report.detail && <small>{report.detail}</small>}
+              {report.overlays && <small title={report.overlays}>closures {report.overlays.slice(0, 8)}</small>}
             </span>
             {report.state === "active" && (
               <button type="button" class="link" onClick={() => showAt(name, report.received, history)}>

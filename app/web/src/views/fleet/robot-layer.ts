@@ -15,7 +15,7 @@ export interface Marker {
 }
 
 const SIZE = 8;
-const MAX_LABELS = 150;
+const MAX_LABELS = 120;
 const FONT = "600 12px system-ui, sans-serif";
 const COLOURS: Record<Standing, string> = {
   current: "added",
@@ -56,13 +56,19 @@ export class RobotLayer extends PaintedLayer {
     visible.sort(
       (a, b) => Number(a.isSelected) - Number(b.isSelected) || order.indexOf(a.standing) - order.indexOf(b.standing),
     );
+    const scale = visible.length > MAX_LABELS && view.resolution > 0.02 ? 0.6 : 1;
     for (const marker of visible) {
       const [x = 0, y = 0] = apply(view.transform, [...marker.at]);
-      context.setTransform(ratio, 0, 0, ratio, x, y);
+      context.setTransform(ratio * scale, 0, 0, ratio * scale, x, y);
       drawMarker(context, marker, view.rotation, colour(COLOURS[marker.standing]), halo);
     }
     context.setTransform(1, 0, 0, 1, 0, 0);
-    drawNames(context, view, [...visible].reverse(), halo, ink);
+    // Too many names are noise: then only those that an operator looks for are written.
+    const named =
+      visible.length > MAX_LABELS
+        ? visible.filter(({ isSelected, standing }) => isSelected || standing === "failed")
+        : visible;
+    drawNames(context, view, named.reverse(), halo, ink);
   }
 }
 

@@ -127,6 +127,7 @@ const RobotRow = memo(function RobotRow({ store, name, isChosen, hasChannel }: R
       <button
         type="button"
         class="row"
+        id={`robot-${name}`}
         aria-pressed={isChosen}
         onClick={() => go({ robot: isChosen ? null : name, closure: null, ...backToNow() })}
       >
