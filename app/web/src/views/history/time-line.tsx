@@ -86,7 +86,7 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
         type="button"
         class="version-main"
         aria-pressed={isShown}
-        aria-label={`Show version ${number}: ${message || "no message"}`}
+        title="Show on the map"
         onClick={() => go({ version: number })}
       >
         <span class="version-title">
@@ -108,7 +108,10 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
         {!isShown && changes.length > SHOWN_CHANGES && <small>and {changes.length - SHOWN_CHANGES} more</small>}
         <small>
           {author} · <Time at={time} />
-          {marksOf(version, others.find((one) => one.version === parent)).map((mark) => (
+          {marksOf(
+            version,
+            others.find((one) => one.version === parent),
+          ).map((mark) => (
             <span key={mark}>
               {" · "}
               <span class={`information ${mark}`}>{mark}</span>
