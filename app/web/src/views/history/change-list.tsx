@@ -102,11 +102,12 @@ function ChangeGroup({ group, site, chosen, onChoose }: Props & { group: Group }
               type="button"
               class="row"
               aria-pressed={chosen?.key === change.key}
-              aria-label={`${change.name} ${change.change}`}
               onClick={() => onChoose(change)}
             >
               <Sign kind={change.change} />
-              <span class="grow">{change.name}</span>
+              <span class="grow">
+                {change.name} <span class="visually-hidden">{change.change}</span>
+              </span>
               <small>
                 {change.fields.slice(0, 3).map(fieldName).join(", ") ||
                   (change.kind === change.layer ? "" : change.kind)}

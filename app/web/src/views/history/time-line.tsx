@@ -86,7 +86,7 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
         type="button"
         class="version-main"
         aria-pressed={isShown}
-        aria-label={`Show version ${number}: ${message || "no message"}`}
+        title="Show on the map"
         onClick={() => go({ version: number })}
       >
         <span class="version-title">
