@@ -105,7 +105,7 @@ export class DiffLayer {
     this.stops.push(
       effect(() => {
         const features = this.shown.value;
-        this.drawn.setFeatures(features);
+        this.drawn.setFeatures(features.map(inOneDirection));
         this.beforeLayer.setFeatures(
           features.flatMap((feature) =>
             feature.beforeGeometry ? [{ ...feature, geometry: feature.beforeGeometry }] : [],
@@ -209,6 +209,15 @@ export function toDiffFeature(wire: Schemas["FeatureChangeOut"]): DiffFeature | 
   const properties = { ...(after ?? before ?? {}), kind: kind ?? layer };
   const beforeGeometry = (before_geometry ?? null) as Geometry | null;
   return { ...feature, properties, change, before, after, beforeGeometry, fields } as DiffFeature;
+}
+
+/** Turns lines the same way: the dashes of the two edges of a street would fill each other's gaps. */
+function inOneDirection<T extends Feature>(feature: T): T {
+  const { geometry } = feature;
+  if (geometry.type !== "LineString") return feature;
+  const [[ax = 0, ay = 0] = [], [bx = 0, by = 0] = []] = [geometry.coordinates[0], geometry.coordinates.at(-1)];
+  if (ax < bx || (ax === bx && ay <= by)) return feature;
+  return { ...feature, geometry: { type: "LineString", coordinates: [...geometry.coordinates].reverse() } };
 }
 
 /** Returns the grids of a diff. A grid of another level than `ground` is named with it: `L2/map`. */

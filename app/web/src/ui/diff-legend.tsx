@@ -9,7 +9,7 @@ export function DiffLegend({ hasFeatures, grids }: { hasFeatures: boolean; grids
       {hasFeatures &&
         (["added", "changed", "deleted"] as const).map((change) => (
           <li key={change} class={`change ${change}`}>
-            {change}
+            <i class={`key line ${change}`} aria-hidden="true" /> {change}
           </li>
         ))}
       {cells.map(([value, name]) => (

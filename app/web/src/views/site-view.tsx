@@ -5,12 +5,14 @@ import { useCallback, useEffect, useRef, useState } from "preact/hooks";
 import { go, link, param, visit } from "../address";
 import { online } from "../api/client";
 import { live } from "../api/events";
+import { useChecking } from "../checks";
 import { useFileDrop } from "../dropped";
 import { SiteMap } from "../map/site-map";
 import { can, session, signOut } from "../session";
 import type { Site } from "../site";
 import { Button } from "../ui/button";
 import { Bars, Problem } from "../ui/states";
+import { count } from "../ui/text";
 import { Access } from "./access";
 import { MapControls } from "./map-controls";
 import { VIEWS } from "./registry";
@@ -43,6 +45,7 @@ export function SiteView({ site }: { site: Site }) {
     addEventListener("keydown", press);
     return () => removeEventListener("keydown", press);
   }, [views, view]);
+  const errors = useChecking(site).errors();
   const isOver = useFileDrop(
     can("editor"),
     useCallback(() => go({ view: "upload" }), []),
@@ -96,11 +99,16 @@ export function SiteView({ site }: { site: Site }) {
             key={id}
             href={link({ view: id })}
             aria-current={view?.id === id ? "page" : undefined}
-            title={`${name} (${key})`}
+            title={`${name} (${key})${id === "checks" && errors ? `: ${count(errors, "error")}` : ""}`}
             onClick={open(() => go({ view: view?.id === id ? "none" : id }))}
           >
             <Icon size={20} aria-hidden="true" />
             <span>{name}</span>
+            {id === "checks" && errors > 0 && (
+              <b class="badge" aria-hidden="true">
+                {errors > 99 ? "99+" : errors}
+              </b>
+            )}
           </a>
         ))}
       </nav>
