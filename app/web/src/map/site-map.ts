@@ -10,12 +10,14 @@ import {
   PinchRotate,
   PinchZoom,
 } from "ol/interaction";
+import type { Layer } from "ol/layer";
 import OlMap from "ol/Map";
 import View from "ol/View";
 import { go, param } from "../address";
 import type { LayerPart } from "../api/client";
 import type { Site } from "../site";
 import { colour, palette, theme } from "../theme";
+import { baseMap, createBaseLayer, isBaseMapShown, loadBaseMap } from "./base-map";
 import { FeatureLayer, type FeatureStyle } from "./feature-layer";
 import { type Box, boxOf, EMPTY_BOX, type Feature, FeatureIndex, joinBoxes, type Position } from "./features";
 import { LOCAL } from "./frame";
@@ -67,6 +69,7 @@ export class SiteMap {
   private readonly selection: FeatureLayer;
   private readonly rasters = new Map<string, RasterLayer>();
   private readonly stops: (() => void)[] = [];
+  private base: Layer | null = null;
   private fitted = "";
   private isFirstPainting = true;
 
@@ -110,7 +113,9 @@ export class SiteMap {
       Z.overlay + 5,
     );
     this.listen();
+    void loadBaseMap();
     this.stops.push(
+      effect(() => void this.showBase()),
       effect(() => this.showFeatures()),
       effect(() => this.showRasters()),
       effect(() => this.paintAgain()),
@@ -275,6 +280,18 @@ export class SiteMap {
     });
   }
 
+  /** Shows the base map while it is switched on; a site without a datum has no place on it. */
+  private async showBase(): Promise<void> {
+    const [base, frame, isShown] = [baseMap.value, this.site.frame.value, isBaseMapShown()];
+    this.base?.setVisible(isShown);
+    if (this.base || !base || !frame || !isShown) return;
+    const layer = await createBaseLayer(base, frame);
+    if (this.base || !this.map.getTarget()) return;
+    this.base = layer;
+    layer.setVisible(isBaseMapShown());
+    this.map.addLayer(layer);
+  }
+
   private showRasters(): void {
     const wanted = new Map<string, LayerPart>();
     for (const part of this.site.rasters.value) {
@@ -322,9 +339,11 @@ export class SiteMap {
     else tiles.recolour(coloursOf(palette.value, theme.value, part.layer === "voxels" || this.hasPicture.value));
   }
 
-  /** Whether a picture lies below the grids and features. */
-  private readonly hasPicture = computed(() =>
-    this.site.rasters.value.some((part) => part.layer === "imagery" && !isHidden(rasterKey(part))),
+  /** Whether a picture or the base map lies below the grids and features. */
+  private readonly hasPicture = computed(
+    () =>
+      (isBaseMapShown() && this.site.frame.value !== null) ||
+      this.site.rasters.value.some((part) => part.layer === "imagery" && !isHidden(rasterKey(part))),
   );
 
   /** Draws anew after a change of theme, palette or slice, or when a picture comes below. */
@@ -378,17 +397,18 @@ export class SiteMap {
     }
     if (layer === "objects") {
       return {
-        classOf: () => "object",
-        paints: () => ({
-          object: {
+        classOf: ({ properties }) => (properties.name ? "named" : "object"),
+        paints: () => {
+          const object = {
             stroke: colour("object"),
             fill: `color-mix(in srgb, ${colour("object")} 14%, transparent)`,
             width: 1,
             dot: 5,
             dotsBelow: 1,
-            labels: this.resolution.peek() < 0.05,
-          },
-        }),
+          };
+          // Ids say nothing: only names are written, as soon as they have room.
+          return { object, named: { ...object, labels: this.resolution.peek() < 0.12 } };
+        },
       };
     }
     return { classOf: (feature) => this.networkClass(feature), paints: () => this.networkPaints() };

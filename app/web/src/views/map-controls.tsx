@@ -2,7 +2,9 @@
 import { signal } from "@preact/signals";
 import { Compass, Maximize, Minus, Plus, Ruler } from "lucide-preact";
 import { useEffect, useRef } from "preact/hooks";
+import { baseMap, isBaseMapShown } from "../map/base-map";
 import type { Position } from "../map/features";
+import { isHidden, rasterKey } from "../map/site-map";
 import type { SiteMap } from "../map/site-map";
 import type { Site } from "../site";
 import { colour } from "../theme";
@@ -36,6 +38,7 @@ export function MapControls({ site, map }: { site: Site; map: SiteMap }) {
       <footer class="map-foot">
         <ScaleBar map={map} />
         <Pointer site={site} map={map} />
+        <Attribution site={site} />
       </footer>
     </>
   );
@@ -105,6 +108,17 @@ function Pointer({ site, map }: { site: Site; map: SiteMap }) {
       )}
     </span>
   );
+}
+
+/** Credits of what is shown: text, never markup. */
+function Attribution({ site }: { site: Site }) {
+  const shown = site.parts.value.filter(
+    (part) => part.level === site.level.value && !isHidden(part.layer) && !isHidden(rasterKey(part)),
+  );
+  const texts = shown.flatMap(({ attribution }) => attribution);
+  if (isBaseMapShown() && site.frame.value && baseMap.value?.attribution) texts.push(baseMap.value.attribution);
+  if (!texts.length) return null;
+  return <span class="attribution">{[...new Set(texts)].join(" · ")}</span>;
 }
 
 /** Measures along clicked points. */

@@ -1,15 +1,18 @@
 /** What is on the map: layers on and off, opacity, legend, and the selected feature. */
 import { Crosshair, Eye, EyeOff } from "lucide-preact";
 import type { LayerPart } from "../../api/client";
+import { baseMap, isBaseMapShown, showBaseMap } from "../../map/base-map";
 import { cssOf } from "../../map/palette";
 import { isHidden, isMask, rasterKey, toggleHidden } from "../../map/site-map";
-import { type PaletteName, palette, theme } from "../../theme";
+import { palette, theme } from "../../theme";
 import { Button } from "../../ui/button";
 import { Empty } from "../../ui/states";
 import { count } from "../../ui/text";
 import type { ViewProps } from "../registry";
 import { FeatureCard } from "./feature-card";
 import { FeatureList } from "./feature-list";
+import { PaletteChoice } from "./palette-choice";
+import { Slice } from "./slice";
 
 const NAMES: Record<string, string> = {
   topology: "Network",
@@ -49,8 +52,9 @@ export default function LayersView({ site, map }: ViewProps) {
       )}
       <ul class="layer-list">
         {rows.map((row) => (
-          <LayerRow key={row.key} row={row} map={map} />
+          <LayerRow key={row.key} row={row} site={site} map={map} />
         ))}
+        {baseMap.value && <BaseMapRow hasPlace={Boolean(site.environment.value?.datum)} />}
       </ul>
       {partial.length > 0 && (
         <p class="note" role="note">
@@ -91,7 +95,29 @@ function rowsOf(parts: LayerPart[]): Row[] {
   );
 }
 
-function LayerRow({ row, map }: { row: Row; map: ViewProps["map"] }) {
+function BaseMapRow({ hasPlace }: { hasPlace: boolean }) {
+  const isShown = isBaseMapShown() && hasPlace;
+  return (
+    <li class={isShown ? "layer-row" : "layer-row off"}>
+      <Button
+        quiet
+        icon={isShown ? Eye : EyeOff}
+        label={`${isShown ? "Hide" : "Show"} base map`}
+        pressed={isShown}
+        disabled={!hasPlace}
+        onClick={() => showBaseMap(!isShown)}
+      />
+      <span class="grow">
+        Base map
+        <small>
+          {hasPlace ? "loaded from another host while shown" : "needs a datum: the site has no place on earth"}
+        </small>
+      </span>
+    </li>
+  );
+}
+
+function LayerRow({ row, site, map }: { row: Row } & ViewProps) {
   const hidden = isHidden(row.key);
   const opacity = map.opacity.value[row.key] ?? 1;
   return (
@@ -131,46 +157,8 @@ function LayerRow({ row, map }: { row: Row; map: ViewProps["map"] }) {
           if (box) map.fit(box as [number, number, number, number]);
         }}
       />
-      {row.layer === "voxels" && !hidden && <Slice map={map} part={row.part} />}
+      {row.layer === "voxels" && !hidden && <Slice site={site} map={map} part={row.part} />}
     </li>
-  );
-}
-
-/** Heights of the voxels that are shown. */
-function Slice({ map }: { map: ViewProps["map"]; part: LayerPart }) {
-  const [low, high] = map.slice.value ?? [0, 2];
-  const set = (next: [number, number]) => {
-    if (next[0] < next[1]) map.slice.value = next;
-  };
-  return (
-    <fieldset class="slice">
-      <legend>Height, metres</legend>
-      <input
-        type="number"
-        step="0.1"
-        aria-label="From"
-        value={low}
-        onChange={(event) => set([Number(event.currentTarget.value), high])}
-      />
-      <span>to</span>
-      <input
-        type="number"
-        step="0.1"
-        aria-label="To"
-        value={high}
-        onChange={(event) => set([low, Number(event.currentTarget.value)])}
-      />
-      {map.slice.value && (
-        <Button
-          quiet
-          onClick={() => {
-            map.slice.value = null;
-          }}
-        >
-          All
-        </Button>
-      )}
-    </fieldset>
   );
 }
 
@@ -227,21 +215,7 @@ function Legend({ parts }: { parts: LayerPart[] }) {
             </li>
           ))}
       </ul>
-      {hasGrid && (
-        <label class="field inline">
-          <span>Grid colours</span>
-          <select
-            value={palette.value}
-            onChange={(event) => {
-              palette.value = event.currentTarget.value as PaletteName;
-            }}
-          >
-            <option value="plain">Plain</option>
-            <option value="contrast">For all colour vision</option>
-            <option value="costmap">Costmap (RViz)</option>
-          </select>
-        </label>
-      )}
+      {hasGrid && <PaletteChoice />}
     </section>
   );
 }
