@@ -272,22 +272,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
 
     tiles = Tiles(store, service.cache)
     return Services(
-        options=ApiOptions(
-            limits=settings.limits,
-            spool_dir=settings.spool_dir,
-            max_json_bytes=settings.max_json_bytes,
-            body_seconds=settings.body_seconds,
-            body_pace=settings.body_pace,
-            data_dir=settings.data_dir,
-            zenoh_mode=settings.zenoh_mode,
-            zenoh_prefix=settings.zenoh_prefix,
-            zenoh_listen=settings.zenoh_listen if settings.zenoh_mode == "router" else "",
-            zenoh_advertise=settings.zenoh_advertise,
-            ros2=bool(settings.ros2_environments.strip()),
-            manifest_seconds=int(settings.manifest_seconds),
-            basemap_url=settings.basemap_url,
-            basemap_attribution=settings.basemap_attribution.strip(),
-        ),
+        options=_api_options(settings),
         store=store,
         pool=pool,
         spare=spare,
@@ -305,6 +290,25 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         previews=Previews(store, tiles, service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
+    )
+
+
+def _api_options(settings: Settings) -> ApiOptions:
+    return ApiOptions(
+        limits=settings.limits,
+        spool_dir=settings.spool_dir,
+        max_json_bytes=settings.max_json_bytes,
+        body_seconds=settings.body_seconds,
+        body_pace=settings.body_pace,
+        data_dir=settings.data_dir,
+        zenoh_mode=settings.zenoh_mode,
+        zenoh_prefix=settings.zenoh_prefix,
+        zenoh_listen=settings.zenoh_listen if settings.zenoh_mode == "router" else "",
+        zenoh_advertise=settings.zenoh_advertise,
+        ros2=bool(settings.ros2_environments.strip()),
+        manifest_seconds=int(settings.manifest_seconds),
+        basemap_url=settings.basemap_url,
+        basemap_attribution=settings.basemap_attribution.strip(),
     )
 
 

@@ -65,6 +65,7 @@ TAGS = {
     "versions": "Immutable states of an environment: upload, edit, revert, compare.",
     "sources": "Uploaded files, byte for byte.",
     "layers": "Canonical content of a version.",
+    "tiles": "Rasters in pieces, and pictures of sites, for screens.",
     "maps": "Maps in a format, converted on demand.",
     "maps by format": "Short URL of each format, with the parameters of that format.",
     "channels": "Names that point to the version that robots run.",
