@@ -22,6 +22,8 @@ const PARTS: Record<string, string> = { topology: "network", location: "site", z
 
 export interface Options {
   oneWay: boolean;
+  /** New lanes take the action, speed and width that the lanes they continue have in common. */
+  likeBefore: boolean;
   snap: SnapOptions;
   /** Snapping is released while true. */
   free: boolean;
@@ -427,6 +429,7 @@ function addUnseen(theirs: Map<string, Feature>, draft: Draft, layer: LayerName)
 function loadOptions(): Options {
   const usual: Options = {
     oneWay: false,
+    likeBefore: true,
     snap: { nodes: true, edges: true, angles: true, grid: false, step: 0.5 },
     free: false,
     several: false,

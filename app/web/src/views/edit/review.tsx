@@ -80,6 +80,7 @@ export function Review({ desk }: { desk: Desk }) {
         <span>Message</span>
         <textarea
           rows={2}
+          autofocus
           maxLength={1000}
           placeholder={summary(editor.groups.value, editor.cells.value)}
           value={editor.message.value}

@@ -50,7 +50,7 @@ async function send(editor: Editor): Promise<Version> {
 
 function bodyOf(editor: Editor, more: Record<string, unknown> = {}): string {
   const [changes, cells] = [editor.draft.changes(), editor.draft.cells()];
-  const message = editor.message.peek().trim() || `Edited: ${summary(editor.groups.peek(), cells)}`;
+  const message = editor.message.peek().trim() || summary(editor.groups.peek(), cells);
   return JSON.stringify({ message, changes: toWire(changes, cells), ...more });
 }
 

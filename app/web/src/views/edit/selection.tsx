@@ -42,7 +42,7 @@ export function Selection({ editor }: { editor: Editor }) {
 function titleOf(editor: Editor, features: Feature[]): string {
   const [first, second] = features;
   if (!first) return "";
-  if (features.length === 1) return `${kindOf(first)} ${nameOf(first)}`;
+  if (features.length === 1) return first.layer === "location" ? "Fence" : `${kindOf(first)} ${nameOf(first)}`;
   if (features.length === 2 && isEdge(first) && second && editor.draft.twinOf(first) === second)
     return `Two-way street ${String(first.properties.source)} – ${String(first.properties.target)}`;
   const nodes = features.filter(isNode).length;
@@ -58,7 +58,6 @@ export function kindOf(feature: Feature): string {
   if (isEdge(feature)) return "One-way lane";
   const kind = String(feature.properties.kind ?? "");
   if (feature.layer === "zones") return `Zone (${kind})`;
-  if (feature.layer === "location") return "Fence";
   return kind ? kind[0]?.toUpperCase() + kind.slice(1) : "Object";
 }
 

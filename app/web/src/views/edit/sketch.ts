@@ -56,6 +56,7 @@ const SELECTION: FeatureStyle = {
   paints: () => {
     const accent = colour("accent");
     return {
+      outline: { stroke: accent, width: 4 },
       selected: { stroke: accent, width: 4, dot: 13, fill: `color-mix(in srgb, ${accent} 12%, transparent)` },
       line: { stroke: accent, width: 4, arrows: true },
       corner: { dot: 10, dotColour: accent },
@@ -105,9 +106,10 @@ export class Sketch {
     const features = this.editor.selected.value;
     const vertex = this.editor.vertex.value;
     const isDirected = (feature: Feature) => isEdge(feature) && !this.editor.draft.twinOf(feature);
-    const out: Feature[] = features.map((feature) =>
-      isDirected(feature) ? { ...feature, properties: { ...feature.properties, mark: "line" } } : feature,
-    );
+    const out: Feature[] = features.map((feature) => {
+      const look = isDirected(feature) ? "line" : feature.layer === "location" ? "outline" : "selected";
+      return { ...feature, properties: { ...feature.properties, mark: look } };
+    });
     for (const [index, { at, middle }] of handlesOf(features).entries()) {
       out.push({ ...point("corner", at), id: `handle${index}`, properties: { mark: middle ? "middle" : "corner" } });
     }

@@ -22,20 +22,10 @@ export function ToolOptions({ desk }: { desk: Desk }) {
   const { editor } = desk;
   const name = editor.tool.value;
   const tool = desk.tool.value;
-  const options = editor.options.value;
   return (
     <section class="edit-options" aria-label="Options of the tool">
       <p class="muted">{HINTS[name]}</p>
-      {name === "path" && (
-        <label class="check">
-          <input
-            type="checkbox"
-            checked={options.oneWay}
-            onChange={(event) => editor.set({ oneWay: event.currentTarget.checked })}
-          />
-          One-way lanes
-        </label>
-      )}
+      {name === "path" && <PathOptions editor={editor} />}
       {name === "zone" && <ZoneOptions editor={editor} />}
       {name === "object" && <ObjectOptions editor={editor} />}
       {(name === "cells" || name === "brush") && <CellOptions editor={editor} withBrush={name === "brush"} />}
@@ -49,6 +39,30 @@ export function ToolOptions({ desk }: { desk: Desk }) {
         />
       )}
     </section>
+  );
+}
+
+function PathOptions({ editor }: { editor: Editor }) {
+  const { oneWay, likeBefore } = editor.options.value;
+  return (
+    <div>
+      <label class="check">
+        <input
+          type="checkbox"
+          checked={oneWay}
+          onChange={(event) => editor.set({ oneWay: event.currentTarget.checked })}
+        />
+        One-way lanes
+      </label>
+      <label class="check">
+        <input
+          type="checkbox"
+          checked={likeBefore}
+          onChange={(event) => editor.set({ likeBefore: event.currentTarget.checked })}
+        />
+        Action, speed and width as the lanes they continue
+      </label>
+    </div>
   );
 }
 

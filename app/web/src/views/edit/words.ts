@@ -1,5 +1,6 @@
 /** Changes in words, for the review. */
 import { type Feature, nameOf, type Position } from "../../map/features";
+import { count } from "../../ui/text";
 import { type CellEdit, type Change, core, isEdge, isNode, same } from "./draft";
 import { distance } from "./geometry";
 import { placeOf } from "./transaction";
@@ -102,13 +103,26 @@ export function cellTitle({ grid, value }: CellEdit): string {
   return `Cells of “${grid}” ${value === 255 ? "unknown" : value >= 50 ? "occupied" : "free"}`;
 }
 
-/** A message for those who write none. */
+/** A message for those who write none: "Node Gate changed, 3 lanes deleted". */
 export function summary(groups: readonly ChangeGroup[], cells: readonly CellEdit[]): string {
-  const counts = { added: 0, changed: 0, deleted: 0 };
-  for (const { rows } of groups) for (const { kind } of rows) counts[kind] += 1;
-  const parts = Object.entries(counts)
-    .filter(([, value]) => value > 0)
-    .map(([name, value]) => `${value} ${name}`);
-  if (cells.length) parts.push(`cells set in ${cells.length} ${cells.length === 1 ? "place" : "places"}`);
-  return parts.join(", ");
+  const rows = groups.flatMap((group) => group.rows);
+  const parts: string[] = [];
+  const counts = new Map<string, ChangeRow[]>();
+  for (const row of rows) {
+    const key = `${nounOf(row)}/${row.kind}`;
+    counts.set(key, [...(counts.get(key) ?? []), row]);
+  }
+  for (const [key, list] of counts) {
+    const [noun = "", kind = ""] = key.split("/");
+    parts.push(list.length === 1 ? `${list[0]?.title} ${kind}` : `${count(list.length, noun)} ${kind}`);
+  }
+  if (cells.length) parts.push(`cells set in ${count(cells.length, "place")}`);
+  return parts.slice(0, 5).join(", ") + (parts.length > 5 ? " …" : "");
+}
+
+function nounOf({ change, keys }: ChangeRow): string {
+  const feature = change.after ?? change.before;
+  if (isNode(feature)) return "node";
+  if (isEdge(feature)) return keys.length > 1 ? "street" : "lane";
+  return { zones: "zone", location: "fence" }[String(feature?.layer)] ?? "object";
 }

@@ -1,6 +1,6 @@
 /** Draw lanes in a chain: a click in the void makes a node and a lane to it. */
 import type { Feature, Position } from "../../../map/features";
-import { isEdge, isNode, keyOf } from "../draft";
+import { isEdge, isNode, keyOf, same } from "../draft";
 import { splitInto } from "../operations";
 import { mark, marksOf } from "../sketch";
 import type { Snapped } from "../snap";
@@ -61,8 +61,10 @@ export class PathTool extends Tool {
     }
     const from = last && edits.get(keyOf(last));
     if (from) {
-      if (!edits.edgesBetween(from, node).length) edits.addEdge(from, node);
-      if (!editor.options.peek().oneWay && !edits.edgesBetween(node, from).length) edits.addEdge(node, from);
+      const { oneWay, likeBefore } = editor.options.peek();
+      const properties = likeBefore ? sharedProperties(edits, from) : {};
+      if (!edits.edgesBetween(from, node).length) edits.addEdge(from, node, properties);
+      if (!oneWay && !edits.edgesBetween(node, from).length) edits.addEdge(node, from, properties);
     }
     const title = !from ? `Start at ${node.id}` : `Lane ${from.id} to ${node.id}`;
     const isNew = !editor.draft.get(keyOf(node));
@@ -105,4 +107,18 @@ export class PathTool extends Tool {
     this.finish();
     return isUnderWay;
   }
+}
+
+const TAKEN = ["action", "speed_limit", "width", "surface", "access"];
+
+/** Returns what the lanes at a node have in common. */
+function sharedProperties(edits: Transaction, node: Feature): Record<string, unknown> {
+  const [first, ...others] = edits.edgesOf(node);
+  if (!first) return {};
+  const names = TAKEN.filter(
+    (name) =>
+      first.properties[name] !== undefined &&
+      others.every(({ properties }) => same(properties[name], first.properties[name])),
+  );
+  return Object.fromEntries(names.map((name) => [name, first.properties[name]]));
 }

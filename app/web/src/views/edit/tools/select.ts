@@ -1,5 +1,14 @@
 /** Select, move, merge by dropping, drag corners. */
-import { type Box, boxOf, type Feature, isArea, type Position, pointsOf } from "../../../map/features";
+import {
+  type Box,
+  boxOf,
+  distanceTo,
+  type Feature,
+  isArea,
+  linesOf,
+  type Position,
+  pointsOf,
+} from "../../../map/features";
 import { isHidden } from "../../../map/site-map";
 import { type Command, isEdge, isNode, keyOf } from "../draft";
 import { closed, crossesItself, distance, movedTo, outlinesOf } from "../geometry";
@@ -38,7 +47,7 @@ export class SelectTool extends Tool {
     }
     const chosen = editor.selection.peek();
     const grip =
-      press.hits.find((hit) => chosen.has(keyOf(hit))) ??
+      press.hits.find((hit) => chosen.has(keyOf(hit)) && this.isGrip(hit, press)) ??
       (press.touch ? undefined : press.hits.find((hit) => hit.layer === "topology" || !isArea(hit.geometry)));
     if (!grip) return false;
     const keys = chosen.has(keyOf(grip)) ? [...chosen] : editor.wholeOf(grip);
@@ -46,6 +55,19 @@ export class SelectTool extends Tool {
     const anchor = (pointsOf(grip.geometry)[0] as Position | undefined) ?? press.at;
     this.taken = { kind: "move", from: press.at, anchor, keys, without: new Set(keys), node };
     return true;
+  }
+
+  /** Large areas are taken at their outline only: inside, the map is moved. */
+  private isGrip(feature: Feature, press: Press): boolean {
+    if (!isArea(feature.geometry)) return true;
+    const [a, b, c, d] = boxOf(feature.geometry);
+    const [width = 0, height = 0] = this.context.map.map.getSize() ?? [];
+    const pixel = this.context.map.resolution.peek();
+    const isLarge = c - a > (width * pixel) / 2 || d - b > (height * pixel) / 2;
+    if (!isLarge && feature.layer !== "location") return true;
+    return linesOf(feature.geometry).some(
+      (line) => distanceTo({ type: "LineString", coordinates: line }, press.at) <= press.reach,
+    );
   }
 
   override drag(press: Press): void {
