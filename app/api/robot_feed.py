@@ -35,7 +35,7 @@ COMMIT_SECONDS = 1.0
 MAX_LOAD = 0.1
 """Maximum share of time for comparisons of all robots."""
 
-REPORT_OVERLAP = timedelta(seconds=2)
+REPORT_OVERLAP = timedelta(seconds=10)
 """Reports are read again for this long, since another process may store one later than it received it."""
 
 RETRY_SECONDS = 1.0

@@ -228,9 +228,8 @@ def test_five_hundred_robots(server: WebServer, site: str, open_page: Open) -> N
             list(pool.map(put, fleet))
 
     report_all(1)
-    total = next(c for c in server.get(f"environments/{site}/channels") if c["channel"] == "production")["robots"][
-        "total"
-    ]
+    channels = server.get(f"environments/{site}/channels")
+    total = next(c["robots"]["total"] for c in channels if c["channel"] == "production")
     page = open_page(f"/?site={site}&view=fleet")
     expect(bar(page)).to_have_attribute("aria-valuetext", re.compile(f"of {total} hold this map, .*500 behind"))
     rows = page.get_by_role("list", name="Robots").get_by_role("listitem")
