@@ -22,7 +22,7 @@ function colours(theme: "light" | "dark"): Uint32Array {
   const out = new Uint32Array(256);
   for (const word of WORDS) {
     const [red, green, blue] = word[theme];
-    out[word.value] = ((205 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
+    out[word.value] = ((165 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
   }
   return out;
 }

@@ -207,29 +207,33 @@ function Facts({ site, map, facts, channel, from, version }: FactsProps) {
         </p>
       )}
       <p class={facts.errors ? "note" : "muted"}>
-        {facts.errors || facts.warnings ? (
-          <>
-            Checks find{" "}
-            {[facts.errors && count(facts.errors, "error"), facts.warnings && count(facts.warnings, "warning")]
-              .filter(Boolean)
-              .join(" and ")}{" "}
-            in v{version}:{" "}
-            <button
-              type="button"
-              class="link"
-              onClick={() => go({ view: "checks", promote: null, channel: null, version })}
-            >
-              see them
-            </button>
-          </>
-        ) : (
-          <>Checks find no error in v{version}.</>
-        )}
+        <span>
+          {facts.errors || facts.warnings ? (
+            <>
+              Checks find{" "}
+              {[facts.errors && count(facts.errors, "error"), facts.warnings && count(facts.warnings, "warning")]
+                .filter(Boolean)
+                .join(" and ")}{" "}
+              in v{version}:{" "}
+              <button
+                type="button"
+                class="link"
+                onClick={() => go({ view: "checks", promote: null, channel: null, version })}
+              >
+                see them
+              </button>
+            </>
+          ) : (
+            <>Checks find no error in v{version}.</>
+          )}
+        </span>
       </p>
       {from !== null && (
-        <Button quiet onClick={() => go({ promote: null, channel: null, from, to: version })}>
-          Compare v{from} with v{version}
-        </Button>
+        <div class="actions">
+          <Button quiet onClick={() => go({ promote: null, channel: null, from, to: version })}>
+            Compare v{from} with v{version}
+          </Button>
+        </div>
       )}
     </div>
   );
