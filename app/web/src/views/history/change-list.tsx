@@ -162,19 +162,20 @@ function Grids({ map, comparison, cells, onCells }: Props) {
             <input type="checkbox" checked={cells} onChange={(event) => onCells(event.currentTarget.checked)} />
             Draw changed cells
           </label>
-          {cells && <CellLegend />}
+          {cells && <CellLegend grids={grids.map(([, grid]) => grid)} />}
         </>
       )}
     </section>
   );
 }
 
-function CellLegend() {
+function CellLegend({ grids }: { grids: Record<string, unknown>[] }) {
   const shown = theme.value;
+  const words = WORDS.filter((word) => grids.some((grid) => Number(grid[word.count]) > 0));
   return (
     <div class="legend">
       <ul aria-label="Colours of cells">
-        {WORDS.map(({ value, title }) => (
+        {words.map(({ value, title }) => (
           <li key={value}>
             <i
               class="key"
