@@ -207,3 +207,16 @@ def test_viewer_reads_history_only(open_page: Open, server: WebServer) -> None:
     expect(page.get_by_role("button", name="Compare with v2")).to_be_visible()
     for name in ("Promote…", "Restore…", "Roll back to v2"):
         expect(page.get_by_role("button", name=name)).to_have_count(0)
+
+
+def test_map_is_shown_as_a_robot_had_it(open_page: Open, server: WebServer) -> None:
+    root = server.get("environments/orchard/versions/1")["root"]
+    status = {"environment": "orchard", "channel": "production", "version": 1, "root": root, "state": "active"}
+    server.call("PUT", "robots/mule-9/status", json=status)
+    page = open_page("/?site=orchard&view=history")
+    page.get_by_text("The map as a robot had it").click()
+    page.get_by_role("combobox", name="Robot").select_option("mule-9")
+    expect(page.get_by_role("status").filter(has_text="mule-9 had v1")).to_be_visible()
+    expect(page.get_by_role("link", name="v1")).to_be_visible()  # in the top bar: the version on the map
+    page.get_by_label("Time").fill("2020-01-01T12:00:00")
+    expect(page.get_by_text("mule-9 had not reported a map by then.")).to_be_visible()

@@ -1,6 +1,6 @@
 /** One changed feature: both states side by side, and restoring the earlier one. */
 import { RotateCcw, X } from "lucide-preact";
-import { useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { go } from "../../address";
 import { type ApiError, asApiError, requestJson, apiPath, type Version } from "../../api/client";
 import { can } from "../../session";
@@ -22,6 +22,8 @@ interface Props {
 }
 
 export function ChangeCard({ site, comparison, change, onClose }: Props) {
+  const element = useRef<HTMLElement>(null);
+  useEffect(() => element.current?.scrollIntoView({ block: "nearest" }), []);
   const [busy, setBusy] = useState(false);
   const [problem, setProblem] = useState<ApiError | null>(null);
   const together = undoneWith(change, comparison.changes);
@@ -42,7 +44,7 @@ export function ChangeCard({ site, comparison, change, onClose }: Props) {
     }
   };
   return (
-    <article class="feature-card change-card" aria-label={`Change of ${change.name}`}>
+    <article ref={element} class="feature-card change-card" aria-label={`Change of ${change.name}`}>
       <header>
         <Sign kind={change.change} />
         <span class="grow">

@@ -1,5 +1,6 @@
 /** What differs, as a list: grids, features by layer, and other parts; with the legend of the map. */
 import { Crosshair } from "lucide-preact";
+import type { ComponentChildren } from "preact";
 import { useState } from "preact/hooks";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
@@ -29,6 +30,8 @@ interface Props {
   onKinds: (kinds: ReadonlySet<ChangeKind>) => void;
   onCells: (cells: boolean) => void;
   onChoose: (change: Change) => void;
+  /** The chosen change in full, shown below its row. */
+  card: ComponentChildren;
 }
 
 export function ChangeList(props: Props) {
@@ -86,17 +89,19 @@ export function Sign({ kind }: { kind: ChangeKind }) {
   );
 }
 
-function ChangeGroup({ group, site, chosen, onChoose }: Props & { group: Group }) {
+function ChangeGroup({ group, site, chosen, onChoose, card }: Props & { group: Group }) {
   const [limit, setLimit] = useState(SHOWN);
   const hasLevels = site.levels.value.length > 1;
   const rest = group.changes.length - limit;
+  const listed = group.changes.slice(0, limit);
+  if (chosen && !listed.includes(chosen) && group.changes.includes(chosen)) listed.push(chosen);
   return (
     <section class="change-group" aria-label={`Changed: ${group.title}`}>
       <h3>
         {group.title} <small>{group.changes.length}</small>
       </h3>
       <ul class="rows">
-        {group.changes.slice(0, limit).map((change) => (
+        {listed.map((change) => (
           <li key={change.key}>
             <button
               type="button"
@@ -114,6 +119,7 @@ function ChangeGroup({ group, site, chosen, onChoose }: Props & { group: Group }
                 {hasLevels && ` · ${change.level}`}
               </small>
             </button>
+            {chosen === change && card}
           </li>
         ))}
       </ul>
@@ -156,19 +162,20 @@ function Grids({ map, comparison, cells, onCells }: Props) {
             <input type="checkbox" checked={cells} onChange={(event) => onCells(event.currentTarget.checked)} />
             Draw changed cells
           </label>
-          {cells && <CellLegend />}
+          {cells && <CellLegend grids={grids.map(([, grid]) => grid)} />}
         </>
       )}
     </section>
   );
 }
 
-function CellLegend() {
+function CellLegend({ grids }: { grids: Record<string, unknown>[] }) {
   const shown = theme.value;
+  const words = WORDS.filter((word) => grids.some((grid) => Number(grid[word.count]) > 0));
   return (
     <div class="legend">
       <ul aria-label="Colours of cells">
-        {WORDS.map(({ value, title }) => (
+        {words.map(({ value, title }) => (
           <li key={value}>
             <i
               class="key"

@@ -17,7 +17,7 @@ export type Mode = "overlay" | "swipe" | "blink";
 
 const Z = { before: 14, after: 15, chosen: 24, oldRaster: 2, cells: 4 };
 /** Resolution from which on each change has its sign; coarser only if there are few. */
-const SIGN_RESOLUTION = 0.12;
+const SIGN_RESOLUTION = 0.05;
 const FEW = 150;
 
 export class CompareMap {
@@ -70,7 +70,6 @@ export class CompareMap {
     this.count = own.length;
     this.before.setFeatures(before);
     this.after.setFeatures(after);
-    this.index = new FeatureIndex([]);
     this.index = new FeatureIndex([...before, ...after]);
     const drawn = new Set(own.map(({ key }) => key));
     const hidden = comparison.changes.filter(

@@ -93,6 +93,9 @@ function Compared({ site, map, comparison }: ViewProps & { comparison: Compariso
     const box = change && CompareMap.boxOf([change]);
     if (box) map.fit([box[0] - 4, box[1] - 4, box[2] + 4, box[3] + 4]);
   };
+  const card = chosen && (
+    <ChangeCard key={chosen.key} site={site} comparison={comparison} change={chosen} onClose={() => choose(null)} />
+  );
   return (
     <div class="stack">
       <ModeChoice mode={mode} />
@@ -106,9 +109,7 @@ function Compared({ site, map, comparison }: ViewProps & { comparison: Compariso
           right={refName(comparison.to)}
         />
       )}
-      {chosen && (
-        <ChangeCard key={chosen.key} site={site} comparison={comparison} change={chosen} onClose={() => choose(null)} />
-      )}
+      {chosen && !changes.includes(chosen) && card}
       <ChangeList
         site={site}
         map={map}
@@ -121,7 +122,8 @@ function Compared({ site, map, comparison }: ViewProps & { comparison: Compariso
         onText={setText}
         onKinds={setKinds}
         onCells={setCells}
-        onChoose={choose}
+        onChoose={(change) => choose(change === chosen ? null : change)}
+        card={card}
       />
       {comparison.total > comparison.changes.length && (
         <p class="note" role="note">

@@ -55,7 +55,7 @@ export function impactFeatures(impact: Impact, changes: readonly Change[], known
     const state = was && stateOf(was, "before");
     if (state) put(id, id, "deleted", state.level, state.geometry);
   }
-  for (const id of impact.edges.turned) {
+  for (const id of [...impact.edges.turned, ...impact.nodes.moved.map((node) => node.id)]) {
     const now = byId.get(id);
     if (now) put(id, id, "turned", now.level, now.geometry);
   }

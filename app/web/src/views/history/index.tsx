@@ -1,7 +1,8 @@
 /** History: the time line of versions, comparison of any two, promotion and roll back.
  *
  * In the address: `version` the version shown; `from` and `to` the versions compared, `mode` how (overlay, swipe,
- * blink), `change` the chosen change; `promote` the version to promote, `channel` the channel.
+ * blink), `change` the chosen change; `promote` the version to promote, `channel` the channel; `robot`
+ * and `time` for the map as a robot had it.
  */
 import "./history.css";
 import { useEffect } from "preact/hooks";
@@ -12,6 +13,7 @@ import { Channels } from "./channels";
 import { Compare } from "./compare";
 import { useVersions } from "./loads";
 import { Promote } from "./promote";
+import { RobotTime } from "./robot-time";
 import { TimeLine } from "./time-line";
 
 export default function HistoryView({ site, map }: ViewProps) {
@@ -29,6 +31,7 @@ export default function HistoryView({ site, map }: ViewProps) {
   return (
     <div class="stack">
       <Channels site={site} />
+      <RobotTime site={site} />
       <TimeLine site={site} versions={versions} />
     </div>
   );

@@ -31,6 +31,8 @@ export function Promote({ site, map, version }: ViewProps & { version: string })
   const [problem, setProblem] = useState<ApiError | null>(null);
   const facts = useLoaded((signal) => loadFacts(site, from, version, signal), [site.name, from, version]);
   useImpactMap({ site, map }, facts.data);
+  // A roll back waits for nothing; nothing waits for an impact that cannot be had.
+  const isUnread = !isBack && facts.data === undefined && facts.problem === null;
   const missing = NAME.test(name) ? whenProblem(when) : "Name the channel: small letters, digits, - and _.";
   const submit = async () => {
     setBusy(true);
@@ -80,7 +82,7 @@ export function Promote({ site, map, version }: ViewProps & { version: string })
           type="submit"
           icon={isBack ? Undo2 : Rocket}
           busy={busy}
-          disabled={Boolean(missing) || (from === number && !channel?.planned) || facts.data === undefined}
+          disabled={Boolean(missing) || (from === number && !channel?.planned) || isUnread}
         >
           {isBack
             ? "Roll back now"
@@ -207,29 +209,33 @@ function Facts({ site, map, facts, channel, from, version }: FactsProps) {
         </p>
       )}
       <p class={facts.errors ? "note" : "muted"}>
-        {facts.errors || facts.warnings ? (
-          <>
-            Checks find{" "}
-            {[facts.errors && count(facts.errors, "error"), facts.warnings && count(facts.warnings, "warning")]
-              .filter(Boolean)
-              .join(" and ")}{" "}
-            in v{version}:{" "}
-            <button
-              type="button"
-              class="link"
-              onClick={() => go({ view: "checks", promote: null, channel: null, version })}
-            >
-              see them
-            </button>
-          </>
-        ) : (
-          <>Checks find no error in v{version}.</>
-        )}
+        <span>
+          {facts.errors || facts.warnings ? (
+            <>
+              Checks find{" "}
+              {[facts.errors && count(facts.errors, "error"), facts.warnings && count(facts.warnings, "warning")]
+                .filter(Boolean)
+                .join(" and ")}{" "}
+              in v{version}:{" "}
+              <button
+                type="button"
+                class="link"
+                onClick={() => go({ view: "checks", promote: null, channel: null, version })}
+              >
+                see them
+              </button>
+            </>
+          ) : (
+            <>Checks find no error in v{version}.</>
+          )}
+        </span>
       </p>
       {from !== null && (
-        <Button quiet onClick={() => go({ promote: null, channel: null, from, to: version })}>
-          Compare v{from} with v{version}
-        </Button>
+        <div class="actions">
+          <Button quiet onClick={() => go({ promote: null, channel: null, from, to: version })}>
+            Compare v{from} with v{version}
+          </Button>
+        </div>
       )}
     </div>
   );

@@ -1,5 +1,5 @@
 /** Time line: the versions, newest first, with what they changed and the channels that point to them. */
-import { GitCompareArrows, History, Rocket, TriangleAlert } from "lucide-preact";
+import { History, Rocket, TriangleAlert } from "lucide-preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { go, param } from "../../address";
 import type { Channel, Version } from "../../api/client";
@@ -78,7 +78,7 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
   const changes = changesInWords(version.changes);
   const row = useRef<HTMLLIElement>(null);
   useEffect(() => {
-    if (isShown && param("version")) row.current?.scrollIntoView({ block: "nearest" });
+    if (isShown && param("version")) row.current?.firstElementChild?.scrollIntoView({ block: "nearest" });
   }, [isShown]);
   return (
     <li ref={row} class={isShown ? "version shown" : "version"}>
@@ -134,17 +134,13 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
               </Button>
             )}
             {parent !== null && (
-              <Button icon={GitCompareArrows} onClick={() => go({ from: parent, to: number })}>
-                Compare with v{parent}
-              </Button>
-            )}
-            {can("editor") && !isHead && (
-              <Button icon={History} onClick={onRestore}>
-                Restore…
-              </Button>
+              <Button onClick={() => go({ from: parent, to: number })}>Compare with v{parent}</Button>
             )}
           </div>
-          <CompareWith number={number} others={others} />
+          <div class="actions">
+            {can("editor") && !isHead && <Button onClick={onRestore}>Restore…</Button>}
+            <CompareWith number={number} others={others} />
+          </div>
           {version.warnings.length > 0 && (
             <details>
               <summary>{count(version.warnings.length, "warning")}</summary>
@@ -171,8 +167,8 @@ function Flag({ name, channel }: { name: string; channel?: Channel }) {
 
 function CompareWith({ number, others }: { number: number; others: Version[] }) {
   return (
-    <label class="field inline">
-      <span>Compare with</span>
+    <label class="compare-with">
+      <span class="visually-hidden">Compare v{number} with another version</span>
       <select
         value=""
         onChange={(event) => {
@@ -181,7 +177,7 @@ function CompareWith({ number, others }: { number: number; others: Version[] }) 
         }}
       >
         <option value="" disabled>
-          another version …
+          Compare with …
         </option>
         {others
           .filter(({ version }) => version !== number)
