@@ -31,6 +31,8 @@ export interface DiffGrid {
   unknown: number;
   other: number;
   bbox: number[] | null;
+  /** Tiles of the cells; null: they cannot be drawn. */
+  set: Raster | null;
 }
 
 interface Options {
@@ -88,7 +90,6 @@ export class DiffLayer {
   private readonly rasters: RasterLayer[] = [];
   private readonly control = new AbortController();
   private readonly stops: (() => void)[] = [];
-  private round = 0;
   /** Resolves when everything has been loaded, or has failed. */
   readonly done: Promise<void>;
 
@@ -112,7 +113,7 @@ export class DiffLayer {
           ),
         );
       }),
-      effect(() => void this.showCells(this.grids.value, this.level.value)),
+      effect(() => this.showCells(this.grids.value, this.level.value)),
       effect(() => {
         theme.value;
         requestAnimationFrame(() => {
@@ -151,7 +152,7 @@ export class DiffLayer {
     const { signal: stop } = this.control;
     try {
       const summary = await requestJson<Schemas["DiffOut"]>(apiPath(path, { from, to }), { signal: stop });
-      this.grids.value = gridsOf(summary.layers);
+      this.grids.value = await Promise.all(gridsOf(summary.layers).map((grid) => this.findGrid(grid)));
       let cursor: string | undefined;
       do {
         const query = { from, to, format: "geojson", crs: "local", limit: PAGE, cursor };
@@ -171,29 +172,39 @@ export class DiffLayer {
     }
   }
 
-  private async showCells(grids: DiffGrid[], level: string): Promise<void> {
-    this.clearCells();
-    const round = ++this.round;
+  /** Finds the level and the tiles of a grid: a name that several levels have is written `L2/map`. */
+  private async findGrid(grid: DiffGrid): Promise<DiffGrid> {
+    const cut = grid.key.indexOf("/");
+    const ways: { name: string; level?: string }[] = [{ name: grid.key }];
+    if (cut > 0) ways.unshift({ name: grid.key.slice(cut + 1), level: grid.key.slice(0, cut) });
+    else ways.push({ name: grid.key, level: this.level.peek() });
     const { from, to } = this.options;
-    const { signal: stop } = this.control;
-    for (const grid of grids.filter((one) => one.level === level)) {
-      const path = this.map.site.path("diff", "tiles", grid.name);
-      try {
-        const query = { from, to, level };
-        const set = await requestJson<Raster>(apiPath(path, query), { signal: stop });
-        if (stop.aborted || round !== this.round) return;
-        const address = (z: number, row: number, column: number) =>
-          apiPath([...path, z, row, `${column}.png`], { from, to, level });
-        const tiles = new Tiles(set, address);
-        tiles.recolour(cellColours());
-        const layer = this.map.addRaster(tiles, Z.cells);
-        layer.setVisible(this.visible.peek());
-        this.rasters.push(layer);
-      } catch (error) {
-        if (stop.aborted || round !== this.round) return;
-        const failed = asApiError(error);
-        if (failed.status !== 404) this.problem.value = failed; // 404: nothing that could be drawn
-      }
+    for (const { name, level } of ways) {
+      const path = apiPath(this.map.site.path("diff", "tiles", name), { from, to, level });
+      const set = await requestJson<Schemas["ChangeRasterOut"]>(path, { signal: this.control.signal }).catch(
+        (error) => {
+          if (asApiError(error).status < 400) throw error; // aborted, or offline
+          return null;
+        },
+      );
+      if (set) return { ...grid, name, level: set.level, set: set as unknown as Raster };
+    }
+    return grid;
+  }
+
+  private showCells(grids: DiffGrid[], level: string): void {
+    this.clearCells();
+    const { from, to } = this.options;
+    for (const { name, set } of grids.filter((one) => one.level === level)) {
+      if (!set) continue;
+      const path = this.map.site.path("diff", "tiles", name);
+      const address = (z: number, row: number, column: number) =>
+        apiPath([...path, z, row, `${column}.png`], { from, to, level });
+      const tiles = new Tiles(set, address);
+      tiles.recolour(cellColours());
+      const layer = this.map.addRaster(tiles, Z.cells);
+      layer.setVisible(this.visible.peek());
+      this.rasters.push(layer);
     }
   }
 
@@ -220,16 +231,22 @@ function inOneDirection<T extends Feature>(feature: T): T {
   return { ...feature, geometry: { type: "LineString", coordinates: [...geometry.coordinates].reverse() } };
 }
 
-/** Returns the grids of a diff. A grid of another level than `ground` is named with it: `L2/map`. */
+/** Returns the grids of a diff, with the numbers of their cells. Their levels are found by `findGrid`. */
 export function gridsOf(layers: Record<string, unknown>): DiffGrid[] {
   const grids = (layers.occupancy ?? {}) as Record<string, Partial<DiffGrid>>;
   return Object.entries(grids)
     .filter(([, value]) => typeof value === "object" && value !== null)
-    .map(([key, { freed = 0, blocked = 0, unknown = 0, other = 0, bbox = null }]) => {
-      const cut = key.indexOf("/");
-      const [level, name] = cut > 0 ? [key.slice(0, cut), key.slice(cut + 1)] : ["ground", key];
-      return { key, name, level, freed, blocked, unknown, other, bbox };
-    });
+    .map(([key, { freed = 0, blocked = 0, unknown = 0, other = 0, bbox = null }]) => ({
+      key,
+      name: key,
+      level: "ground",
+      freed,
+      blocked,
+      unknown,
+      other,
+      bbox,
+      set: null,
+    }));
 }
 
 /** How changes are drawn. Lines tell by their dashes what points tell by their signs. */

@@ -15,6 +15,7 @@ import {
 import { sendForm } from "../../api/upload";
 import type { PickedFile } from "../../dropped";
 import type { Site } from "../../site";
+import { notify } from "../../ui/toast";
 import { addFiles, formOf, NO_OPTIONS, type UploadOptions } from "./files";
 
 export type Step =
@@ -49,7 +50,12 @@ export class Desk {
   private key = "";
 
   add(more: readonly PickedFile[]): void {
-    const { files, hidden } = addFiles(this.step.peek().name === "done" ? [] : this.files.peek(), more);
+    const step = this.step.peek();
+    if ((step.name === "sending" && step.commit) || step.name === "waiting") {
+      notify("A version is being saved: add these files afterwards", { kind: "failed" });
+      return;
+    }
+    const { files, hidden } = addFiles(step.name === "done" ? [] : this.files.peek(), more);
     this.files.value = files;
     this.hidden.value = hidden;
     this.untry();
@@ -124,6 +130,14 @@ export class Desk {
       if (problem.status === 412) this.newer.value = await this.headOf().catch(() => null);
       if (!problem.isOffline) this.problem.value = problem;
     }
+  }
+
+  /** Tells of a version that somebody else has saved since the dry run, before a commit is refused. */
+  async watchHead(head: number | undefined): Promise<void> {
+    const step = this.step.peek();
+    if (step.name !== "tried" || head === undefined || head <= step.dry.parent) return;
+    const version = await this.headOf().catch(() => null);
+    if (this.step.peek() === step) this.newer.value = version;
   }
 
   /** Gives up a commit that waits for the server. */

@@ -1,5 +1,6 @@
 /** The version is saved: where to go from here. */
 import { CircleCheck, GitCompare, Eye, Rocket, Upload } from "lucide-preact";
+import { useEffect, useRef } from "preact/hooks";
 import { go, link } from "../../address";
 import type { Version } from "../../api/client";
 import { Button } from "../../ui/button";
@@ -9,6 +10,8 @@ import { open } from "../sites";
 import type { Desk } from "./desk";
 
 export function Done({ desk, version, isNew }: { desk: Desk; version: Version; isNew: boolean }) {
+  const top = useRef<HTMLDivElement>(null);
+  useEffect(() => top.current?.focus(), []); // the button that was pressed is gone
   const links = [
     { text: "Show on the map", icon: Eye, to: { view: "layers", version: version.version } },
     {
@@ -24,7 +27,7 @@ export function Done({ desk, version, isNew }: { desk: Desk; version: Version; i
   ];
   return (
     <div class="stack">
-      <div class="done" role="status">
+      <div class="done" role="status" tabIndex={-1} ref={top}>
         <CircleCheck size={28} aria-hidden="true" />
         <p class="empty-title">
           {isNew ? `v${version.version} committed` : `Nothing changed: v${version.version} already has this content`}

@@ -48,6 +48,14 @@ export default function UploadView({ site, map }: ViewProps) {
       }),
     [desk],
   );
+  useEffect(() => {
+    const warn = (event: BeforeUnloadEvent) => {
+      if (desk.step.peek().name === "waiting") event.preventDefault(); // the browser asks before it closes the page
+    };
+    addEventListener("beforeunload", warn);
+    return () => removeEventListener("beforeunload", warn);
+  }, [desk]);
+  useEffect(() => effect(() => void desk.watchHead(site.environment.value?.version)), [desk, site]);
   const step = desk.step.value;
   const files = desk.files.value;
   if (step.name === "done") return <Done desk={desk} version={step.version} isNew={step.isNew} />;

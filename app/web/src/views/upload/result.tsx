@@ -3,6 +3,7 @@ import { Crosshair, Eye, EyeOff, RefreshCw } from "lucide-preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { go } from "../../address";
 import type { DryRun, Version } from "../../api/client";
+import { checksOf } from "../../checks";
 import { DiffLayer } from "../../map/diff-layer";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
@@ -45,10 +46,13 @@ function showChanges(layer: DiffLayer): void {
 export function Result({ site, map, dry }: Props) {
   const diff = useDiff(map, dry.parent, dry.id);
   const top = useRef<HTMLElement>(null);
-  useEffect(() => top.current?.scrollIntoView({ block: "start" }), []);
+  useEffect(() => {
+    top.current?.scrollIntoView({ block: "start" });
+    top.current?.focus({ preventScroll: true }); // the button that was pressed is gone
+  }, []);
   const isSame = Object.keys(dry.diff.layers).length === 0;
   return (
-    <section class="stack result" ref={top} aria-label="What would change">
+    <section class="stack result" ref={top} tabIndex={-1} aria-label="What would change">
       {isSame ? (
         <p class="note">
           These files change nothing: v{dry.parent} already has this content. If you commit, they are kept as its
@@ -57,6 +61,7 @@ export function Result({ site, map, dry }: Props) {
       ) : (
         diff && <Changes site={site} diff={diff} changes={dry.diff.layers as Record<string, unknown>} />
       )}
+      <ResultChecks site={site} dry={dry} />
       {dry.warnings.length > 0 && (
         <details class="warnings" open={dry.warnings.length <= 5}>
           <summary>{count(dry.warnings.length, "warning")}</summary>
@@ -64,6 +69,29 @@ export function Result({ site, map, dry }: Props) {
         </details>
       )}
     </section>
+  );
+}
+
+/** Mistakes that the result would have, before it is saved. */
+function ResultChecks({ site, dry }: { site: Site; dry: DryRun }) {
+  const data = checksOf(site).data.value;
+  if (data?.version !== dry.id) return null;
+  const rules = new Map<string, number>();
+  for (const { rule, severity } of data.items) {
+    if (severity === "error") rules.set(rule, (rules.get(rule) ?? 0) + 1);
+  }
+  if (rules.size === 0) return <p class="muted">The checks find no errors in the result.</p>;
+  return (
+    <div class="note">
+      <p>The checks find errors in the result. It can be committed all the same.</p>
+      <ul>
+        {[...rules].map(([rule, number]) => (
+          <li key={rule}>
+            {number} × {data.rules.find((one) => one.rule === rule)?.title ?? rule}
+          </li>
+        ))}
+      </ul>
+    </div>
   );
 }
 
