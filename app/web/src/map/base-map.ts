@@ -1,4 +1,5 @@
-/** The base map below all layers: off unless the operator has configured one and the user switches it on. */
+/** The base map below all layers: off unless the operator has configured one and the user switches it on (`base=1` in
+ * the address). */
 import { signal } from "@preact/signals";
 import type { Layer } from "ol/layer";
 import { go, param } from "../address";

@@ -71,10 +71,11 @@ function Choice({ derivations, information }: Pick<Props, "derivations" | "infor
 }
 
 function Choices({ list, information }: { list: Derivation[]; information: Record<string, string> }) {
+  const choices = list.map((one) => ({ one, needed: lacking(one, information) }));
+  choices.sort((a, b) => Number(a.needed.length > 0) - Number(b.needed.length > 0)); // what works comes first
   return (
     <ul class="rows choices">
-      {list.map((one) => {
-        const needed = lacking(one, information);
+      {choices.map(({ one, needed }) => {
         return (
           <li key={one.id}>
             <button type="button" class="row" disabled={needed.length > 0} onClick={() => go({ derive: one.id })}>

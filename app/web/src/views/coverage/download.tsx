@@ -50,11 +50,14 @@ export function DownloadPart({ site, row, values, disabled, onProblem }: Props) 
   };
   return (
     <section class="stack" aria-label="Download">
-      <div class="actions">
+      <div class="download">
         <Button main icon={Download} busy={busy} disabled={disabled} onClick={() => void start()}>
           Download
         </Button>
-        <small class="grow">{filesText(row.format)}; several files come as one zip</small>
+        <small class="grow">
+          {filesText(row.format)}
+          {row.format.files.length > 1 && "; several files come as one zip"}
+        </small>
       </div>
       {busy && <JobProgress job={job} title="Making the map" onCancel={() => control.current?.abort()} />}
       {done && <p role="status">{done}</p>}

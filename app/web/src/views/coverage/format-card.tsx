@@ -8,7 +8,7 @@ import { can } from "../../session";
 import type { Site } from "../../site";
 import { Button } from "../../ui/button";
 import { SchemaForm } from "../../ui/schema-form";
-import { asParameters, isValid, type Parameter, setValues, type Values } from "../../ui/schema-values";
+import { asParameters, isValid, type Parameter, setValues, type Value, type Values } from "../../ui/schema-values";
 import { sentence } from "../../ui/states";
 import { open } from "../sites";
 import type { Derivation } from "./derivations";
@@ -79,12 +79,12 @@ export function FormatCard({ site, map, row, derivations }: Props) {
   );
 }
 
-function ReportDetails({ site, row, values }: { site: Site; row: TableRow; values: Record<string, never> | object }) {
+function ReportDetails({ site, row, values }: { site: Site; row: TableRow; values: Record<string, Value> }) {
   const [isOpen, setOpen] = useState(false);
   return (
     <details class="part" onToggle={(event) => setOpen(event.currentTarget.open)}>
       <summary>Report of this map</summary>
-      {isOpen && <ReportPart site={site} format={row.id} values={values as Record<string, string>} />}
+      {isOpen && <ReportPart site={site} format={row.id} values={values} />}
     </details>
   );
 }
