@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
+
 from tests.web.conftest import TABLET, Open, WebServer
 
 RESOLUTION = 0.05
