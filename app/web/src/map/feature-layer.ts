@@ -32,10 +32,10 @@ export interface FeatureStyle {
 
 interface Paths {
   lines: Path2D;
-  /** One path for each area: in a single one, areas that overlap would cancel each other. */
-  areas: Path2D[];
+  areas: Path2D;
   dots: Path2D;
   hasLines: boolean;
+  hasAreas: boolean;
   hasDots: boolean;
 }
 
@@ -182,7 +182,7 @@ export class FeatureLayer extends PaintedLayer {
       }
       if (paint.stroke) {
         context.strokeStyle = paint.stroke;
-        for (const area of group.areas) context.stroke(area);
+        if (group.hasAreas) context.stroke(group.areas);
         if (group.hasLines) context.stroke(group.lines);
       }
       context.setLineDash([]);
@@ -278,9 +278,10 @@ function isCounterClockwise(ring: number[][]): boolean {
 function newPaths(): Paths {
   return {
     lines: new Path2D(),
-    areas: [],
+    areas: new Path2D(),
     dots: new Path2D(),
     hasLines: false,
+    hasAreas: false,
     hasDots: false,
   };
 }
