@@ -268,7 +268,7 @@ export function diffStyle(hasSigns: () => boolean): FeatureStyle {
       const signs = hasSigns() ? sign : undefined;
       out[`${change} area`] = { stroke, fill, width: 2.5, dash: dash && [...dash], sign: signs };
       out[`${change} line`] = { stroke, width: 3.5, dash: dash && [...dash] };
-      out[`${change} point`] = { stroke, dot: signs ? 3 : 8, sign: signs };
+      out[`${change} point`] = { stroke, dot: signs && change !== "added" ? 3 : 9, sign: signs };
     }
     return out;
   };
