@@ -118,7 +118,7 @@ def at(feature: dict[str, Any]) -> tuple[float, ...]:
 def test_any_order_of_edits_can_be_undone_and_merged(tmp_path: Path) -> None:
     web = Path(__file__).resolve().parents[2] / "app" / "web"
     bundler, program = web / "node_modules" / ".bin" / "rolldown", tmp_path / "edit.mjs"
-    arguments = [str(bundler), "checks/edit.ts", "--file", str(program), "--platform", "node"]
+    arguments = [str(bundler), "src/views/edit/edit.check.ts", "--file", str(program), "--platform", "node"]
     subprocess.run(arguments, cwd=web, check=True, capture_output=True, timeout=120)
     done = subprocess.run(["node", str(program)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

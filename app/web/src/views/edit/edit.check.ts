@@ -1,9 +1,9 @@
 /** Any order of edits keeps lanes tied to their nodes, can be undone, replayed and merged (run by tests/web/test_edit.py). */
-import { type Command, Draft, isEdge, isNode, keyOf, same } from "../src/views/edit/draft";
-import { compare, merged, withFreshIds } from "../src/views/edit/merge";
-import * as operations from "../src/views/edit/operations";
-import { placeOf, Transaction } from "../src/views/edit/transaction";
-import type { Feature } from "../src/map/features";
+import { type Command, Draft, isEdge, isNode, keyOf, same } from "./draft";
+import { compare, merged, withFreshIds } from "./merge";
+import * as operations from "./operations";
+import { placeOf, Transaction } from "./transaction";
+import type { Feature } from "../../map/features";
 
 const RUNS = 150;
 const WHERE = { level: "ground", part: "network" };
