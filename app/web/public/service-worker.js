@@ -7,7 +7,12 @@ const KEPT = /^\/api\/v1\/(session$|environments(\/|$)|robots$|formats$)/;
 const NOT_KEPT = /\/(maps\/[^/]+|sources\/|manifest|reports\/)/;
 
 self.addEventListener("install", (event) => {
-  event.waitUntil(caches.open(SHELL).then((cache) => cache.addAll(["/", "/icon.svg"])).then(() => self.skipWaiting()));
+  event.waitUntil(
+    caches
+      .open(SHELL)
+      .then((cache) => cache.addAll(["/", "/icon.svg"]))
+      .then(() => self.skipWaiting()),
+  );
 });
 
 self.addEventListener("activate", (event) => {
@@ -20,7 +25,8 @@ self.addEventListener("fetch", (event) => {
   if (request.method !== "GET" || url.origin !== self.location.origin) return;
   if (request.mode === "navigate" && url.pathname === "/") event.respondWith(fromServer(request, SHELL, "/"));
   else if (url.pathname.startsWith("/assets/") || url.pathname === "/icon.svg") event.respondWith(fromCache(request));
-  else if (KEPT.test(url.pathname) && !NOT_KEPT.test(url.pathname)) event.respondWith(fromServer(request, MAPS, request));
+  else if (KEPT.test(url.pathname) && !NOT_KEPT.test(url.pathname))
+    event.respondWith(fromServer(request, MAPS, request));
 });
 
 async function fromCache(request) {
