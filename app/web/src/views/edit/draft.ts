@@ -84,6 +84,8 @@ export class Draft {
   log: Command[] = [];
   /** Number of commands of the log that are in force; those behind it can be done again. */
   position = 0;
+  /** Stands in new ids where not all features are loaded, so that none is taken twice. */
+  idMark = "";
   private readonly base = new Map<string, Feature>();
   private readonly current = new Map<string, Feature>();
   private readonly edges = new Map<string, Set<string>>();
@@ -132,9 +134,10 @@ export class Draft {
 
   /** Returns an id that is not in use: `n1`, `n2`, … */
   freshId(prefix: string, taken: ReadonlySet<string> = new Set()): string {
+    const start = `${prefix}${this.idMark}`;
     let number = 1;
-    while (this.isIdUsed(`${prefix}${number}`) || taken.has(`${prefix}${number}`)) number += 1;
-    return `${prefix}${number}`;
+    while (this.isIdUsed(`${start}${number}`) || taken.has(`${start}${number}`)) number += 1;
+    return `${start}${number}`;
   }
 
   /** Returns the node an edge starts or ends at: that of its own part, else of another (a lift's lane). */

@@ -120,6 +120,12 @@ export class Editor {
     this.map.shown.value = null;
   }
 
+  private newDraft(features: Iterable<Feature>, log?: Command[], position?: number): Draft {
+    const draft = new Draft(features, log, position);
+    if (this.site.partial.peek().length) draft.idMark = `-${this.store.id.slice(0, 5)}-`;
+    return draft;
+  }
+
   get draftId(): string {
     return this.store.id;
   }
@@ -251,7 +257,7 @@ export class Editor {
 
   /** Throws all changes away. */
   discard(): void {
-    this.draft = new Draft(this.site.features.peek());
+    this.draft = this.newDraft(this.site.features.peek());
     this.base.value = this.site.number;
     this.message.value = "";
     this.selection.value = new Set();
@@ -261,7 +267,7 @@ export class Editor {
 
   /** The draft has become a version: what is drawn is what the server holds. */
   saved(version: number): void {
-    this.draft = new Draft(this.draft.features());
+    this.draft = this.newDraft(this.draft.features());
     this.base.value = version;
     this.message.value = "";
     this.notes.value = this.notes.peek().filter(({ id }) => id === "merged");
@@ -291,8 +297,10 @@ export class Editor {
 
   private async start(features: Feature[], version: number): Promise<void> {
     this.base.value = version;
-    this.draft = new Draft(features);
+    this.draft = this.newDraft(features);
     const stored = await this.store.load().catch(() => null);
+    this.base.value = this.site.number ?? version;
+    this.draft = this.newDraft(this.site.features.peek()); // the site may have moved on, and the draft have another id
     if (stored && stored.head.position + stored.log.length > 0) this.restore(stored);
     this.ready.value = true;
     this.revision.value += 1;
@@ -310,7 +318,7 @@ export class Editor {
     const version = this.site.number ?? 0;
     this.message.value = head.message;
     if (head.version === version) {
-      this.draft = new Draft(features, log, head.position);
+      this.draft = this.newDraft(features, log, head.position);
       this.base.value = version;
       this.noteRestored("");
       return;
@@ -323,7 +331,7 @@ export class Editor {
       if (from) older.set(key, from);
       else older.delete(key);
     }
-    this.draft = new Draft(older.values(), log, head.position);
+    this.draft = this.newDraft(older.values(), log, head.position);
     this.base.value = head.version;
     this.noteRestored(`, made on v${head.version}`);
     this.meet(features, version, this.site.version.peek()?.author ?? "");
@@ -351,7 +359,7 @@ export class Editor {
       return;
     }
     if (!this.draft.log.length) {
-      this.draft = new Draft(features);
+      this.draft = this.newDraft(features);
       this.base.value = version;
       this.revision.value = this.revision.peek() + 1;
       const left = [...this.selection.peek()].filter((key) => this.draft.get(key));
@@ -401,11 +409,11 @@ export class Editor {
     const cells = this.draft.cells();
     const old = this.draft;
     let details: string[] = [];
-    if (merge.keepsHistory && !merge.conflicts.length) this.draft = new Draft(theirs, old.log, old.position);
+    if (merge.keepsHistory && !merge.conflicts.length) this.draft = this.newDraft(theirs, old.log, old.position);
     else {
       const result = merged(theirs, merge, choices, (key) => old.before(key), `Your changes, merged with v${version}`);
       details = result.notes;
-      this.draft = new Draft(theirs);
+      this.draft = this.newDraft(theirs);
       const command: Command = { title: "", edits: [], ...result.command, cells };
       this.draft.execute({ ...command, title: `Your changes, merged with v${version}` });
     }
