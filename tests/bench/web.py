@@ -124,7 +124,7 @@ def cpu(devtools: CDPSession) -> float:
 
 
 PAINTED = """(least) => {
-  const canvases = [...document.querySelectorAll('.painted-layer canvas')];
+  const canvases = [...document.querySelectorAll('.painted-layer:not([hidden]) canvas')];
   const painted = canvases.filter((canvas) => {
     if (!canvas.width) return false;
     const {data} = canvas.getContext('2d').getImageData(canvas.width / 4, canvas.height / 2, canvas.width / 2, 1);

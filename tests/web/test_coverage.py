@@ -125,7 +125,7 @@ def count_pixels(page: Page, colour: tuple[int, int, int]) -> int:
     return int(
         page.evaluate(
             """([r, g, b]) => { let count = 0;
-            for (const canvas of document.querySelectorAll('.painted-layer canvas')) {
+            for (const canvas of document.querySelectorAll('.painted-layer:not([hidden]) canvas')) {
               const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
               for (let i = 0; i < data.length; i += 4)
                 if (data[i] === r && data[i + 1] === g && data[i + 2] === b && data[i + 3] === 255) count += 1;
@@ -150,7 +150,7 @@ def test_losses_are_drawn_and_listed(open_page: Open, server: WebServer) -> None
         expect(card).to_contain_text(f"{number} × {kind.replace('_', ' ')} {change}")
     for line in losses["report"]["dropped"]:
         expect(card).to_contain_text(line["why"])
-    page.wait_for_function("() => document.querySelectorAll('.painted-layer canvas').length > 5")
+    page.wait_for_function("() => document.querySelectorAll('.painted-layer:not([hidden]) canvas').length > 5")
     wait_for_pixels(page, DELETED)
     assert "losses=1" in page.url
     page.goto("/?site=farm&view=coverage&format=tmap2&losses=1")

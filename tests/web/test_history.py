@@ -83,7 +83,7 @@ def pixels(page: Page, colour: str) -> int:
             probe.fillRect(0, 0, 1, 1);
             const wanted = new Uint32Array(probe.getImageData(0, 0, 1, 1).data.buffer)[0];
             let count = 0;
-            for (const canvas of document.querySelectorAll('.painted-layer canvas')) {
+            for (const canvas of document.querySelectorAll('.painted-layer:not([hidden]) canvas')) {
               const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
               for (const word of new Uint32Array(data.buffer)) if (word === wanted) count += 1;
             } return count; }""",

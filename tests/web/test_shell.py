@@ -42,7 +42,7 @@ def wait_until_drawn(page: Page) -> None:
     """Wait until the layers of the map show many colours: the picture, the grid and the features."""
     page.wait_for_function(
         """() => { const seen = new Set();
-            for (const canvas of document.querySelectorAll('.painted-layer canvas')) {
+            for (const canvas of document.querySelectorAll('.painted-layer:not([hidden]) canvas')) {
               const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
               const words = new Uint32Array(data.buffer);
               for (let i = 0; i < words.length; i += 7) if (words[i]) seen.add(words[i]);
