@@ -69,7 +69,8 @@ def test_files_are_tried_drawn_and_committed(open_page: Open, server: WebServer,
     expect(page.get_by_role("button", name="Hide Occupancy “yard”")).to_be_visible()
 
 
-DRAWN = """([red, green, blue]) => [...document.querySelectorAll('.painted-layer:not([hidden]) canvas')].some((canvas) => {
+DRAWN = """([red, green, blue]) =>
+  [...document.querySelectorAll('.painted-layer:not([hidden]) canvas')].some((canvas) => {
   const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
   for (let at = 0; at < data.length; at += 4) {
     if (data[at + 3] > 150 && Math.abs(data[at] - red) + Math.abs(data[at + 1] - green)
