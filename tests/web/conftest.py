@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,8 +68,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebServer]:
         process.stop()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    """Start a browser for a module: while it runs, no other test could start an event loop."""
     program = shutil.which("chromium")
     assert program, "chromium is not installed (Debian: apt install chromium)"
     with sync_playwright() as playwright:
@@ -130,6 +132,14 @@ def axe() -> str:
     path = Path(__file__).resolve().parents[2] / "app" / "web" / "node_modules" / "axe-core" / "axe.min.js"
     assert path.is_file(), "axe-core is missing: `npm ci` in app/web"
     return path.read_text()
+
+
+def wait_until(page: Page, expression: str, argument: Any = None) -> None:
+    """Wait until a JavaScript function returns true; Playwright's own waiting needs ``eval``, which is forbidden."""
+    deadline = time.monotonic() + SECONDS
+    while not page.evaluate(expression, argument):
+        assert time.monotonic() < deadline, f"not true within {SECONDS:.0f} s: {expression}"
+        page.wait_for_timeout(250)
 
 
 def check_accessibility(page: Page, axe: str) -> None:

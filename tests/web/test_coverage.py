@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.api import samples
 from tests.cli.conftest import TOKEN, ServerProcess
-from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility
+from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility, wait_until
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 COLUMNS = ("location", "objects", "occupancy", "topology", "zones", "imagery", "voxels")
@@ -150,7 +150,7 @@ def test_losses_are_drawn_and_listed(open_page: Open, server: WebServer) -> None
         expect(card).to_contain_text(f"{number} × {kind.replace('_', ' ')} {change}")
     for line in losses["report"]["dropped"]:
         expect(card).to_contain_text(line["why"])
-    page.wait_for_function("() => document.querySelectorAll('.painted-layer:not([hidden]) canvas').length > 5")
+    wait_until(page, "() => document.querySelectorAll('.painted-layer:not([hidden]) canvas').length > 5")
     wait_for_pixels(page, DELETED)
     assert "losses=1" in page.url
     page.goto("/?site=farm&view=coverage&format=tmap2&losses=1")
@@ -181,7 +181,7 @@ def test_derivation_is_tried_then_saved_then_out_of_date(open_page: Open, server
     assert "version=dry:" in page.url
     result.get_by_role("button", name="Before").click()
     expect(result.get_by_role("button", name="Before")).to_have_attribute("aria-pressed", "true")
-    assert "version=dry:" not in page.url
+    expect(page).not_to_have_url(re.compile("version=dry:"))
     result.get_by_role("button", name="Save as a version").click()
     expect(page.get_by_role("link", name=re.compile("^v2"))).to_be_visible()
     saved = server.get(f"{site}/versions/latest")

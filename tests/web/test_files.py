@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -19,8 +20,9 @@ MAX_ALL_BYTES = 450_000
 
 
 @pytest.fixture
-def anyone(server: WebServer) -> httpx.Client:
-    return httpx.Client(base_url=server.address)
+def anyone(server: WebServer) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.address) as http:
+        yield http
 
 
 def test_policy_allows_this_server_only(anyone: httpx.Client) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility
+from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility, wait_until
 
 VIEWS = ("Layers", "History", "Upload", "Edit", "Coverage", "Fleet", "Checks")
 
@@ -40,14 +40,14 @@ def test_site_is_found_and_drawn(open_page: Open) -> None:
 
 def wait_until_drawn(page: Page) -> None:
     """Wait until the layers of the map show many colours: the picture, the grid and the features."""
-    page.wait_for_function(
+    wait_until(
+        page,
         """() => { const seen = new Set();
             for (const canvas of document.querySelectorAll('.painted-layer:not([hidden]) canvas')) {
               const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
               const words = new Uint32Array(data.buffer);
               for (let i = 0; i < words.length; i += 7) if (words[i]) seen.add(words[i]);
             } return seen.size > 50; }""",
-        polling=500,
     )
 
 

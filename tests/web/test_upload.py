@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.web.conftest import TABLET, Open, WebServer, check_accessibility
+from tests.web.conftest import TABLET, Open, WebServer, check_accessibility, wait_until
 
 GRID = "image: yard.pgm\nresolution: 0.1\norigin: [0, 0, 0]\noccupied_thresh: 0.65\nfree_thresh: 0.25\nnegate: 0\n"
 BROKEN = '<osm version="0.6">\n<node id="1" lat="52" lon="5"/>\n<node id="2" lat="x" lon="5"/>\n</osm\n'
@@ -55,7 +55,7 @@ def test_files_are_tried_drawn_and_committed(open_page: Open, server: WebServer,
     expect(changes).to_contain_text("Grid yard: 40 cells blocked, 1,160 cells freed")
     expect(page.get_by_text("Trial: not saved")).to_be_visible()
     expect(page.get_by_text("found: Occupancy grid", exact=False)).to_be_visible()
-    page.wait_for_function(f"({DRAWN})([176, 60, 90])")  # the wall, in the colour of cells that are new and occupied
+    wait_until(page, DRAWN, [176, 60, 90])  # the wall, in the colour of cells that are new and occupied
     assert server.get(f"environments/{site}")["version"] == 0
     page.get_by_label("Message").fill("Survey of the yard")
     page.get_by_role("button", name="Commit as v1").click()
