@@ -170,6 +170,7 @@ AFTER_THE_CHECK = {
     "_donor",
     "serve",
     "bundle",
+    "_sign_in_path",
 }
 """Called by a function that has checked."""
 

@@ -131,7 +131,7 @@ def test_effective_templates_are_listed_with_origin(api: Api, env: str) -> None:
     put(api, env, set="warehouse", formats={"tmap2": {"values": {"yaw_goal_tolerance": 0.2}}})
     answer = api.get(f"environments/{env}/templates")
     templates = answer.json()
-    assert answer.headers["etag"] == '"3"'
+    assert answer.headers["etag"].removeprefix("W/") == '"3"'  # weak if the body is compressed
     assert (templates["version"], templates["set"]) == (3, "warehouse")
     assert {"default", "outdoor", "indoor", "warehouse"} <= set(templates["sets"])
     lines = {line["format"]: line for line in templates["formats"]}
