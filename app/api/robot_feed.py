@@ -17,6 +17,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api.http.auth import Principal
 from app.api.http.dependencies import Services
+from app.api.http.problems import describe
 from app.api.robots import robots_as_json
 from app.errors import NotFound, Unavailable
 
@@ -136,8 +137,8 @@ class _Watch:
                 await asyncio.sleep(RETRY_SECONDS)
             except NotFound:
                 return  # deleted or renamed: its streams end
-            except Exception:
-                log.exception("changes of robots: reading them failed; trying again")
+            except Exception as error:  # noqa: BLE001  all streams share this task: it must not end
+                log.error("robots: reading their changes failed, will retry: %s", describe(error))  # noqa: TRY400
                 await asyncio.sleep(RETRY_SECONDS)
             else:
                 if complete:

@@ -157,8 +157,8 @@ def preview_key(version: Version, request: PreviewRequest) -> str:
     parts = sorted([e.key.layer, e.key.level, e.key.name, e.hash] for e in version.parts)
     datum = None if version.datum is None else version.datum.as_dict()
     levels = [[level.name, level.elevation] for level in version.levels]
-    asked = [request.layers, request.level, request.width, request.theme]
-    return hashlib.sha256(orjson.dumps(["preview", WRITER, parts, datum, levels, asked])).hexdigest()
+    selection = [request.layers, request.level, request.width, request.theme]
+    return hashlib.sha256(orjson.dumps(["preview", WRITER, parts, datum, levels, selection])).hexdigest()
 
 
 class Previews:
