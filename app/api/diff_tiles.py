@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import Path, Query, Request
 from pydantic import BaseModel, Field
@@ -18,6 +18,7 @@ from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import EnvironmentPath, problem_responses
+from app.api.http.tile_address import NOT_MODIFIED, TILE_RESPONSES, LevelOfDetail, TileColumn, TileRow
 from app.convert.cache import ConvertedMap
 from app.convert.change_tiles import TILE, draw_stored_tile, draw_tile, level_count
 from app.convert.report import Report
@@ -87,9 +88,6 @@ NamePath = Annotated[str, Path(max_length=256, description="Name of the grid.", 
 LevelQuery = Annotated[
     str | None, Query(max_length=256, description="Level of the grid; required if several levels have the name.")
 ]
-RowPath = Annotated[int, Path(ge=0, le=2**20, description="Row of the tile, 0 on top.", examples=[0])]
-ColumnPath = Annotated[int, Path(ge=0, le=2**20, description="Column of the tile, 0 on the left.", examples=[0])]
-NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "Not modified: the client has this content"}}
 
 
 @router.get(
@@ -97,17 +95,16 @@ NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "Not modif
     response_class=Response,
     responses={
         **problem_responses(None, 404, 409, 422, 503),
-        200: {"description": "The tile: 256 × 256 pixels", "content": {"image/png": {}}},
-        **NOT_MODIFIED,
+        **TILE_RESPONSES,
     },
     summary="Get a tile of changed cells",
 )
 async def get_change_tile(
     env: EnvironmentPath,
     name: NamePath,
-    z: Annotated[int, Path(ge=0, le=32, description="Level of detail, 0 to `levels` - 1.", examples=[0])],
-    row: RowPath,
-    col: ColumnPath,
+    z: LevelOfDetail,
+    row: TileRow,
+    col: TileColumn,
     request: Request,
     services: ServicesDep,
     _: Viewer,

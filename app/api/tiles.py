@@ -17,6 +17,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
+from app.api.http.tile_address import NOT_MODIFIED, TILE_RESPONSES, LevelOfDetail, TileColumn, TileRow
 from app.api.layers import select_part
 from app.convert.placement import Placement, place_columns, place_raster
 from app.convert.pyramid import TILE, Size
@@ -71,9 +72,7 @@ NamePath = Annotated[
 LevelQuery = Annotated[
     str | None, Query(max_length=256, description="Level of the part; required if several levels have the name.")
 ]
-MAX_INDEX = 2**20
 HeightQuery = Annotated[float | None, Query(ge=-MAX_METRES, le=MAX_METRES, allow_inf_nan=False)]
-NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "Not modified: the client has this content"}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +104,7 @@ def _find(services: Services, env: str, v: str, kind: Kind, name: str, level: st
     response_class=Response,
     responses={
         **problem_responses(None, 404, 409, 422),
-        200: {"description": "The tile: 256 × 256 pixels", "content": {"image/png": {}}},
-        **NOT_MODIFIED,
+        **TILE_RESPONSES,
     },
     summary="Get a tile",
 )
@@ -115,9 +113,9 @@ async def get_tile(
     v: VersionPath,
     kind: KindPath,
     name: NamePath,
-    z: Annotated[int, Path(ge=0, le=32, description="Level of detail, 0 to `levels` - 1.", examples=[0])],
-    row: Annotated[int, Path(ge=0, le=MAX_INDEX, description="Row of the tile, 0 on top.", examples=[0])],
-    col: Annotated[int, Path(ge=0, le=MAX_INDEX, description="Column of the tile, 0 on the left.", examples=[0])],
+    z: LevelOfDetail,
+    row: TileRow,
+    col: TileColumn,
     request: Request,
     services: ServicesDep,
     _: Viewer,
