@@ -125,21 +125,22 @@ export function nameOf(feature: Feature): string {
   return typeof name === "string" && name ? name : feature.id;
 }
 
-/** Index of features by place. */
+/** Index of features by place, built when it is first asked: the map is painted before. */
 export class FeatureIndex {
-  private readonly tree = new RBush<Feature>(12);
-  readonly byId = new Map<string, Feature>();
+  private tree: RBush<Feature> | null = null;
+  readonly byId: ReadonlyMap<string, Feature>;
 
-  constructor(features: readonly Feature[]) {
-    const known = features.filter((feature) => Number.isFinite(boxOf(feature.geometry)[0]));
-    this.tree.load(
-      known.map((feature) => boxOf(feature.geometry)),
-      known,
-    );
-    for (const feature of features) this.byId.set(feature.id, feature);
+  constructor(private readonly features: readonly Feature[]) {
+    this.byId = new Map(features.map((feature) => [feature.id, feature]));
   }
 
   inBox(box: Box): Feature[] {
+    if (!this.tree) {
+      const boxes = this.features.map((feature) => boxOf(feature.geometry));
+      const isPlaced = (_: unknown, index: number) => Number.isFinite(boxes[index]?.[0]);
+      this.tree = new RBush(12);
+      this.tree.load(boxes.filter(isPlaced), this.features.filter(isPlaced));
+    }
     return this.tree.getInExtent(box);
   }
 

@@ -2,8 +2,7 @@
 import { useEffect, useState } from "preact/hooks";
 
 const LOCALE = "en-GB";
-const relative = new Intl.RelativeTimeFormat(LOCALE, { numeric: "auto", style: "short" });
-const whole = new Intl.NumberFormat(LOCALE);
+let relative: Intl.RelativeTimeFormat | undefined;
 const UNITS: [Intl.RelativeTimeFormatUnit, number][] = [
   ["year", 31_536_000],
   ["month", 2_592_000],
@@ -12,11 +11,16 @@ const UNITS: [Intl.RelativeTimeFormatUnit, number][] = [
   ["minute", 60],
 ];
 
+export function whole(value: number): string {
+  return value.toLocaleString(LOCALE);
+}
+
 export function count(value: number, one: string, many = `${one}s`): string {
-  return `${whole.format(value)} ${value === 1 ? one : many}`;
+  return `${whole(value)} ${value === 1 ? one : many}`;
 }
 
 export function ago(time: string, now = Date.now()): string {
+  relative ??= new Intl.RelativeTimeFormat(LOCALE, { numeric: "auto", style: "short" }); // some 20 ms
   const seconds = (Date.parse(time) - now) / 1000;
   for (const [unit, size] of UNITS)
     if (Math.abs(seconds) >= size) return relative.format(Math.round(seconds / size), unit);

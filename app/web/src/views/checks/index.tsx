@@ -10,6 +10,7 @@ import { type Finding, type Severity, useChecking } from "../../checks";
 import { can } from "../../session";
 import type { Site } from "../../site";
 import { Button } from "../../ui/button";
+import { SearchField } from "../../ui/search-field";
 import { Bars, Empty, Problem } from "../../ui/states";
 import { count } from "../../ui/text";
 import type { ViewProps } from "../registry";
@@ -52,15 +53,7 @@ export default function ChecksView({ site, map }: ViewProps) {
       ) : (
         <>
           <Filters data={data.items} severities={severities} />
-          <label class="field">
-            <span class="visually-hidden">Search findings</span>
-            <input
-              type="search"
-              placeholder="Search by name, id or level"
-              value={text}
-              onInput={(event) => setText(event.currentTarget.value)}
-            />
-          </label>
+          <SearchField label="Search findings" hint="Search by name, id or level" value={text} onInput={setText} />
           <OldVersion site={site} />
           {data.truncated && (
             <p class="note">Only the first {data.items.length} findings are listed: repair these, then check again.</p>

@@ -1,8 +1,8 @@
 /** Changes of a version in words. Pure. */
+import { whole } from "../../ui/text";
 import { INFORMATION_TEXT } from "./table";
 
 const WORDS = ["added", "changed", "deleted", "freed", "blocked", "unknown"];
-const number = new Intl.NumberFormat("en-GB");
 
 /** Returns a line for each layer, such as "Topology: 245 added"; rasters are counted in cells. */
 export function changeLines(changes: Record<string, unknown>): string[] {
@@ -25,6 +25,6 @@ export function changeLines(changes: Record<string, unknown>): string[] {
 
 function countsOf(value: Record<string, unknown>): string {
   return WORDS.filter((word) => typeof value[word] === "number" && value[word] > 0)
-    .map((word) => `${number.format(value[word] as number)} ${word}`)
+    .map((word) => `${whole(value[word] as number)} ${word}`)
     .join(", ");
 }

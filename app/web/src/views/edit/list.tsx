@@ -3,6 +3,7 @@ import { useState } from "preact/hooks";
 import { keyOf } from "./draft";
 import type { Editor } from "./editor";
 import { titleOf } from "./words";
+import { SearchField } from "../../ui/search-field";
 
 const SHOWN = 60;
 
@@ -24,15 +25,7 @@ export function DraftList({ editor }: { editor: Editor }) {
   return (
     <details class="feature-list" onToggle={(event) => setOpen(event.currentTarget.open)}>
       <summary>Features</summary>
-      <label class="field">
-        <span class="visually-hidden">Search features</span>
-        <input
-          type="search"
-          placeholder="Search by name, id or kind"
-          value={text}
-          onInput={(event) => setText(event.currentTarget.value)}
-        />
-      </label>
+      <SearchField label="Search features" hint="Search by name, id or kind" value={text} onInput={setText} />
       <ul class="rows">
         {found.slice(0, SHOWN).map((feature) => (
           <li key={keyOf(feature)}>

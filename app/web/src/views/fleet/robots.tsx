@@ -5,6 +5,7 @@ import { memo } from "preact/compat";
 import { useEffect, useState } from "preact/hooks";
 import { go, param } from "../../address";
 import { Button } from "../../ui/button";
+import { SearchField } from "../../ui/search-field";
 import { Empty } from "../../ui/states";
 import { count } from "../../ui/text";
 import type { FleetMap } from "./fleet-map";
@@ -51,15 +52,7 @@ export function Robots({ store, fleetMap, onAdd }: RobotsProps) {
         ))}
       </fieldset>
       {(robots.length > 8 || text) && (
-        <label class="field">
-          <span class="visually-hidden">Search robots</span>
-          <input
-            type="search"
-            placeholder="Search robots by name"
-            value={text}
-            onInput={(event) => setText(event.currentTarget.value)}
-          />
-        </label>
+        <SearchField label="Search robots" hint="Search robots by name" value={text} onInput={setText} />
       )}
       {names.length === 0 && <p class="muted">No robot matches.</p>}
       <ul class="rows robot-rows" aria-label="Robots">

@@ -6,6 +6,7 @@ import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { theme } from "../../theme";
 import { Button } from "../../ui/button";
+import { SearchField } from "../../ui/search-field";
 import { Empty } from "../../ui/states";
 import { count } from "../../ui/text";
 import { cellWords, WORDS } from "./cells";
@@ -60,15 +61,7 @@ export function ChangeList(props: Props) {
               </Button>
             ))}
           </div>
-          <label class="field">
-            <span class="visually-hidden">Search changes</span>
-            <input
-              type="search"
-              placeholder="Search by name, id or property"
-              value={text}
-              onInput={(event) => onText(event.currentTarget.value)}
-            />
-          </label>
+          <SearchField label="Search changes" hint="Search by name, id or property" value={text} onInput={onText} />
         </div>
       )}
       <Grids {...props} />

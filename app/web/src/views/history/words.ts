@@ -1,6 +1,6 @@
 /** What versions changed, as people say it. No DOM. */
 import type { Version } from "../../api/client";
-import { count } from "../../ui/text";
+import { count, whole } from "../../ui/text";
 
 export const LAYER_NAMES: Record<string, string> = {
   topology: "Network",
@@ -53,7 +53,7 @@ export function cellsInWords(cells: Counts): string {
 export function countsInWords(counts: Counts): string {
   const words = ["added", "changed", "deleted"]
     .filter((key) => numberOf(counts[key]))
-    .map((key) => `${new Intl.NumberFormat("en-GB").format(numberOf(counts[key]))} ${key}`);
+    .map((key) => `${whole(numberOf(counts[key]))} ${key}`);
   if (words.length === 0 && counts.document) words.push("document changed");
   return words.join(", ");
 }

@@ -4,6 +4,7 @@ import { nameOf } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { count } from "../../ui/text";
+import { SearchField } from "../../ui/search-field";
 
 const SHOWN = 100;
 
@@ -18,15 +19,7 @@ export function FeatureList({ site, map }: { site: Site; map: SiteMap }) {
   return (
     <details class="feature-list" open={Boolean(wanted)}>
       <summary>Features ({features.length})</summary>
-      <label class="field">
-        <span class="visually-hidden">Search features</span>
-        <input
-          type="search"
-          placeholder="Search by name, id or kind"
-          value={text}
-          onInput={(event) => setText(event.currentTarget.value)}
-        />
-      </label>
+      <SearchField label="Search features" hint="Search by name, id or kind" value={text} onInput={setText} />
       <ul class="rows">
         {features.slice(0, SHOWN).map((feature) => (
           <li key={`${feature.layer}/${feature.id}`}>
