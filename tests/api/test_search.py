@@ -13,7 +13,8 @@ MEMBERS = {"kind", "environment", "version", "id", "name", "level", "where", "ti
 def test_search_returns_items_of_accessible_environments(api: Api, farm: str, bare: str) -> None:
     found = api.get(f"environments/{farm}/versions/3/layers/topology").json()["features"]
     node = next(f["id"] for f in found if f["properties"]["kind"] == "node" and len(f["id"]) > 3)
-    body = api.get("search", params={"q": node.upper(), "limit": 100}).json()
+    allowed = api.token_for("viewer", environments=farm)
+    body = allowed.get("search", params={"q": node.upper(), "limit": 100}).json()
     assert set(body) == {"items", "truncated"}
     hit = next(item for item in body["items"] if (item["environment"], item["id"]) == (farm, node))
     assert set(hit) == MEMBERS

@@ -176,6 +176,66 @@ def pan(bench: Bench, site: str, at: str) -> tuple[float, float]:
         return (cpu(devtools) - before) / PAN_FRAMES, rate
 
 
+def drag(bench: Bench, site: str) -> float:
+    """Return the main thread's CPU per movement in milliseconds while a node is dragged in the editor."""
+    with bench.open(f"/?site={site}&view=edit&at=100,100,0.05") as (page, devtools):
+        page.get_by_role("toolbar", name="Editing tools").wait_for(timeout=120_000)
+        page.wait_for_timeout(3000)
+        box = page.locator(".map").bounding_box()
+        assert box
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 8, y + 3)
+        page.wait_for_timeout(500)
+        before = cpu(devtools)
+        for step in range(PAN_FRAMES):
+            page.mouse.move(x + 8 + step, y + 3 + step / 3)
+            page.evaluate("() => new Promise(requestAnimationFrame)")
+        used = cpu(devtools) - before
+        page.mouse.up()
+        page.get_by_role("button", name="Undo (Ctrl+Z)").and_(page.locator(":enabled")).wait_for(timeout=60_000)
+        return used / PAN_FRAMES
+
+
+ROBOTS = 500
+AT_CENTRE = """() => [...document.querySelectorAll('.painted-layer:not([hidden]) canvas')].filter(
+  (canvas) => canvas.width && canvas.getContext('2d').getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data[3]).length"""
+UNTIL_SEEN = f"""(before) => new Promise((resolve) => {{
+  const count = {AT_CENTRE};
+  const look = () => count() > before ? resolve(performance.timeOrigin + performance.now())
+    : requestAnimationFrame(look);
+  look();
+}})"""
+
+
+def event_to_pixel(bench: Bench, site: str) -> float:
+    """Return the median seconds from a robot's report until it is drawn at its new place, with 499 others."""
+    root = bench.call("GET", f"environments/{site}/versions/latest")["root"]
+    version = bench.call("GET", f"environments/{site}")["version"]
+
+    def report(robot: int, x: float, y: float) -> None:
+        status = {"environment": site, "channel": "latest", "version": version, "root": root, "state": "active"}
+        pose = {"x": x, "y": y, "yaw": 0.0, "level": "ground"}
+        bench.call("PUT", f"robots/r{robot}/status", json={**status, "pose": pose})
+
+    for robot in range(ROBOTS):
+        report(robot, 50 + robot % 25 * 4.0, 60.0 + robot // 25 * 4.0)
+    seconds: list[float] = []
+    with bench.open(f"/?site={site}&view=fleet&at=101,101,0.1") as (page, _):
+        page.get_by_role("list", name="Robots").get_by_role("listitem").first.wait_for(timeout=120_000)
+        page.wait_for_timeout(3000)
+        for robot in range(7):
+            before = page.evaluate(AT_CENTRE)
+            start = time.time()
+            page.evaluate(f"window.seen = ({UNTIL_SEEN})({before}); null")
+            report(robot, 101.0, 101.0)
+            seconds.append(page.evaluate("window.seen") / 1000 - start)
+            report(robot, 50.0, 50.0)
+            page.wait_for_timeout(2000)
+    return statistics.median(seconds)
+
+
 def memory(bench: Bench, site: str) -> float:
     """Return the memory of the browser's process for the page, in megabytes, after zooming through the map."""
     with bench.open(f"/?site={site}&view=none") as (page, _):
@@ -241,6 +301,9 @@ def measure(bench: Bench, large: bool) -> Iterator[Row]:
     cold, cached = tiles(bench, "square")
     yield "tile, cold", "≤ 30 ms", f"{cold:.1f} ms"
     yield "tile, cached", "≤ 2 ms", f"{cached:.1f} ms"
+    bench.make_site("network", {}, 142, 2.0)
+    yield "dragging a node of 20 000: CPU a movement", "≤ 33 ms", f"{drag(bench, 'network'):.1f} ms"
+    yield f"report to pixel, {ROBOTS} robots", "≤ 1 s", f"{event_to_pixel(bench, 'square'):.2f} s"
     view, everything = sizes(bench)
     yield "first view, gzip", "≤ 250 kB", f"{view:.0f} kB"
     yield "all files, gzip", "≤ 450 kB", f"{everything:.0f} kB"
