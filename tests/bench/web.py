@@ -200,7 +200,8 @@ def drag(bench: Bench, site: str) -> float:
 
 ROBOTS = 500
 AT_CENTRE = """() => [...document.querySelectorAll('.painted-layer:not([hidden]) canvas')].filter(
-  (canvas) => canvas.width && canvas.getContext('2d').getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data[3]).length"""
+  (canvas) => canvas.width
+    && canvas.getContext('2d').getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data[3]).length"""
 UNTIL_SEEN = f"""(before) => new Promise((resolve) => {{
   const count = {AT_CENTRE};
   const look = () => count() > before ? resolve(performance.timeOrigin + performance.now())
