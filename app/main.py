@@ -492,6 +492,7 @@ async def _run_housekeeping(services: Services) -> None:
             services.response_cache.flush_counters()
             newest = _note_time(newest)
             await run_in_threadpool(services.store.tokens.end_expired)
+            await run_in_threadpool(services.store.tokens.store_uses)
             await run_in_threadpool(services.store.sessions.store_uses)
             await run_in_threadpool(services.store.channels.apply_due_moves, datetime.now(UTC))
             await run_in_threadpool(services.store.channels.advance_rollouts, datetime.now(UTC), next_step)

@@ -18,7 +18,15 @@ from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import EnvironmentPath, problem_responses
-from app.api.http.tile_address import NOT_MODIFIED, TILE_RESPONSES, LevelOfDetail, TileColumn, TileRow
+from app.api.http.tile_address import (
+    NOT_MODIFIED,
+    TILE_RESPONSES,
+    LevelOfDetail,
+    TileColumn,
+    TileHash,
+    TileRow,
+    check_hash,
+)
 from app.convert.cache import ConvertedMap
 from app.convert.change_tiles import TILE, draw_stored_tile, draw_tile, level_count
 from app.convert.report import Report
@@ -83,6 +91,11 @@ class _Comparison:
         seed = json_bytes(["diff tiles", DRAWING, self.old_hash, self.new_hash, *address])
         return f'"{hashlib.sha256(seed).hexdigest()[:32]}"'
 
+    @property
+    def hash(self) -> str:
+        """Return the hash of both contents."""
+        return self.etag().strip('"')
+
 
 NamePath = Annotated[str, Path(max_length=256, description="Name of the grid.", examples=["map"])]
 LevelQuery = Annotated[
@@ -111,6 +124,7 @@ async def get_change_tile(
     from_: FromRef = None,
     to: Ref = "latest",
     level: LevelQuery = None,
+    hash_: TileHash = None,
 ) -> Response:
     """Return a grey tile of changed cells, in the pixels of the newer grid: row 0 and column 0 are the upper left.
 
@@ -122,6 +136,7 @@ async def get_change_tile(
     count as unknown. A deleted grid is drawn in its own frame, as unknown now.
     """
     compared = await run_in_threadpool(_find, services, env, from_, to, name, level)
+    check_hash(hash_, compared.hash)
     headers = _headers(compared.etag(z, row, col), from_, to)
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
@@ -164,7 +179,7 @@ def get_change_raster(
         "tile": TILE,
         "levels": level_count(image),
         "bounds": list(cell_box(image.header, 0, 0, image.width, image.height)),
-        "hash": compared.etag().strip('"'),
+        "hash": compared.hash,
     }
     return json_response(body, headers=headers)
 

@@ -38,7 +38,19 @@ DEFAULT_SECONDS = 3600.0
 MAX_SECONDS = 2_592_000.0
 
 
-class OverlayBody(RequestModel):
+class EndBody(RequestModel):
+    """End of a closure: from now, or a time."""
+
+    ttl_seconds: float | None = Field(
+        None,
+        ge=1,
+        le=MAX_SECONDS,
+        description="Duration in seconds from now. A report with neither `ttl_seconds` nor `expires` ends in 3600 s.",
+    )
+    expires: ApiTime | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with time zone.")
+
+
+class OverlayBody(EndBody):
     """Obstruction: a polygon or an edge."""
 
     model_config = ConfigDict(
@@ -69,13 +81,6 @@ class OverlayBody(RequestModel):
     level: str | None = Field(
         None, min_length=1, max_length=256, description="Level of the polygon. Default: `ground`."
     )
-    ttl_seconds: float | None = Field(
-        None,
-        ge=1,
-        le=2_592_000,
-        description="Duration in seconds from now. Default: 3600 unless `expires` is given.",
-    )
-    expires: ApiTime | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with time zone.")
     state: Literal["pending", "accepted"] = Field(
         "pending", description="`accepted` (editors only): in force at once, on every channel."
     )
@@ -222,8 +227,8 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
     return json_response(overlay.as_dict(), 201 if new else 200)
 
 
-def _expiry_of(body: OverlayBody, now: datetime) -> datetime:
-    """Compute the end of a report. Raises Invalid."""
+def _expiry_of(body: EndBody, now: datetime) -> datetime:
+    """Compute the end of a report or closure. Raises Invalid."""
     if body.expires is None:
         return now + timedelta(seconds=DEFAULT_SECONDS if body.ttl_seconds is None else body.ttl_seconds)
     problem = ""
@@ -299,6 +304,23 @@ def reject_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
     """Reject a pending overlay. It stays in the list and has no effect."""
     decided = services.store.overlays.decide(env, id, "pending", "rejected", principal.name, datetime.now(UTC))
     return json_response(decided.as_dict())
+
+
+@router.patch(
+    "/{id}",
+    responses=problem_responses(OverlayOut, 400, 404, 409, 415),
+    summary="Change the end of an accepted overlay",
+)
+def change_overlay(
+    env: EnvironmentPath, id: OverlayPath, body: EndBody, services: ServicesDep, principal: Editor
+) -> Response:
+    """Let a closure end earlier or later. Robots get it with its new end: the event is `overlay.accepted` again."""
+    if body.ttl_seconds is None and body.expires is None:
+        problem = "give ttl_seconds or expires"
+        raise Invalid(f"the new end is missing: {problem}", [Problem(problem, where="body")])
+    now = datetime.now(UTC)
+    moved = services.store.overlays.move_end(env, id, _expiry_of(body, now), principal.name, now)
+    return json_response(moved.as_dict())
 
 
 @router.post("/{id}/end", responses=problem_responses(OverlayOut, 404, 409), summary="End an accepted overlay now")

@@ -17,7 +17,15 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
-from app.api.http.tile_address import NOT_MODIFIED, TILE_RESPONSES, LevelOfDetail, TileColumn, TileRow
+from app.api.http.tile_address import (
+    NOT_MODIFIED,
+    TILE_RESPONSES,
+    LevelOfDetail,
+    TileColumn,
+    TileHash,
+    TileRow,
+    check_hash,
+)
 from app.api.layers import select_part
 from app.convert.placement import Placement, place_columns, place_raster
 from app.convert.pyramid import TILE, Size
@@ -122,6 +130,7 @@ async def get_tile(
     level: LevelQuery = None,
     z_min: Annotated[HeightQuery, Query(description="Voxels: lower end of the slice in metres. Default: all.")] = None,
     z_max: Annotated[HeightQuery, Query(description="Voxels: upper end of the slice in metres. Default: all.")] = None,
+    hash_: TileHash = None,
 ) -> Response:
     """Return a tile of a raster, in the raster's own pixels: row 0 and column 0 are the upper left corner.
 
@@ -133,6 +142,7 @@ async def get_tile(
     """
     generation = services.response_cache.generation()
     raster = await run_in_threadpool(_find, services, env, v, kind, name, level)
+    check_hash(hash_, raster.entry.hash)
     address = TileAddress(z, row, col)
     tiles, entry = services.tiles, raster.entry
     if kind == "voxels":

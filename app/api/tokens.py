@@ -55,6 +55,7 @@ class TokenOut(BaseModel):
     robot: str | None
     expires: datetime | None
     created: datetime
+    last_used: datetime | None = Field(description="Time of the last use, to the hour; null: never, or not known.")
     ended: datetime | None = Field(
         description="Time at which the server found the token expired. It stays expired, even if the clock is set back."
     )
@@ -89,6 +90,7 @@ def as_dict(token: Token) -> dict[str, Any]:
         "robot": token.robot,
         "expires": rfc3339(token.expires) if token.expires else None,
         "created": rfc3339(token.created),
+        "last_used": rfc3339(token.used) if token.used else None,
         "ended": rfc3339(token.ended) if token.ended else None,
     }
 

@@ -87,7 +87,7 @@ def show(server: options.Server = None, token: options.Token = None, as_json: op
     if as_json:
         output.show_json(rows)
         return
-    members = ("id", "name", "role", "environments", "robot", "expires", "ended")
+    members = ("id", "name", "role", "environments", "robot", "expires", "last_used", "ended")
     output.show_table(members, ([row.get(member) or "" for member in members] for row in rows))
 
 

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from app.convert.cache import Cache, ConvertedMap
 from app.convert.drawing import Canvas, Colour, Pixels, fit_frame
 from app.convert.placement import Placement, place_columns, place_raster
-from app.convert.pyramid import Size
+from app.convert.pyramid import Size, reduced_transform
 from app.convert.report import Report
 from app.convert.tiles import Tiles
 from app.derive.zones_to_occupancy import KEEPOUTS, LANES, SPEEDS
@@ -286,8 +286,8 @@ class _Drawing:
     def _reduce(self, entry: PartEntry, placement: Placement) -> tuple[Pixels, Affine]:
         """Read a raster at about twice the picture's pixels."""
         reader = self._tiles.header(entry)
-        k = _reduction(Size(reader.width, reader.height), self._request.width)
-        return self._tiles.reduced(entry, k), _reduced_transform(placement.transform, k)
+        k = Size(reader.width, reader.height).reduction(self._request.width)
+        return self._tiles.reduced(entry, k), reduced_transform(placement.transform, k)
 
     def _image(self, entry: PartEntry) -> _Raster | None:
         datum = None if self._frame is None else self._frame.datum
@@ -307,7 +307,7 @@ class _Drawing:
     def _columns(self, entry: PartEntry) -> _Raster:
         columns = self._tiles.columns(self._version, entry.key)
         size = Size(columns.width, columns.height)
-        k = _reduction(size, self._request.width)
+        k = size.reduction(self._request.width)
         small = size.reduced(k)
         side, (low, high) = max(small.width, small.height), columns.heights
         cells = columns.tile(k, 0, 0, side, columns.heights)
@@ -316,7 +316,7 @@ class _Drawing:
         walls = columns.tile(k, 0, 0, side, heights if heights[0] < high else columns.heights) == OCCUPIED
         cells[walls] = OCCUPIED
         cells = cells[: small.height, : small.width]
-        return self._cells(cells, _reduced_transform(place_columns(columns).transform, k), over=False)
+        return self._cells(cells, reduced_transform(place_columns(columns).transform, k), over=False)
 
     def _cells(self, cells: Pixels, transform: Affine, *, over: bool) -> _Raster:
         """Colour cells from free to occupied; unknown ones are transparent, and free ones over an image."""
@@ -435,17 +435,6 @@ def _spacing(edges: NDArray[np.object_], nodes: NDArray[np.object_]) -> float:
         return math.inf
     x0, y0, x1, y1 = shapely.total_bounds(nodes)
     return math.hypot(x1 - x0, y1 - y0) / math.sqrt(len(nodes))
-
-
-def _reduction(size: Size, width: int) -> int:
-    """Return the reduction at which a raster is at most two pixels wide or high per pixel of the picture."""
-    return max(0, math.ceil(math.log2(max(size.width, size.height) / (2 * width))))
-
-
-def _reduced_transform(transform: Affine, k: int) -> Affine:
-    a, b, c, d, e, f = transform
-    side = 2**k
-    return a * side, b * side, c, d * side, e * side, f
 
 
 def _visible_box(visible: NDArray[np.bool_], transform: Affine) -> Box | None:

@@ -6,6 +6,7 @@ unknown only if all are; colours are averaged, weighted by their opacity. Row 0 
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.model.grid import UNKNOWN
-from app.model.imagery import GeoImage, display_pixels, display_range
+from app.model.imagery import Affine, GeoImage, display_pixels, display_range
 from app.store.windows import RasterReader
 from app.syntax import images
 
@@ -49,9 +50,20 @@ class Size:
         """Return the size at a reduction."""
         return Size(_round_up(self.width, k), _round_up(self.height, k))
 
+    def reduction(self, width: int) -> int:
+        """Return the reduction at which it is at most two pixels wide or high per pixel of a picture."""
+        return max(0, math.ceil(math.log2(max(self.width, self.height) / (2 * width))))
+
     def tiles(self) -> tuple[int, int]:
         """Return the number of rows and columns of tiles."""
         return -(-self.height // TILE), -(-self.width // TILE)
+
+
+def reduced_transform(transform: Affine, k: int) -> Affine:
+    """Return the transform of a raster's pixels at a reduction."""
+    a, b, c, d, e, f = transform
+    side = 2**k
+    return a * side, b * side, c, d * side, e * side, f
 
 
 def _round_up(value: int, k: int) -> int:

@@ -145,6 +145,21 @@ class Overlays:
                 _append_event(connection, row, decided, event, author, now)
             return decided
 
+    def move_end(self, environment: str, id: str, expires: datetime, author: str, now: datetime) -> Overlay:
+        """Change the end of an accepted overlay, with an event: robots get it anew. Raises NotFound, Conflict."""
+        table = tables.overlay
+        with self._database.write() as connection:
+            row = environment_row(connection, environment, lock=True)
+            stored = _read(connection, row, id)
+            if stored.state != "accepted":
+                raise Conflict(f"overlay {id} is {stored.state}: only the end of accepted overlays can be changed")
+            if stored.expires == expires:
+                return stored
+            connection.execute(update(table).where(table.c.id == id).values(expires=expires))
+            moved = _read(connection, row, id)
+            _append_event(connection, row, moved, "overlay.accepted", author, now)
+            return moved
+
     def end_due(self, now: datetime) -> None:
         """End overlays that are due: pending ones expire, closures are lifted, each with its event."""
         table, owner = tables.overlay, tables.environment

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-import threading
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, delete, insert, select
 
 from app.errors import Conflict, NotFound
 from app.store import tables
 from app.store.database import Database
 from app.store.tokens import Tokens
+from app.store.uses import Uses
 from app.store.values import Token
 
 SECRET_BYTES: Final = 32
@@ -47,8 +47,7 @@ class Sessions:
 
     def __init__(self, database: Database, tokens: Tokens) -> None:
         self._database, self._tokens = database, tokens
-        self._uses: dict[str, datetime] = {}
-        self._lock = threading.Lock()
+        self._uses = Uses(database, tables.session.c.hash, tables.session.c.used, USE_INTERVAL)
 
     def create(self, token: Token) -> tuple[Session, str]:
         """Start a session of a token; returns it with its secret, which is not stored. Raises NotFound if revoked."""
@@ -90,18 +89,19 @@ class Sessions:
         if len(secret) > MAX_SECRET:
             return None
         table, owner, digest = tables.session, tables.token, _hash(secret)
-        query = select(owner, table.c.used).join(table, table.c.token_id == owner.c.id).where(table.c.hash == digest)
+        query = (
+            select(owner, table.c.used.label("session_used"))
+            .join(table, table.c.token_id == owner.c.id)
+            .where(table.c.hash == digest)
+        )
         with self._database.read() as connection:
             row = connection.execute(query).one_or_none()
         now = self._database.now()
         token = None if row is None else self._tokens.check_row(row)
-        if row is None or token is None or row.used + IDLE <= now:
+        if row is None or token is None or row.session_used + IDLE <= now:
             return None
-        with self._lock:
-            used = max(row.used, self._uses.get(digest, row.used))
-            if now - used >= USE_INTERVAL:
-                self._uses[digest] = used = now
-        return Session(token, used + IDLE)
+        self._tokens.note_use(token)
+        return Session(token, self._uses.note(digest, row.session_used) + IDLE)
 
     def end(self, secret: str) -> bool:
         """End a session; returns whether there was one."""
@@ -117,21 +117,7 @@ class Sessions:
 
     def store_uses(self) -> int:
         """Store the noted uses of sessions, in one transaction; returns how many. Without any it writes nothing."""
-        with self._lock:
-            uses, self._uses = self._uses, {}
-        if not uses:
-            return 0
-        table = tables.session
-        try:
-            with self._database.write(notify=False, upkeep=True) as connection:
-                for digest, used in uses.items():
-                    newer = (table.c.hash == digest) & (table.c.used < used)
-                    connection.execute(update(table).where(newer).values(used=used))
-        except BaseException:
-            with self._lock:
-                self._uses = {**uses, **self._uses}
-            raise
-        return len(uses)
+        return self._uses.store()
 
     def sweep(self) -> int:
         """Delete ended sessions and expired codes; returns how many."""

@@ -335,6 +335,7 @@ token = Table(
     Column("expires", UtcDateTime, nullable=True),
     Column("created", UtcDateTime, nullable=False),
     Column("ended", UtcDateTime, nullable=True),
+    Column("used", UtcDateTime, nullable=True),
 )
 
 

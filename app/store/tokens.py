@@ -6,7 +6,7 @@ import hashlib
 import hmac
 import logging
 import secrets
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any, Final, get_args
 
 from sqlalchemy import Row, delete, insert, select, update
@@ -17,11 +17,15 @@ from app.store import tables
 from app.store.audit import set_audit_target
 from app.store.base import checked_text
 from app.store.database import Database
+from app.store.uses import Uses
 from app.store.values import Role, Token, rfc3339
 
 log = logging.getLogger(__name__)
 
 SECRET_BYTES: Final = 32
+
+USE_INTERVAL: Final = timedelta(hours=1)
+"""Minimum time between two stored uses of a token."""
 
 
 class Tokens:
@@ -29,6 +33,7 @@ class Tokens:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._uses = Uses(database, tables.token.c.id, tables.token.c.used, USE_INTERVAL)
 
     def create(
         self,
@@ -101,7 +106,7 @@ class Tokens:
                 raise NotFound(f"unknown token {id[:80]!r}")
 
     def find(self, text: str) -> Token | None:
-        """Find the token with this secret; None if it is unknown or expired."""
+        """Find the token with this secret, and note its use; None if it is unknown or expired."""
         if len(text) > 4096:
             return None
         digest = _hash(text)
@@ -109,7 +114,18 @@ class Tokens:
             row = connection.execute(select(tables.token).where(tables.token.c.hash == digest)).one_or_none()
         if row is None or not hmac.compare_digest(row.hash, digest):
             return None
-        return self.check_row(row)
+        token = self.check_row(row)
+        if token is not None:
+            self.note_use(token)
+        return token
+
+    def note_use(self, token: Token) -> None:
+        """Note that a token is used, to be stored by `store_uses`."""
+        self._uses.note(token.id, token.used)
+
+    def store_uses(self) -> int:
+        """Store the noted uses of tokens, in one transaction; returns how many. Without any it writes nothing."""
+        return self._uses.store()
 
     def check_row(self, row: Row[Any], *, store_end: bool = True) -> Token | None:
         """Convert a token's row; None if the token has ended. store_end: store that it was found expired."""
@@ -144,4 +160,4 @@ def _hash(secret: str) -> str:
 
 
 def _as_token(row: Row[Any]) -> Token:
-    return Token(row.id, row.name, row.role, row.environments, row.robot, row.expires, row.created, row.ended)
+    return Token(row.id, row.name, row.role, row.environments, row.robot, row.expires, row.created, row.ended, row.used)

@@ -345,6 +345,7 @@ class Token:
     """An access token without its secret.
 
     environments: a name pattern (fnmatch), None for all. ended: when it was found to have expired; it stays expired.
+    used: when it was last used, to the hour.
     """
 
     id: str
@@ -355,6 +356,7 @@ class Token:
     expires: datetime | None
     created: datetime
     ended: datetime | None = None
+    used: datetime | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,7 +105,7 @@ ROWS = [
         f"DELETE {E}/channels/{{channel}}/planned, POST {E}/derivations, POST {E}/generations, PUT {E}/templates, "
         f"DELETE {E}/templates, PUT {E}/templates/{{format}}, DELETE {E}/templates/{{format}}, POST {E}/alignments, "
         f"POST {E}/overlays/{{id}}/accept, POST {E}/overlays/{{id}}/reject, POST {E}/overlays/{{id}}/end, "
-        f"POST {E}/overlays/{{id}}/keep",
+        f"POST {E}/overlays/{{id}}/keep, PATCH {E}/overlays/{{id}}",
         admin=f"DELETE {E}, POST {E}/restore, POST {E}/purge",
     ),
 ]

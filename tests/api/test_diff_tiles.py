@@ -164,6 +164,9 @@ def test_caching_and_problems(api: Api, farm: str) -> None:
     about = api.get(f"{path}?from=2&to=3")
     assert about.headers["etag"] != numbered.headers["etag"]
     api.get(f"{path}?from=2&to=3", 304, headers={"If-None-Match": about.headers["etag"]})
+    address = f"{path}/0/0/0.png?from=2&to=3&hash="
+    assert api.get(address + about.json()["hash"]).content == numbered.content
+    assert "other content" in api.problem("GET", f"{address}{'0' * 32}", 404)["detail"]
     assert "z 0 to 0" in api.problem("GET", f"{path}/1/0/0.png?from=2&to=3", 404)["detail"]
     assert "rows 0 to 0" in api.problem("GET", f"{path}/0/0/1.png?from=2&to=3", 404)["detail"]
     detail = api.problem("GET", f"environments/{farm}/diff/tiles/maps?from=2&to=3", 404)["detail"]

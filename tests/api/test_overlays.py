@@ -108,6 +108,29 @@ def test_end_is_given_as_a_time_or_as_seconds(api: Api, farm: str) -> None:
         assert text in api.problem("POST", url, 422, json=body)["detail"]
 
 
+def test_editor_changes_the_end_of_a_closure(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/overlays"
+    report = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
+    address = f"{url}/{report['id']}"
+    assert "is pending" in api.problem("PATCH", address, 409, json={"ttl_seconds": 60})["detail"]
+    accepted = api.post(f"{address}/accept", expect=200).json()
+    later = rfc3339(datetime.now(UTC) + timedelta(hours=5))
+    moved = api("PATCH", address, 200, json={"expires": later}).json()
+    assert moved == {**accepted, "expires": later}
+    assert api("PATCH", address, 200, json={"expires": later}).json() == moved
+    events = told_of(api, farm)
+    assert [e["type"] for e in events] == ["overlay.created", "overlay.accepted", "overlay.accepted"]
+    assert events[2]["overlay"] == moved
+    assert events[1]["overlays_digest"] != events[2]["overlays_digest"], "robots get the new end"
+    assert "give ttl_seconds or expires" in api.problem("PATCH", address, 422, json={})["detail"]
+    api.problem("PATCH", address, 422, json={"ttl_seconds": 5, "expires": later})
+    api.problem("PATCH", address, 422, json={"state": "ended"})
+    api.token_for("robot", robot="mower-7").problem("PATCH", address, 403, json={"ttl_seconds": 60})
+    api("PATCH", address, 200, json={"ttl_seconds": 1})
+    until(lambda: api.get(f"{url}?state=ended").json())
+    assert "is ended" in api.problem("PATCH", address, 409, json={"ttl_seconds": 60})["detail"]
+
+
 def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None:
     """The robot runs production, and the head has another network."""
     url = f"environments/{farm}/overlays"

@@ -79,6 +79,13 @@ def test_a_numbered_version_is_immutable_and_a_channel_revalidates(api: Api, sit
     assert other.headers["etag"] != numbered.headers["etag"]
 
 
+def test_address_with_a_hash_is_of_that_content_only(api: Api, site: str) -> None:
+    base = f"environments/{site}/versions/1/tiles/occupancy/map"
+    own = api.get(base).json()["hash"]
+    assert api.get(f"{base}/0/0/0.png?hash={own}").content == api.get(f"{base}/0/0/0.png").content
+    assert "other content" in api.problem("GET", f"{base}/0/0/0.png?hash={'0' * len(own)}", 404)["detail"]
+
+
 def test_names_and_levels_select_a_part(api: Api, site: str) -> None:
     base = f"environments/{site}/versions/latest/tiles"
     assert api.get(f"{base}/occupancy/keepout").json()["name"] == "keepout"

@@ -88,6 +88,30 @@ def test_uses_are_written_at_most_once_a_minute(timed: Store, clock: Clock) -> N
     assert timed.generation() == generation, "cached responses stay valid"
 
 
+def test_last_use_of_a_token_is_stored_at_most_once_an_hour(timed: Store, clock: Clock) -> None:
+    token, secret = timed.tokens.create("mower", "viewer")
+    unused, _ = timed.tokens.create("spare", "viewer")
+    generation = timed.generation()
+
+    def last_used() -> dict[str, datetime | None]:
+        return {one.id: one.used for one in timed.tokens.all()}
+
+    start = clock.time
+    assert timed.tokens.find(secret) is not None
+    assert last_used() == {token.id: None, unused.id: None}, "no read costs a write"
+    assert timed.tokens.store_uses() == 1
+    for minutes, stored in ((30, 0), (59, 0), (60, 1)):
+        clock.time = start + timedelta(minutes=minutes)
+        assert timed.tokens.find(secret) is not None
+        assert timed.tokens.store_uses() == stored
+    assert last_used() == {token.id: clock.time, unused.id: None}
+    _, session = timed.sessions.create(unused)
+    assert timed.sessions.find(session) is not None
+    assert timed.tokens.store_uses() == 1
+    assert last_used()[unused.id] == clock.time, "a use of a session is one of its token"
+    assert timed.generation() == generation, "cached responses stay valid"
+
+
 @pytest.mark.parametrize("end", ["expiry", "revocation"])
 def test_session_ends_with_its_token(timed: Store, clock: Clock, end: str) -> None:
     token, _ = timed.tokens.create("alice", "viewer", expires=clock.time + timedelta(hours=1))

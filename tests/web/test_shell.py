@@ -51,6 +51,30 @@ def wait_until_drawn(page: Page) -> None:
     )
 
 
+def test_site_of_a_purged_name_gets_its_own_tiles(open_page: Open, server: WebServer) -> None:
+    site = "environments/again"
+    page = open_page("/")
+    seen: list[str] = []
+    page.on("request", lambda request: seen.append(request.url))
+
+    def hash_shown() -> str:
+        own = str(server.get(f"{site}/versions/1/tiles/occupancy/map")["hash"])
+        page.goto("/?site=again")
+        with page.expect_request(lambda request: f"hash={own}" in request.url and "map/" in request.url):
+            wait_until_drawn(page)
+        return own
+
+    hashes = []
+    for rows in (4, 6):
+        server.make_site("again", rows=rows)
+        hashes.append(hash_shown())
+        server.call("DELETE", site)
+        server.call("POST", f"{site}/purge")
+    assert hashes[0] != hashes[1]
+    own = [url for url in seen if "tiles/occupancy/map/" in url]
+    assert all(any(f"hash={one}" in url for one in hashes) for url in own)
+
+
 def test_map_is_selected_by_pointer_and_by_list_and_link(open_page: Open, server: WebServer) -> None:
     page = open_page("/?site=orchard")
     page.get_by_text("Features (").click()

@@ -18,6 +18,7 @@ import {
 import { EventStream } from "./api/events";
 import { type Box, type Feature, fromWire, joinBoxes, type LayerName, type WireFeature } from "./map/features";
 import { createFrame, type Frame } from "./map/frame";
+import { describeTiles } from "./map/tiles";
 
 export const VECTOR_LAYERS: LayerName[] = ["zones", "objects", "topology", "location"];
 
@@ -124,9 +125,12 @@ export class Site {
     return this.channels.value.filter((one) => one.version === version).map(({ channel }) => channel);
   }
 
+  tilePath(part: LayerPart): (string | number)[] {
+    return this.path("versions", this.exact, "tiles", part.layer, part.name);
+  }
+
   async tiles(part: LayerPart): Promise<Raster> {
-    const path = this.path("versions", this.exact, "tiles", part.layer, part.name);
-    return requestJson<Raster>(apiPath(path, { level: part.level }));
+    return describeTiles<Raster>(this.tilePath(part), { level: part.level });
   }
 
   /** Reads the environment and its channels again, and the version if its channel has moved. */

@@ -23,7 +23,7 @@ import { type Box, boxOf, EMPTY_BOX, type Feature, FeatureIndex, joinBoxes, type
 import { LOCAL } from "./frame";
 import { coloursOf, maskColours } from "./palette";
 import { RasterLayer } from "./raster-layer";
-import { Tiles } from "./tiles";
+import { tileAddress, Tiles } from "./tiles";
 
 const PICK_PIXELS = 10;
 const Z = { imagery: 0, voxels: 1, occupancy: 2, masks: 3, zones: 10, objects: 11, topology: 12, overlay: 20 };
@@ -309,15 +309,11 @@ export class SiteMap {
     try {
       const set = await this.site.tiles(part);
       if (this.rasters.has(key) || !this.site.rasters.peek().includes(part)) return;
-      const base = `/api/v1/${this.site.path("versions", this.site.exact, "tiles", part.layer, part.name).map(encodeURIComponent).join("/")}`;
+      const path = this.site.tilePath(part);
       const tiles = new Tiles(set, (z, row, column) => {
-        const search = new URLSearchParams({ level: part.level });
-        const slice = this.slice.peek();
-        if (part.layer === "voxels" && slice) {
-          search.set("z_min", String(slice[0]));
-          search.set("z_max", String(slice[1]));
-        }
-        return `${base}/${z}/${row}/${column}.png?${search}`;
+        const slice = part.layer === "voxels" ? this.slice.peek() : null;
+        const query = { level: part.level, z_min: slice?.[0], z_max: slice?.[1] };
+        return tileAddress(path, query, set)(z, row, column);
       });
       this.colourTiles(part, tiles);
       const kind = part.layer as "imagery" | "voxels" | "occupancy";

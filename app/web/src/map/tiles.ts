@@ -1,11 +1,24 @@
 /** Tiles of one raster, coloured and cached. */
-import type { Raster } from "../api/client";
+import { apiPath, type Raster, requestJson } from "../api/client";
 import type { TileReply, TileRequest } from "./tile-worker";
 
 /** Size, place and levels of detail of a raster: what tiles are drawn by. */
 export type TileSet = Pick<Raster, "width" | "height" | "transform" | "tile" | "levels" | "bounds" | "hash">;
 
 const MAX_TILES = 400;
+
+type Query = Record<string, string | number | null | undefined>;
+
+/** Reads what the tiles of a raster are like; the server is asked whether that is still true. Throws ApiError. */
+export function describeTiles<T extends TileSet>(path: (string | number)[], query: Query): Promise<T> {
+  return requestJson<T>(apiPath(path, query), { cache: "no-cache" });
+}
+
+/** Address of a tile. With the hash no cache takes it for one of another environment of that name, now deleted. */
+export function tileAddress(path: (string | number)[], query: Query, set: TileSet) {
+  return (z: number, row: number, column: number): string =>
+    apiPath([...path, z, row, `${column}.png`], { ...query, hash: set.hash });
+}
 
 let worker: Worker | null = null;
 let nextId = 0;

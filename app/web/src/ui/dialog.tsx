@@ -22,14 +22,17 @@ export function Dialog({ open, title, onClose, children, actions, wide }: Dialog
     if (!dialog) return;
     if (open && !dialog.open) dialog.showModal();
     if (!open && dialog.open) dialog.close();
-  }, [open]);
+  }); // after each drawing: the browser may have closed what the owner keeps open
   return (
     <dialog
       ref={element}
       class={wide ? "dialog wide" : "dialog"}
       aria-labelledby={id}
-      onClose={onClose}
-      onCancel={onClose}
+      onClose={() => open && onClose()}
+      onCancel={(event) => {
+        event.preventDefault(); // the owner may keep it open
+        onClose();
+      }}
     >
       {open && (
         <>

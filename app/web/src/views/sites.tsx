@@ -143,10 +143,11 @@ export function open(run: () => void) {
 }
 
 function SiteCard({ site }: { site: Environment }) {
-  const picture = apiPath(["environments", site.name, "versions", site.version, "preview.png"], {
+  const address = apiPath(["environments", site.name, "versions", "latest", "preview.png"], {
     width: 640,
     theme: theme.value,
   });
+  const picture = `${address}#${site.root}`; // asked for anew when the content is another
   return (
     <li>
       <a

@@ -14,15 +14,22 @@ import { Secret } from "./secret";
 import { isExpired, mayBeOwn, type Token } from "./words";
 import "./access.css";
 
-export default function Tokens() {
+const HOUR = 3_600_000;
+
+interface Props {
+  /** The token that is shown this once; the owner keeps it, and asks before the dialog is closed. */
+  created: Schemas["NewTokenOut"] | null;
+  onCreated: (token: Schemas["NewTokenOut"] | null) => void;
+}
+
+export default function Tokens({ created, onCreated }: Props) {
   const tokens = useLoaded((signal) => ask(api.GET("/api/v1/tokens", { signal })), []);
-  const [created, setCreated] = useState<Schemas["NewTokenOut"] | null>(null);
   if (created) {
     return (
       <Secret
         token={created}
         onClose={() => {
-          setCreated(null);
+          onCreated(null);
           tokens.reload();
         }}
       />
@@ -30,7 +37,7 @@ export default function Tokens() {
   }
   return (
     <div class="stack">
-      <NewToken onCreated={setCreated} />
+      <NewToken onCreated={onCreated} />
       <Show of={tokens}>
         {(list) =>
           list.length === 0 ? (
@@ -84,7 +91,7 @@ function TokenRow({ token, all, onRevoked }: RowProps) {
           </small>
         </span>
         <small>
-          <Expiry token={token} /> · made <Time at={token.created} />
+          <LastUse token={token} /> · <Expiry token={token} /> · made <Time at={token.created} />
         </small>
         {token.role !== "robot" && !ended && (
           <Button quiet icon={Link} label={`Sign-in link for ${token.name}`} onClick={() => void makeCode()} />
@@ -121,6 +128,17 @@ function warning(token: Token, all: Token[]): string {
   return token.role === "robot"
     ? `The robot ${token.robot ?? token.name} loses its access at once. It keeps the maps it has.`
     : "Whoever uses it is signed out at once. This cannot be undone.";
+}
+
+/** The server notes a use at most once an hour. */
+function LastUse({ token: { last_used: used } }: { token: Token }) {
+  if (!used) return <>not used yet</>;
+  if (Date.now() - Date.parse(used) < 2 * HOUR) return <>in use</>;
+  return (
+    <>
+      last used <Time at={used} />
+    </>
+  );
 }
 
 function Expiry({ token }: { token: Token }) {

@@ -128,7 +128,7 @@ function Apply({ site, map, dry, idempotency, onAgain, onClose }: ApplyProps) {
   const isOld = problem?.status === 412 || problem?.status === 404;
   return (
     <>
-      {diff && <Changes site={site} diff={diff} changes={dry.diff.layers as Record<string, unknown>} />}
+      <Changes map={map} diff={diff} changes={dry.diff.layers as Record<string, unknown>} />
       {problem && <Problem error={problem} />}
       <div class="actions">
         {isOld && (

@@ -1,18 +1,18 @@
 /** Changes as a list that mirrors the map: groups, and in them each feature. */
 import { useState } from "preact/hooks";
 import { go } from "../../address";
-import { nameOf } from "../../map/features";
+import { type Change, stateOf } from "../../map/changes";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { count } from "../../ui/text";
-import { type ChangeGroup, type FeatureChange, groupsOf, groupText } from "./changes";
+import { type ChangeGroup, groupsOf, groupText } from "./changes";
 
 const SHOWN = 60;
 
 interface Props {
   site: Site;
   map: SiteMap;
-  changes: readonly FeatureChange[];
+  changes: readonly Change[];
   label: string;
 }
 
@@ -42,8 +42,8 @@ function GroupRow({ site, map, group }: { site: Site; map: SiteMap; group: Chang
           {group.changes.slice(0, SHOWN).map((change) => (
             <li key={change.key}>
               <button type="button" class="row" onClick={() => reveal(site, map, change)}>
-                <span class="grow">{nameOf(change.feature)}</span>
-                <small>{change.feature.level !== site.level.value ? change.feature.level : change.feature.id}</small>
+                <span class="grow">{change.name}</span>
+                <small>{change.level !== site.level.value ? change.level : change.id}</small>
               </button>
             </li>
           ))}
@@ -54,7 +54,9 @@ function GroupRow({ site, map, group }: { site: Site; map: SiteMap; group: Chang
   );
 }
 
-function reveal(site: Site, map: SiteMap, { feature }: FeatureChange): void {
+function reveal(site: Site, map: SiteMap, change: Change): void {
+  const feature = stateOf(change, "after") ?? stateOf(change, "before");
+  if (!feature) return;
   if (feature.level !== site.level.peek()) go({ level: feature.level }, { replace: true });
   map.selected.value = feature;
   map.reveal(feature);

@@ -1,60 +1,21 @@
-/** Changed features, as differences and losses come: read, grouped and counted. Pure but for the drawing's colours. */
-import { type Feature, fromWire, type LayerName, type WireFeature } from "../../map/features";
-
-export type Change = "added" | "changed" | "deleted";
-
-export interface FeatureChange {
-  key: string;
-  feature: Feature;
-  /** Its shape before, if that is another. */
-  before: Feature | null;
-  change: Change;
-  kind: string;
-  fields: string[];
-}
-
-interface ChangeProperties {
-  layer: string;
-  kind: string;
-  change: Change;
-  before: Record<string, unknown> | null;
-  after: Record<string, unknown> | null;
-  before_geometry: Feature["geometry"] | null;
-  fields: string[];
-}
-
-export function fromChange(wire: WireFeature): FeatureChange | null {
-  const properties = wire.properties as unknown as ChangeProperties;
-  const shown = properties.change === "deleted" ? properties.before : properties.after;
-  const feature = fromWire(properties.layer as LayerName, { ...wire, properties: shown ?? properties.before });
-  if (!feature) return null;
-  const { before_geometry: geometry, change, kind, fields } = properties;
-  return {
-    key: [properties.layer, feature.level, feature.part, feature.id].join("/"),
-    feature,
-    before: geometry ? { ...feature, geometry } : null,
-    change,
-    kind,
-    fields,
-  };
-}
+/** Groups of changed features. No DOM. */
+import type { Change, ChangeKind } from "../../map/changes";
 
 export interface ChangeGroup {
   key: string;
-  change: Change;
-  layer: string;
+  change: ChangeKind;
   kind: string;
   fields: string[];
-  changes: FeatureChange[];
+  changes: Change[];
 }
 
 /** Groups what has the same kind and fares the same, the biggest first. */
-export function groupsOf(changes: readonly FeatureChange[]): ChangeGroup[] {
+export function groupsOf(changes: readonly Change[]): ChangeGroup[] {
   const groups = new Map<string, ChangeGroup>();
   for (const one of changes) {
-    const { change, kind, fields, feature } = one;
-    const key = [change, feature.layer, kind, ...fields].join(" ");
-    const group = groups.get(key) ?? { key, change, layer: feature.layer, kind, fields, changes: [] };
+    const { change, kind, fields, layer } = one;
+    const key = [change, layer, kind, ...fields].join(" ");
+    const group = groups.get(key) ?? { key, change, kind, fields, changes: [] };
     groups.set(key, group);
     group.changes.push(one);
   }

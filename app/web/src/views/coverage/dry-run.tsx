@@ -3,7 +3,8 @@ import { useEffect, useState } from "preact/hooks";
 import { go, param } from "../../address";
 import { type ApiError, apiPath, asApiError, type DryRun, requestJson, type Version } from "../../api/client";
 import { useLoaded } from "../../api/loaded";
-import type { WireFeature } from "../../map/features";
+import { useChangeLayer } from "../../map/change-layer";
+import { loadComparison } from "../../map/changes";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { Button } from "../../ui/button";
@@ -11,12 +12,6 @@ import { Findings, Problem, Show } from "../../ui/states";
 import { notify } from "../../ui/toast";
 import { ChangeList } from "./change-list";
 import { changeLines } from "./change-summary";
-import { type FeatureChange, fromChange } from "./changes";
-import { useChangesOnMap } from "./changes-layer";
-
-const PAGE = 5000;
-const MAX_CHANGES = 20_000;
-const NONE: FeatureChange[] = [];
 
 interface Props {
   site: Site;
@@ -31,9 +26,8 @@ export function DryRunResult({ site, map, dry, onDrop, onSaved }: Props) {
   const [busy, setBusy] = useState(false);
   const [problem, setProblem] = useState<ApiError | null>(null);
   useVersionOnMap(dry, side);
-  const diff = useLoaded((signal) => loadChanges(site, dry, signal), [dry.id]);
-  const changes = (side === "after" && diff.data) || NONE;
-  useChangesOnMap(site, map, changes);
+  const diff = useLoaded((signal) => loadComparison(site, String(dry.parent), dry.id, signal), [dry.id]);
+  useChangeLayer(map, diff.data?.changes, diff.data, side === "after");
   const save = async () => {
     setBusy(true);
     setProblem(null);
@@ -76,7 +70,9 @@ export function DryRunResult({ site, map, dry, onDrop, onSaved }: Props) {
         </details>
       )}
       <Show of={diff}>
-        {(list) => (list.length ? <ChangeList site={site} map={map} changes={list} label="Changes" /> : null)}
+        {({ changes }) =>
+          changes.length ? <ChangeList site={site} map={map} changes={changes} label="Changes" /> : null
+        }
       </Show>
       {problem && <Problem error={problem} retry={() => void save()} />}
       <div class="actions">
@@ -105,18 +101,4 @@ function useVersionOnMap(dry: DryRun, side: "before" | "after"): void {
     },
     [dry.id, prior],
   );
-}
-
-async function loadChanges(site: Site, dry: DryRun, signal: AbortSignal): Promise<FeatureChange[]> {
-  const out: FeatureChange[] = [];
-  let cursor: string | undefined;
-  do {
-    const query = { from: dry.parent, to: dry.id, format: "geojson", crs: "local", limit: PAGE, cursor };
-    const page = await requestJson<{ features: WireFeature[]; next?: string }>(apiPath(site.path("diff"), query), {
-      signal,
-    });
-    out.push(...page.features.map(fromChange).filter((one) => one !== null));
-    cursor = page.next;
-  } while (cursor && out.length < MAX_CHANGES);
-  return out;
 }

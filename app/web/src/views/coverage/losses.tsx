@@ -1,22 +1,17 @@
 /** What a format would lose of this version: on the map, and as a list. */
 import { useEffect, useMemo, useRef, useState } from "preact/hooks";
-import { apiPath } from "../../api/client";
+import { apiPath, type Schemas } from "../../api/client";
 import { type Job, requestWithJob } from "../../api/jobs";
 import { useLoaded } from "../../api/loaded";
-import type { WireFeature } from "../../map/features";
+import { useChangeLayer } from "../../map/change-layer";
+import { type Changes, readChanges } from "../../map/changes";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { JobProgress } from "../../ui/job-progress";
 import { Show } from "../../ui/states";
 import { count } from "../../ui/text";
 import { ChangeList } from "./change-list";
-import { type FeatureChange, fromChange } from "./changes";
-import { useChangesOnMap } from "./changes-layer";
 import type { TableRow } from "./table";
-
-const PAGE = 5000;
-/** Features above which the rest is only counted. */
-const MAX_LOSSES = 20_000;
 
 interface Dropped {
   what: string;
@@ -24,21 +19,12 @@ interface Dropped {
   why: string;
 }
 
-interface Answer {
-  features: WireFeature[];
-  next?: string;
-  numberMatched?: number;
-  report: { read: boolean; dropped: Dropped[] };
-}
-
-interface Losses {
-  changes: FeatureChange[];
-  total: number;
+interface Report {
   read: boolean;
   dropped: Dropped[];
 }
 
-const NONE: FeatureChange[] = [];
+type Losses = Changes & Report;
 
 export function LossesPart({ site, map, row }: { site: Site; map: SiteMap; row: TableRow }) {
   const [job, setJob] = useState<Job | null>(null);
@@ -51,8 +37,7 @@ export function LossesPart({ site, map, row }: { site: Site; map: SiteMap; row: 
     },
     [site.name, site.exact, row.id],
   );
-  const changes = losses.data?.changes ?? NONE;
-  useChangesOnMap(site, map, changes);
+  useChangeLayer(map, losses.data?.changes);
   useEffect(() => () => void (map.selected.value = null), [map]);
   if (cancelled) return <p class="muted">Cancelled. Switch it off and on to start again.</p>;
   return (
@@ -75,7 +60,7 @@ export function LossesPart({ site, map, row }: { site: Site; map: SiteMap; row: 
 function LossesFound({ site, map, row, losses }: { site: Site; map: SiteMap; row: TableRow; losses: Losses }) {
   const { changes, total, read, dropped } = losses;
   const [inside, outside] = useMemo(() => {
-    const carried = changes.filter(({ feature }) => row.format.information[feature.layer] === "raw");
+    const carried = changes.filter(({ layer }) => row.format.information[layer] === "raw");
     return [carried, changes.filter((one) => !carried.includes(one))];
   }, [changes, row]);
   if (!total && !dropped.length) {
@@ -134,16 +119,12 @@ async function loadLosses(
   signal: AbortSignal,
   onJob: (job: Job | null) => void,
 ): Promise<Losses> {
-  const changes: FeatureChange[] = [];
-  let cursor: string | undefined;
-  for (;;) {
-    const query = { format, crs: "local", limit: PAGE, cursor };
-    const path = apiPath(site.path("versions", site.exact, "losses"), query);
-    const answer = (await (await requestWithJob(path, { signal, onJob })).json()) as Answer;
-    changes.push(...answer.features.map(fromChange).filter((one) => one !== null));
-    cursor = answer.next;
-    if (!cursor || changes.length >= MAX_LOSSES) {
-      return { changes, total: answer.numberMatched ?? changes.length, ...answer.report };
-    }
-  }
+  let report: Report = { read: true, dropped: [] };
+  const changes = await readChanges(async (query) => {
+    const path = apiPath(site.path("versions", site.exact, "losses"), { format, ...query });
+    const answer: Schemas["LossesOut"] = await (await requestWithJob(path, { signal, onJob })).json();
+    report = answer.report;
+    return answer;
+  });
+  return { ...changes, ...report };
 }

@@ -7,7 +7,9 @@ import { Button } from "../../ui/button";
 import { Empty } from "../../ui/states";
 import { count, Time } from "../../ui/text";
 import { attempt, notify } from "../../ui/toast";
-import { type Closure, closuresOf, type Decision, decide, geometryOf } from "./closures";
+import { type Closure, closuresOf, type Decision, decide, geometryOf, moveEnd } from "./closures";
+import { type End, EndFields } from "./end-fields";
+import { endOf } from "./ends";
 import type { FleetMap } from "./fleet-map";
 import { NewClosureForm } from "./new-closure";
 import { clock, convergence, remaining } from "./status";
@@ -211,6 +213,7 @@ function Actions({ closure, store, isChosen }: { closure: Closure; store: FleetS
     if (!done) return store.load();
     keepFocus(closure);
     const version = decision === "keep" ? done.at(-1)?.version : null;
+    if (decision === "accept") go({ closure: closure.id, robot: null }); // where its end can be changed
     const more = version ? ` in v${version}: promote it before the closure ends` : "";
     notify(`${DONE[decision]}: ${closure.title}${more}.`, {
       ...(version ? { action: { label: "History", run: () => go({ view: "history" }) } } : {}),
@@ -231,11 +234,38 @@ function Actions({ closure, store, isChosen }: { closure: Closure; store: FleetS
   }
   if (closure.state !== "accepted" || !isChosen) return null;
   return (
-    <div class="actions">
-      {button("end", "End now")}
-      {!closure.first.version &&
-        button("keep", "Make permanent", { label: "Creates a version in which it is blocked for good" })}
-    </div>
+    <>
+      <NewEnd key={closure.first.expires} closure={closure} store={store} />
+      <div class="actions">
+        {button("end", "End now")}
+        {!closure.first.version &&
+          button("keep", "Make permanent", { label: "Creates a version in which it is blocked for good" })}
+      </div>
+    </>
+  );
+}
+
+/** Another end for a closure in force. */
+function NewEnd({ closure, store }: { closure: Closure; store: FleetStore }) {
+  const [end, setEnd] = useState<End>({ choice: "60", until: "" });
+  const [busy, setBusy] = useState(false);
+  const submit = async (event: Event) => {
+    event.preventDefault();
+    setBusy(true);
+    const expires = endOf(end.choice, end.until, new Date());
+    const isDone = await attempt(() => moveEnd(store, closure, expires).then(() => true));
+    setBusy(false);
+    if (!isDone) return store.load();
+    keepFocus(closure);
+    notify(`${closure.title} is closed until ${clock(expires)}.`);
+  };
+  return (
+    <form class="new-end" aria-label="Change the end" onSubmit={submit}>
+      <EndFields end={end} onChange={setEnd} />
+      <Button type="submit" busy={busy}>
+        Change the end
+      </Button>
+    </form>
   );
 }
 

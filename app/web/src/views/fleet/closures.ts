@@ -1,6 +1,6 @@
 /** Closures: both directions of a street as one, what they are called, where they are, which were in force. No DOM. */
 import { batch } from "@preact/signals";
-import { apiPath, request, requestJson } from "../../api/client";
+import { api, apiPath, ask, request, requestJson } from "../../api/client";
 import type { Feature, Geometry } from "../../map/features";
 import { nameOf } from "../../map/features";
 import type { Frame } from "../../map/frame";
@@ -141,6 +141,18 @@ export async function decide(store: FleetStore, closure: Closure, decision: Deci
     for (const overlay of out) store.putOverlay(overlay);
   });
   return out;
+}
+
+/** Changes when a closure ends, in all its directions. Throws ApiError. */
+export async function moveEnd(store: FleetStore, closure: Closure, expires: string): Promise<void> {
+  const out: Overlay[] = [];
+  for (const { id } of closure.overlays) {
+    const params = { path: { env: store.site.name, id } };
+    out.push(await ask(api.PATCH("/api/v1/environments/{env}/overlays/{id}", { params, body: { expires } })));
+  }
+  batch(() => {
+    for (const overlay of out) store.putOverlay(overlay);
+  });
 }
 
 export interface NewClosure {

@@ -10,7 +10,8 @@ import { Button } from "../../ui/button";
 import { attempt, notify } from "../../ui/toast";
 import { isTyping } from "../site-view";
 import { close, endsOf, reverseOf } from "./closures";
-import { END_CHOICES, type EndChoice, endOf } from "./ends";
+import { type End, EndFields } from "./end-fields";
+import { endOf } from "./ends";
 import { type FleetMap, isEdge } from "./fleet-map";
 import type { FleetStore } from "./store";
 import type { Overlay } from "./types";
@@ -27,8 +28,7 @@ export function NewClosureForm({ store, fleetMap, kind }: FormProps) {
   const [corners, setCorners] = useState<Position[]>([]);
   const [bothWays, setBothWays] = useState(true);
   const [detail, setDetail] = useState("");
-  const [end, setEnd] = useState<EndChoice>("60");
-  const [until, setUntil] = useState("");
+  const [end, setEnd] = useState<End>({ choice: "60", until: "" });
   const [busy, setBusy] = useState(false);
   const done = useRef(new Map<string, Overlay>());
   const features = store.site.features.value;
@@ -59,7 +59,7 @@ export function NewClosureForm({ store, fleetMap, kind }: FormProps) {
   const submit = async (event: Event) => {
     event.preventDefault();
     setBusy(true);
-    const expires = endOf(end, until, new Date());
+    const expires = endOf(end.choice, end.until, new Date());
     const wanted = isArea ? { polygon: polygonOf(corners), level } : { edges: edges.map(({ id }) => id) };
     const made = await attempt(() => close(store, { ...wanted, detail: detail.trim(), expires, done: done.current }));
     setBusy(false);
@@ -85,27 +85,7 @@ export function NewClosureForm({ store, fleetMap, kind }: FormProps) {
           onInput={(event) => setDetail(event.currentTarget.value)}
         />
       </label>
-      <label class="field">
-        <span>Until</span>
-        <select value={end} onChange={(event) => setEnd(event.currentTarget.value as EndChoice)}>
-          {END_CHOICES.map(([value, name]) => (
-            <option key={value} value={value}>
-              {name}
-            </option>
-          ))}
-        </select>
-      </label>
-      {end === "until" && (
-        <label class="field">
-          <span>End</span>
-          <input
-            type="datetime-local"
-            required
-            value={until}
-            onInput={(event) => setUntil(event.currentTarget.value)}
-          />
-        </label>
-      )}
+      <EndFields end={end} onChange={setEnd} />
       <div class="actions">
         <Button type="submit" main disabled={!isReady} busy={busy}>
           Close for all robots

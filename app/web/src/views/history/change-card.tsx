@@ -3,6 +3,7 @@ import { RotateCcw, X } from "lucide-preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { go } from "../../address";
 import { type ApiError, asApiError, requestJson, apiPath, type Version } from "../../api/client";
+import type { Change, Comparison } from "../../map/changes";
 import { can } from "../../session";
 import type { Site } from "../../site";
 import { Button } from "../../ui/button";
@@ -10,8 +11,7 @@ import { Problem } from "../../ui/states";
 import { count } from "../../ui/text";
 import { notify } from "../../ui/toast";
 import { Sign } from "./change-list";
-import { type Change, restoreEdits, undoneWith, valueRows } from "./changes";
-import type { Comparison } from "./loads";
+import { restoreEdits, undoneWith, valueRows } from "./changes";
 import { refName } from "./words";
 
 interface Props {

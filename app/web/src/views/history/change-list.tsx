@@ -2,16 +2,15 @@
 import { Crosshair } from "lucide-preact";
 import type { ComponentChildren } from "preact";
 import { useState } from "preact/hooks";
+import { type Change, type ChangeKind, type Comparison, gridsOf, KINDS } from "../../map/changes";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
-import { theme } from "../../theme";
 import { Button } from "../../ui/button";
+import { ChangeLegend } from "../../ui/change-legend";
 import { SearchField } from "../../ui/search-field";
 import { Empty } from "../../ui/states";
 import { count } from "../../ui/text";
-import { cellWords, WORDS } from "./cells";
-import { type Change, type ChangeKind, type Group, groupsOf, KINDS } from "./changes";
-import type { Comparison } from "./loads";
+import { type Group, groupsOf } from "./changes";
 import { cellsInWords, changesInWords } from "./words";
 
 const SHOWN = 100;
@@ -155,32 +154,10 @@ function Grids({ map, comparison, cells, onCells }: Props) {
             <input type="checkbox" checked={cells} onChange={(event) => onCells(event.currentTarget.checked)} />
             Draw changed cells
           </label>
-          {cells && <CellLegend grids={grids.map(([, grid]) => grid)} />}
+          {cells && <ChangeLegend grids={gridsOf(comparison)} />}
         </>
       )}
     </section>
-  );
-}
-
-function CellLegend({ grids }: { grids: Record<string, unknown>[] }) {
-  const shown = theme.value;
-  const words = WORDS.filter((word) => grids.some((grid) => Number(grid[word.count]) > 0));
-  return (
-    <div class="legend">
-      <ul aria-label="Colours of cells">
-        {words.map(({ value, title }) => (
-          <li key={value}>
-            <i
-              class="key"
-              ref={(element) => {
-                if (element) element.style.background = cellWords.css(value, shown);
-              }}
-            />{" "}
-            {title}
-          </li>
-        ))}
-      </ul>
-    </div>
   );
 }
 

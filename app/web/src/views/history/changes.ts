@@ -1,59 +1,9 @@
 /** Changed features of two versions: lists, search, both states, and edits that restore. No DOM. */
 import type { Schemas } from "../../api/client";
-import type { Feature, Geometry, LayerName } from "../../map/features";
+import type { Change, ChangeKind } from "../../map/changes";
+import type { Geometry, LayerName } from "../../map/features";
 
-export type WireChange = Schemas["FeatureChangeOut"];
-export type ChangeKind = "added" | "changed" | "deleted";
 export type Edit = Schemas["EditsBody"]["changes"][number];
-
-export interface Change {
-  /** Unique in a comparison: layer, level, part and id. */
-  key: string;
-  id: string;
-  name: string;
-  layer: LayerName;
-  kind: string;
-  change: ChangeKind;
-  level: string;
-  part: string;
-  before: Record<string, unknown> | null;
-  after: Record<string, unknown> | null;
-  beforeGeometry: Geometry | null;
-  afterGeometry: Geometry | null;
-  fields: string[];
-}
-
-export const KINDS: ChangeKind[] = ["added", "changed", "deleted"];
-
-export function changeOf(wire: WireChange): Change {
-  const { layer, change, before, after, before_geometry, fields, kind } = wire.properties;
-  const geometry = (wire.place ?? wire.geometry ?? null) as Geometry | null;
-  const old = (before_geometry ?? null) as Geometry | null;
-  const name = (after ?? before)?.name;
-  return {
-    key: [layer, wire.level, wire.part, wire.id].join("/"),
-    id: wire.id,
-    name: typeof name === "string" && name ? name : wire.id,
-    layer,
-    kind: kind ?? layer,
-    change,
-    level: wire.level,
-    part: wire.part,
-    before: (before ?? null) as Change["before"],
-    after: (after ?? null) as Change["after"],
-    beforeGeometry: change === "added" ? null : (old ?? geometry),
-    afterGeometry: change === "deleted" ? null : geometry,
-    fields,
-  };
-}
-
-/** Returns the feature as it was or is, to be drawn; null if there is none. */
-export function stateOf(change: Change, when: "before" | "after"): Feature | null {
-  const geometry = when === "before" ? change.beforeGeometry : change.afterGeometry;
-  if (!geometry) return null;
-  const { id, layer, level, part, name, kind } = change;
-  return { id, layer, level, part, geometry, properties: { name, kind, change: change.change, key: change.key } };
-}
 
 export interface Group {
   title: string;

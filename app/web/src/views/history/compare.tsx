@@ -4,6 +4,7 @@ import { useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { go, param } from "../../address";
 import { type DryRun, online } from "../../api/client";
 import { useLoaded } from "../../api/loaded";
+import { boxOfChanges, type Change, type ChangeKind, type Comparison, KINDS, loadComparison } from "../../map/changes";
 import { can } from "../../session";
 import type { Site } from "../../site";
 import { theme } from "../../theme";
@@ -14,9 +15,9 @@ import { attempt, notify } from "../../ui/toast";
 import type { ViewProps } from "../registry";
 import { ChangeCard } from "./change-card";
 import { ChangeList } from "./change-list";
-import { type Change, type ChangeKind, filterChanges, KINDS } from "./changes";
+import { filterChanges } from "./changes";
 import { CompareMap, type Mode } from "./compare-map";
-import { type Comparison, loadComparison, MAX_CHANGES, type Versions } from "./loads";
+import type { Versions } from "./loads";
 import { BlinkControl, ModeChoice, Swipe, useBlink } from "./modes";
 import { RestoreDialog, commitRun } from "./restore-dialog";
 import { Tracks } from "./tracks";
@@ -83,14 +84,14 @@ function Compared({ site, map, comparison }: ViewProps & { comparison: Compariso
   const key = param("change");
   const chosen = comparison.changes.find((change) => change.key === key) ?? null;
   const view = useCompareMap({ map });
-  useEffect(() => view.current?.show(comparison, changes, level), [comparison, changes, level]);
-  useEffect(() => view.current?.setMode(mode, share, blink.phase, cells), [mode, share, blink.phase, cells]);
+  useEffect(() => view.current?.show(comparison, changes, level, mode), [comparison, changes, level, mode]);
+  useEffect(() => view.current?.set(share, blink.phase, cells), [share, blink.phase, cells]);
   useEffect(() => view.current?.choose(chosen?.level === level ? chosen : null), [chosen, level]);
   useEffect(() => view.current?.repaint(), [theme.value]);
   useFirstFit(map, comparison);
   const choose = (change: Change | null) => {
     go({ change: change?.key ?? null, ...(change && { level: change.level }) }, { replace: true });
-    const box = change && CompareMap.boxOf([change]);
+    const box = change && boxOfChanges([change]);
     if (box) map.fit([box[0] - 4, box[1] - 4, box[2] + 4, box[3] + 4]);
   };
   const card = chosen && (
@@ -127,7 +128,8 @@ function Compared({ site, map, comparison }: ViewProps & { comparison: Compariso
       />
       {comparison.total > comparison.changes.length && (
         <p class="note" role="note">
-          {count(comparison.total, "feature")} changed: the first {count(MAX_CHANGES, "is", "are")} listed and drawn.
+          {count(comparison.total, "feature")} changed: the first {count(comparison.changes.length, "is", "are")} listed
+          and drawn.
         </p>
       )}
     </div>
@@ -164,7 +166,7 @@ function useFirstFit(map: ViewProps["map"], comparison: Comparison): void {
     const isFirst = done.current === "";
     done.current = key;
     const own = comparison.changes.filter((change) => change.level === map.site.level.peek());
-    const box = CompareMap.boxOf(own);
+    const box = boxOfChanges(own);
     if (!box || (isFirst && param("change"))) return;
     const [a = 0, b = 0, c = 0, d = 0] = map.map.getView().calculateExtent(map.map.getSize());
     const isSeen = box[0] < c && box[2] > a && box[1] < d && box[3] > b;

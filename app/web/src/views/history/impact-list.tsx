@@ -1,10 +1,9 @@
 /** What robots lose by a change, as a list: each entry zooms the map to its place. */
 import type { Schemas } from "../../api/client";
 import type { SiteMap } from "../../map/site-map";
+import { boxOfChanges, type Change } from "../../map/changes";
 import type { Site } from "../../site";
 import { count } from "../../ui/text";
-import type { Change } from "./changes";
-import { CompareMap } from "./compare-map";
 import { robotPlace } from "./impact-map";
 
 type Impact = Schemas["ImpactOut"];
@@ -30,7 +29,7 @@ export function ImpactList({ site, map, impact, changes, channel }: Props) {
     const now = known.find((feature) => feature.id === id && feature.layer === "topology");
     const was = changes.find((change) => change.id === id && change.layer === "topology");
     if (now) map.fitFeatures([now]);
-    else if (was) map.fit(CompareMap.boxOf([was]));
+    else if (was) map.fit(boxOfChanges([was]));
   };
   const { edges, nodes, docks, parts } = impact;
   const isNothing = ![edges.deleted, edges.blocked, edges.turned, nodes.deleted, nodes.moved, docks, parts].some(

@@ -4,7 +4,7 @@ import type { FeatureLayer } from "../../map/feature-layer";
 import { centreOf, type Feature, type Geometry, type Position } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
 import { colour } from "../../theme";
-import { type Change, stateOf } from "./changes";
+import { type Change, stateOf } from "../../map/changes";
 
 type Impact = Schemas["ImpactOut"];
 

@@ -1,28 +1,22 @@
 /** Loading of history, comparisons and impact. */
 import { useEffect, useState } from "preact/hooks";
 import {
-  api,
   ApiError,
   apiPath,
-  ask,
   type Channel,
   isAbort,
-  type LayerPart,
   request,
   requestJson,
   type Schemas,
   type Version,
 } from "../../api/client";
 import { type Loaded, useLoaded } from "../../api/loaded";
+import { type Change, loadChanges } from "../../map/changes";
 import type { Site } from "../../site";
 import { attempt } from "../../ui/toast";
-import { type Change, changeOf, type WireChange } from "./changes";
 import { earlierVersion } from "./earlier";
 
 const PAGE = 50;
-const FEATURE_PAGE = 5000;
-/** Changed features above which the rest is only counted. */
-export const MAX_CHANGES = 20_000;
 
 interface VersionPage {
   versions: Version[];
@@ -73,75 +67,6 @@ export function useVersions(site: Site): Versions {
     more: next ? () => void more(next) : null,
     loadingMore,
   };
-}
-
-export interface Comparison {
-  from: string;
-  to: string;
-  changes: Change[];
-  /** Number of changed features, of which at most MAX_CHANGES are loaded. */
-  total: number;
-  layers: Record<string, Record<string, unknown>>;
-  rasters: RasterChange[];
-}
-
-export interface RasterChange {
-  layer: "occupancy" | "imagery" | "voxels";
-  name: string;
-  level: string;
-  before: LayerPart | null;
-  after: LayerPart | null;
-}
-
-export async function loadComparison(site: Site, from: string, to: string, signal: AbortSignal): Promise<Comparison> {
-  const query = { from, to };
-  const at = (v: string) =>
-    api.GET("/api/v1/environments/{env}/versions/{v}/layers", { params: { path: { env: site.name, v } }, signal });
-  const [diff, before, after, features] = await Promise.all([
-    requestJson<Schemas["DiffOut"]>(apiPath(site.path("diff"), query), { signal }),
-    ask(at(from)),
-    ask(at(to)),
-    loadChanges(site, from, to, signal),
-  ]);
-  return {
-    from,
-    to,
-    changes: features.changes,
-    total: features.total,
-    layers: diff.layers as Comparison["layers"],
-    rasters: rasterChanges(before as LayerPart[], after as LayerPart[]),
-  };
-}
-
-export async function loadChanges(site: Site, from: string, to: string, signal: AbortSignal) {
-  const wires: WireChange[] = [];
-  let cursor: string | null = null;
-  let total = 0;
-  do {
-    const query = { from, to, format: "geojson", crs: "local", limit: FEATURE_PAGE, cursor };
-    const page: Schemas["DiffFeaturesOut"] = await requestJson(apiPath(site.path("diff"), query), { signal });
-    wires.push(...page.features);
-    total = page.numberMatched ?? wires.length;
-    cursor = page.next ?? null;
-  } while (cursor && wires.length < MAX_CHANGES);
-  return { changes: wires.map(changeOf), total };
-}
-
-function rasterChanges(before: LayerPart[], after: LayerPart[]): RasterChange[] {
-  const out = new Map<string, RasterChange>();
-  for (const [when, parts] of [
-    ["before", before],
-    ["after", after],
-  ] as const) {
-    for (const part of parts) {
-      if (part.layer !== "occupancy" && part.layer !== "imagery" && part.layer !== "voxels") continue;
-      const key = [part.layer, part.level, part.name].join("/");
-      const { layer, name, level } = part;
-      const change = out.get(key) ?? { layer, name, level, before: null, after: null };
-      out.set(key, { ...change, [when]: part });
-    }
-  }
-  return [...out.values()].filter(({ before: old, after: now }) => old?.hash !== now?.hash);
 }
 
 /** The version that a channel had before its present one; null if it had none, undefined while it is sought. */

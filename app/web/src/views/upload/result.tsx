@@ -3,13 +3,16 @@ import { Crosshair, Eye, EyeOff, RefreshCw } from "lucide-preact";
 import { useEffect, useRef, useState } from "preact/hooks";
 import { go } from "../../address";
 import type { DryRun, Version } from "../../api/client";
+import { type Loaded, useLoaded } from "../../api/loaded";
 import { checksOf } from "../../checks";
-import { DiffLayer } from "../../map/diff-layer";
+import { useChangeLayer } from "../../map/change-layer";
+import { boxOfChanges, type Comparison, gridsOf, loadComparison } from "../../map/changes";
+import { joinBoxes } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { Button } from "../../ui/button";
-import { DiffLegend } from "../../ui/diff-legend";
-import { Bars, Findings, Problem } from "../../ui/states";
+import { ChangeLegend } from "../../ui/change-legend";
+import { Findings, Show } from "../../ui/states";
 import { count, Time } from "../../ui/text";
 import type { Desk } from "./desk";
 import { featureLines, gridLine, otherLines } from "./words";
@@ -20,27 +23,51 @@ interface Props {
   dry: DryRun;
 }
 
-/** Draws what would change while the component is there. */
-export function useDiff(map: SiteMap, from: number | string, to: string): DiffLayer | null {
-  const [diff, setDiff] = useState<DiffLayer | null>(null);
+/** What differs between two versions, drawn while the component is there and not switched off. */
+export interface Diff {
+  of: Loaded<Comparison>;
+  isVisible: boolean;
+  setVisible: (isVisible: boolean) => void;
+}
+
+export function useDiff(map: SiteMap, from: number, to: string): Diff {
+  const { site } = map;
+  const of = useLoaded((signal) => loadComparison(site, String(from), to, signal), [site.name, from, to]);
+  const [isVisible, setVisible] = useState(true);
+  useChangeLayer(map, of.data?.changes, of.data, isVisible);
   useEffect(() => {
-    const layer = new DiffLayer(map, { from, to });
-    setDiff(layer);
-    void layer.done.then(() => showChanges(layer));
-    return () => layer.close();
-  }, [map, from, to]);
-  return diff;
+    if (of.data) showChanges(map, of.data);
+  }, [of.data]);
+  return { of, isVisible, setVisible };
 }
 
 /** Shows the changes; if the level has none, the level that has most. */
-function showChanges(layer: DiffLayer): void {
+function showChanges(map: SiteMap, comparison: Comparison): void {
+  const counts = countByLevel(comparison);
+  const fullest = [...counts].sort((one, other) => other[1] - one[1])[0]?.[0];
+  const level = map.site.level.peek();
+  if (fullest !== undefined && !counts.has(level)) go({ level: fullest }, { replace: true });
+  fit(map, comparison);
+}
+
+function countByLevel(comparison: Comparison): Map<string, number> {
   const counts = new Map<string, number>();
-  for (const { level } of [...layer.features.peek(), ...layer.grids.peek()]) {
+  for (const { level } of [...comparison.changes, ...gridsOf(comparison)]) {
     counts.set(level, (counts.get(level) ?? 0) + 1);
   }
-  const fullest = [...counts].sort((one, other) => other[1] - one[1])[0]?.[0];
-  if (fullest !== undefined && !counts.has(layer.level.peek())) go({ level: fullest }, { replace: true });
-  layer.fit();
+  return counts;
+}
+
+/** Moves the map to all that differs on the level shown. */
+function fit(map: SiteMap, comparison: Comparison): void {
+  const here = ({ level }: { level: string }) => level === map.site.level.peek();
+  const boxes = [
+    boxOfChanges(comparison.changes.filter(here)),
+    ...gridsOf(comparison)
+      .filter(here)
+      .map(({ bbox }) => bbox),
+  ];
+  map.fit(joinBoxes(boxes.filter((box) => box !== null)));
 }
 
 export function Result({ site, map, dry }: Props) {
@@ -59,7 +86,7 @@ export function Result({ site, map, dry }: Props) {
           sources.
         </p>
       ) : (
-        diff && <Changes site={site} diff={diff} changes={dry.diff.layers as Record<string, unknown>} />
+        <Changes map={map} diff={diff} changes={dry.diff.layers as Record<string, unknown>} />
       )}
       <ResultChecks site={site} dry={dry} />
       {dry.warnings.length > 0 && (
@@ -96,21 +123,14 @@ function ResultChecks({ site, dry }: { site: Site; dry: DryRun }) {
 }
 
 interface ChangesProps {
-  site: Site;
-  diff: DiffLayer;
+  map: SiteMap;
+  diff: Diff;
   changes: Record<string, unknown>;
 }
 
 /** Changes in words, by level, with the legend of their drawing. */
-export function Changes({ site, diff, changes }: ChangesProps) {
-  const level = site.level.value;
-  const features = diff.features.value;
-  const grids = diff.grids.value;
-  const lines = featureLines(features);
-  const elsewhere = new Map<string, number>();
-  for (const one of [...features, ...grids]) {
-    if (one.level !== level) elsewhere.set(one.level, (elsewhere.get(one.level) ?? 0) + 1);
-  }
+export function Changes({ map, diff, changes }: ChangesProps) {
+  const { of, isVisible, setVisible } = diff;
   return (
     <>
       <header class="changes-head">
@@ -118,17 +138,35 @@ export function Changes({ site, diff, changes }: ChangesProps) {
         <span class="grow" />
         <Button
           quiet
-          icon={diff.visible.value ? Eye : EyeOff}
+          icon={isVisible ? Eye : EyeOff}
           label="Draw the changes on the map"
-          pressed={diff.visible.value}
-          onClick={() => diff.setVisible(!diff.visible.peek())}
+          pressed={isVisible}
+          onClick={() => setVisible(!isVisible)}
         />
-        <Button quiet icon={Crosshair} label="Show all changes on the map" onClick={() => diff.fit()} />
+        <Button
+          quiet
+          icon={Crosshair}
+          label="Show all changes on the map"
+          disabled={!of.data}
+          onClick={() => of.data && fit(map, of.data)}
+        />
       </header>
-      {diff.problem.value && <Problem error={diff.problem.value} />}
-      {diff.loading.value && !lines.length && <Bars />}
+      <Show of={of}>{(comparison) => <Lines map={map} comparison={comparison} changes={changes} />}</Show>
+    </>
+  );
+}
+
+type LinesProps = Pick<ChangesProps, "map" | "changes"> & { comparison: Comparison };
+
+function Lines({ map, comparison, changes }: LinesProps) {
+  const level = map.site.level.value;
+  const grids = gridsOf(comparison);
+  const left = comparison.total - comparison.changes.length;
+  const elsewhere = [...countByLevel(comparison)].filter(([name]) => name !== level);
+  return (
+    <>
       <ul class="changes">
-        {lines.map(({ change, text }) => (
+        {featureLines(comparison.changes).map(({ change, text }) => (
           <li key={text} class={`change ${change}`}>
             {text}
           </li>
@@ -144,19 +182,17 @@ export function Changes({ site, diff, changes }: ChangesProps) {
           </li>
         ))}
       </ul>
-      {diff.left.value > 0 && (
-        <p class="note">Too many changes to draw all: {count(diff.left.value, "feature")} more.</p>
-      )}
-      {elsewhere.size > 0 && (
+      {left > 0 && <p class="note">Too many changes to draw all: {count(left, "feature")} more.</p>}
+      {elsewhere.length > 0 && (
         <div class="actions" role="group" aria-label="Changes on other levels">
-          {[...elsewhere].map(([name, number]) => (
+          {elsewhere.map(([name, number]) => (
             <Button key={name} onClick={() => go({ level: name }, { replace: true })}>
               {count(number, "change")} on {name}
             </Button>
           ))}
         </div>
       )}
-      <DiffLegend hasFeatures={features.length > 0} grids={grids} />
+      <ChangeLegend hasFeatures={comparison.changes.length > 0} grids={grids} />
     </>
   );
 }

@@ -1,13 +1,13 @@
 /** What an upload or an edit changes, in words. */
-import type { Change, DiffFeature, DiffGrid } from "../../map/diff-layer";
+import type { Change, ChangeKind, GridChange } from "../../map/changes";
 import { count } from "../../ui/text";
 
 export interface Line {
-  change: Change;
+  change: ChangeKind;
   text: string;
 }
 
-const VERBS: Change[] = ["deleted", "changed", "added"];
+const VERBS: ChangeKind[] = ["deleted", "changed", "added"];
 const MANY: Record<string, string> = { fence: "fences", zone: "zones", category: "categories", box: "boxes" };
 const LAYERS: Record<string, string> = {
   location: "Fence and datum",
@@ -20,10 +20,10 @@ const LAYERS: Record<string, string> = {
 };
 
 /** Counts features by kind and change, what is deleted first: "3 nodes deleted". */
-export function featureLines(features: readonly DiffFeature[]): Line[] {
+export function featureLines(changes: readonly Change[]): Line[] {
   const counts = new Map<string, number>();
-  for (const { change, properties } of features) {
-    const key = `${change} ${String(properties.kind)}`;
+  for (const { change, kind } of changes) {
+    const key = `${change} ${kind}`;
     counts.set(key, (counts.get(key) ?? 0) + 1);
   }
   return VERBS.flatMap((change) =>
@@ -39,7 +39,7 @@ export function countOf(number: number, kind: string): string {
 }
 
 /** Says which cells of a grid change: "map: 120 cells blocked, 4 freed". */
-export function gridLine({ key, freed, blocked, unknown, other }: DiffGrid): string {
+export function gridLine({ key, freed, blocked, unknown, other }: GridChange): string {
   const parts = [
     blocked && `${count(blocked, "cell")} blocked`,
     freed && `${count(freed, "cell")} freed`,
