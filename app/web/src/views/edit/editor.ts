@@ -96,6 +96,7 @@ export class Editor {
     () => this.groups.value.reduce((sum, { rows }) => sum + rows.length, 0) + this.cells.value.length,
   );
 
+  private readonly isLatest = computed(() => param("version") === "latest");
   private readonly store: DraftStore;
   private readonly stops: (() => void)[] = [];
 
@@ -289,7 +290,7 @@ export class Editor {
     const version = this.site.version.value;
     const features = this.site.features.value;
     const head = this.site.environment.value?.version;
-    if (param("version") !== "latest" || !version || version.version === null || head === undefined) return;
+    if (!this.isLatest.value || !version || version.version === null || head === undefined) return;
     if (version.version !== head) return; // it is being loaded
     if (this.base.peek() === null) void this.start(features, version.version);
     else this.meet(features, version.version, version.author);
