@@ -26,7 +26,7 @@ from app.review.rules import MAX_FINDINGS, RULES, RuleName
 from app.review.worker import check_version
 from app.store.values import Version
 
-RELEASE = 1
+RELEASE = 2
 """Rises with each change of the rules, so that clients do not keep findings of earlier ones."""
 
 MAX_DRAFT = 10_000

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from app.formats.rmf.common import BUILDING
 from app.model.features import Properties, unique_ids
 from app.review.findings import MAX_IDS, Finding, Fix, Site, name_list, point
 from app.review.fixes import Fixer
@@ -125,8 +126,8 @@ def isolated_nodes(site: Site, fixer: Fixer) -> Iterator[Finding]:
 
 
 def is_corner(properties: Properties) -> bool:
-    """Return whether a node has no name: in Open-RMF's buildings the corners of walls are such nodes."""
-    return not properties.get("name")
+    """Return whether a node may be the corner of a wall: in Open-RMF's buildings these are nodes without a name."""
+    return not properties.get("name") and BUILDING in properties
 
 
 def _is_isolated(network: Network) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -165,8 +165,11 @@ def test_blocked_edges_do_not_connect() -> None:
 
 def test_isolated_nodes_and_zero_lengths() -> None:
     assert found(network({**SQUARE, "e": (20.0, 0.0)}))["isolated-node"][0].ids == ("e",)
-    corner = network({**SQUARE, "e": (20.0, 0.0)}, names={"e": ""})
-    assert found(corner) == {}, "a corner of a wall in an Open-RMF building has no name"
+    unnamed = {"kind": "node"}
+    drawn = part("topology", "ground", "drawn", ("f", shapely.Point(20, 0), unnamed))
+    assert found(network(), drawn)["isolated-node"][0].ids == ("f",)
+    corner = part("topology", "ground", "building", ("f", shapely.Point(20, 0), {**unnamed, "openrmf": {"index": 3}}))
+    assert found(network(), corner) == {}, "a corner of a wall in an Open-RMF building has no name"
     result = found(network(edges=[*AROUND, ("a", "a")]))
     assert result["zero-length-edge"][0].ids == ("a-a",)
 

@@ -57,7 +57,6 @@ const FONT = "500 12px system-ui, sans-serif";
 
 export class FeatureLayer extends PaintedLayer {
   private groups = new Map<string, Group>();
-  private features: readonly Feature[] = [];
   /** Paths are float32: they are drawn from here, so that millimetres last. */
   private anchor: [number, number] = [0, 0];
   private hidden = new Set<string>();
@@ -70,8 +69,30 @@ export class FeatureLayer extends PaintedLayer {
   }
 
   setFeatures(features: readonly Feature[]): void {
-    this.features = features;
-    this.build();
+    this.groups = new Map();
+    const first = features[0];
+    this.anchor = first ? centreOf(first.geometry) : [0, 0];
+    this.redo(this.place(features));
+  }
+
+  /** Draws some features no more, and others too: this costs less than setting all anew. */
+  change(removed: ReadonlySet<Feature>, added: readonly Feature[]): void {
+    if (!removed.size && !added.length) return;
+    if (this.isEmpty()) {
+      this.setFeatures(added);
+      return;
+    }
+    const touched = new Set<Chunk>();
+    for (const { chunks } of this.groups.values()) {
+      for (const chunk of removed.size ? chunks : []) {
+        const left = chunk.features.filter((feature) => !removed.has(feature));
+        if (left.length === chunk.features.length) continue;
+        chunk.features = left;
+        touched.add(chunk);
+      }
+    }
+    for (const chunk of this.place(added)) touched.add(chunk);
+    this.redo(touched);
   }
 
   /** Leaves features out, because something else draws them (while they are dragged). */
@@ -79,25 +100,20 @@ export class FeatureLayer extends PaintedLayer {
     const before = this.hidden;
     this.hidden = new Set(ids);
     if (!before.size && !this.hidden.size) return;
-    for (const group of this.groups.values()) {
-      const touched = group.chunks.filter(({ features }) =>
-        features.some(({ id }) => before.has(id) !== this.hidden.has(id)),
-      );
-      for (const chunk of touched) this.trace(chunk);
-      if (touched.length) this.compose(group);
-    }
-    this.repaint();
+    const touched = [...this.groups.values()].flatMap(({ chunks }) =>
+      chunks.filter(({ features }) => features.some(({ id }) => before.has(id) !== this.hidden.has(id))),
+    );
+    this.redo(new Set(touched));
   }
 
   protected override isEmpty(): boolean {
-    return this.groups.size === 0;
+    return [...this.groups.values()].every(({ chunks }) => chunks.every(({ features }) => !features.length));
   }
 
-  private build(): void {
-    this.groups = new Map();
-    const first = this.features[0];
-    this.anchor = first ? centreOf(first.geometry) : [0, 0];
-    for (const feature of this.features) {
+  /** Puts features into the chunks of their classes, and returns these. */
+  private place(features: readonly Feature[]): Set<Chunk> {
+    const touched = new Set<Chunk>();
+    for (const feature of features) {
       const name = this.style.classOf(feature);
       if (!name) continue;
       const group = this.groups.get(name) ?? { ...newPaths(), features: [], chunks: [] };
@@ -108,10 +124,16 @@ export class FeatureLayer extends PaintedLayer {
         group.chunks.push(chunk);
       }
       chunk.features.push(feature);
+      touched.add(chunk);
     }
+    return touched;
+  }
+
+  /** Traces chunks anew. */
+  private redo(touched: ReadonlySet<Chunk>): void {
+    for (const chunk of touched) this.trace(chunk);
     for (const group of this.groups.values()) {
-      for (const chunk of group.chunks) this.trace(chunk);
-      this.compose(group);
+      if (group.chunks.some((chunk) => touched.has(chunk))) this.compose(group);
     }
     this.repaint();
   }
@@ -161,7 +183,7 @@ export class FeatureLayer extends PaintedLayer {
   protected override paint(context: CanvasRenderingContext2D, view: PaintedView): void {
     const pixel = view.resolution; // metres in a CSS pixel
     const paints = this.style.paints();
-    const labels: [Feature, Paint][] = [];
+    const labels: Feature[] = [];
     context.lineJoin = "round";
     for (const [name, paint] of Object.entries(paints)) {
       const group = this.groups.get(name);
@@ -195,7 +217,8 @@ export class FeatureLayer extends PaintedLayer {
         context.stroke(group.dots);
       }
       if (paint.sign) this.drawSigns(context, view, group, paint);
-      if (paint.labels && near) for (const feature of group.features) labels.push([feature, paint]);
+      for (const feature of paint.labels && near ? group.features : [])
+        if (isIn(view.extent, ...centreOf(feature.geometry))) labels.push(feature);
     }
     context.setTransform(1, 0, 0, 1, 0, 0);
     drawLabels(context, view, labels);
@@ -309,8 +332,7 @@ function polygon(context: CanvasRenderingContext2D, x: number, y: number, size: 
 }
 
 /** Writes names beside their features, where they do not cover each other. */
-function drawLabels(context: CanvasRenderingContext2D, view: PaintedView, labels: [Feature, Paint][]): void {
-  const visible = labels.filter(([feature]) => isIn(view.extent, ...centreOf(feature.geometry)));
+function drawLabels(context: CanvasRenderingContext2D, view: PaintedView, visible: readonly Feature[]): void {
   if (visible.length > MAX_LABELS * 4) return;
   const { ratio } = view;
   const taken: Box[] = [];
@@ -320,7 +342,7 @@ function drawLabels(context: CanvasRenderingContext2D, view: PaintedView, labels
   context.lineWidth = 3;
   const halo = getComputedStyle(document.documentElement).getPropertyValue("--map-halo") || "#fff";
   const ink = getComputedStyle(document.documentElement).getPropertyValue("--map-ink") || "#000";
-  for (const [feature] of visible) {
+  for (const feature of visible) {
     if (taken.length >= MAX_LABELS) break;
     const box = boxOf(feature.geometry);
     const anchor = [(box[0] + box[2]) / 2, (box[1] + box[3]) / 2];

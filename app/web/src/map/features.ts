@@ -69,6 +69,7 @@ export function joinBoxes(boxes: Iterable<readonly number[]>): Box | null {
 }
 
 export function centreOf(geometry: Geometry): Position {
+  if (geometry.type === "Point") return [geometry.coordinates[0] ?? 0, geometry.coordinates[1] ?? 0];
   const box = boxOf(geometry);
   return [(box[0] + box[2]) / 2, (box[1] + box[3]) / 2];
 }
@@ -125,23 +126,45 @@ export function nameOf(feature: Feature): string {
   return typeof name === "string" && name ? name : feature.id;
 }
 
+const MAX_CHANGES = 1000;
+
 /** Index of features by place, built when it is first asked: the map is painted before. */
 export class FeatureIndex {
-  private tree: RBush<Feature> | null = null;
-  readonly byId: ReadonlyMap<string, Feature>;
+  private tree: RBush<{ feature: Feature }> | null = null;
+  /** What has changed since the tree was built. */
+  private readonly gone = new Set<Feature>();
+  private readonly added = new Set<Feature>();
+  private readonly ids: Map<string, Feature>;
 
-  constructor(private readonly features: readonly Feature[]) {
-    this.byId = new Map(features.map((feature) => [feature.id, feature]));
+  constructor(private features: readonly Feature[]) {
+    this.ids = new Map(features.map((feature) => [feature.id, feature]));
+  }
+
+  get byId(): ReadonlyMap<string, Feature> {
+    return this.ids;
+  }
+
+  change(removed: Iterable<Feature>, added: Iterable<Feature>): void {
+    for (const feature of removed) {
+      if (!this.added.delete(feature)) this.gone.add(feature);
+      if (this.ids.get(feature.id) === feature) this.ids.delete(feature.id);
+    }
+    for (const feature of added) {
+      if (!this.gone.delete(feature)) this.added.add(feature);
+      this.ids.set(feature.id, feature);
+    }
+    if (this.gone.size + this.added.size < MAX_CHANGES) return;
+    this.features = [...this.features.filter((feature) => !this.gone.has(feature)), ...this.added];
+    this.tree = null;
+    this.gone.clear();
+    this.added.clear();
   }
 
   inBox(box: Box): Feature[] {
-    if (!this.tree) {
-      const boxes = this.features.map((feature) => boxOf(feature.geometry));
-      const isPlaced = (_: unknown, index: number) => Number.isFinite(boxes[index]?.[0]);
-      this.tree = new RBush(12);
-      this.tree.load(boxes.filter(isPlaced), this.features.filter(isPlaced));
-    }
-    return this.tree.getInExtent(box);
+    this.tree ??= treeOf(this.features);
+    const found = this.tree.getInExtent(box).map(({ feature }) => feature);
+    const more = [...this.added].filter((feature) => intersects(boxOf(feature.geometry), box));
+    return [...found.filter((feature) => !this.gone.has(feature)), ...more];
   }
 
   /** Returns the features within `reach` metres of a point, nearest first; points come before lines, areas last. */
@@ -156,6 +179,34 @@ export class FeatureIndex {
     }
     return out.sort((one, other) => one.rank - other.rank).map(({ feature }) => feature);
   }
+}
+
+/** Features are wrapped: OpenLayers puts a number of its own into what it is given. */
+function treeOf(features: readonly Feature[]): RBush<{ feature: Feature }> {
+  const tree = new RBush<{ feature: Feature }>(12);
+  const boxes = features.map((feature) => boxOf(feature.geometry));
+  const isPlaced = (_: unknown, index: number) => Number.isFinite(boxes[index]?.[0]);
+  tree.load(
+    boxes.filter(isPlaced),
+    features.filter(isPlaced).map((feature) => ({ feature })),
+  );
+  return tree;
+}
+
+function intersects(one: Box, other: Box): boolean {
+  return one[0] <= other[2] && one[2] >= other[0] && one[1] <= other[3] && one[3] >= other[1];
+}
+
+/** What has left a list and what has come into it, by identity. */
+export function difference<T>(before: readonly T[], after: readonly T[]): { removed: Set<T>; added: T[] } {
+  const least = Math.min(before.length, after.length);
+  let start = 0;
+  while (start < least && before[start] === after[start]) start += 1;
+  let end = 0;
+  while (end < least - start && before.at(-1 - end) === after.at(-1 - end)) end += 1;
+  const removed = new Set(before.slice(start, before.length - end));
+  const added = after.slice(start, after.length - end).filter((one) => !removed.delete(one));
+  return { removed, added };
 }
 
 /** Distance in metres; 0 inside an area. */

@@ -19,13 +19,25 @@ import type { Site } from "../site";
 import { colour, palette, theme } from "../theme";
 import { baseMap, createBaseLayer, isBaseMapShown, loadBaseMap } from "./base-map";
 import { FeatureLayer, type FeatureStyle } from "./feature-layer";
-import { type Box, boxOf, EMPTY_BOX, type Feature, FeatureIndex, joinBoxes, type Position } from "./features";
+import {
+  type Box,
+  boxOf,
+  difference,
+  EMPTY_BOX,
+  type Feature,
+  FeatureIndex,
+  joinBoxes,
+  type Position,
+} from "./features";
 import { LOCAL } from "./frame";
 import { coloursOf, maskColours } from "./palette";
 import { RasterLayer } from "./raster-layer";
+import { Streets } from "./streets";
 import { tileAddress, Tiles } from "./tiles";
 
 const PICK_PIXELS = 10;
+/** Changes beyond which all features are drawn anew. */
+const MAX_CHANGES = 2000;
 const Z = { imagery: 0, voxels: 1, occupancy: 2, masks: 3, zones: 10, objects: 11, topology: 12, overlay: 20 };
 
 /** Layers switched off, in the address, so that a link shows the same map. */
@@ -69,6 +81,8 @@ export class SiteMap {
   private readonly selection: FeatureLayer;
   private readonly rasters = new Map<string, RasterLayer>();
   private readonly stops: (() => void)[] = [];
+  private drawn: { level: string; features: readonly Feature[] } = { level: "", features: [] };
+  private streets = new Streets([]);
   private base: Layer | null = null;
   private fitted = "";
   private isFirstPainting = true;
@@ -255,13 +269,19 @@ export class SiteMap {
   /** Shows the features of the level; the first time, the place in the address or the whole site. */
   private showFeatures(): void {
     const level = this.site.level.value;
-    const features = (this.shown.value ?? this.site.features.value).filter((feature) => feature.level === level);
-    const hidden = (["zones", "objects", "topology", "location"] as const).filter((name) => isHidden(name));
-    this.index = new FeatureIndex(features);
-    for (const [name, layer] of Object.entries(this.layers)) {
-      layer.setFeatures(features.filter((feature) => feature.layer === name));
-      layer.setVisible(!hidden.includes(name as (typeof hidden)[number]));
+    const features = this.shown.value ?? this.site.features.value;
+    const { removed, added } = difference(this.drawn.features, features);
+    const isSmall = level === this.drawn.level && removed.size + added.length < MAX_CHANGES;
+    this.drawn = { level, features };
+    if (isSmall) this.change(removed, added);
+    else {
+      const onLevel = features.filter((feature) => feature.level === level);
+      this.streets = new Streets(features);
+      this.index = new FeatureIndex(onLevel);
+      for (const [name, layer] of Object.entries(this.layers))
+        layer.setFeatures(onLevel.filter((feature) => feature.layer === name));
     }
+    for (const [name, layer] of Object.entries(this.layers)) layer.setVisible(!isHidden(name));
     const bounds = this.site.bounds.value;
     const key = `${this.site.name}/${level}`;
     if (this.fitted === key || !bounds) return;
@@ -278,6 +298,23 @@ export class SiteMap {
       const wanted = isFirst ? this.index.byId.get(param("feature") ?? "") : undefined;
       this.selected.value = wanted ?? null;
     });
+  }
+
+  /** Shows other features than before in place of some. An edge looks different once another leads back, or none. */
+  private change(removed: Set<Feature>, added: Feature[]): void {
+    const streets = [...removed, ...added].filter(({ properties }) => properties.kind === "edge");
+    const before = new Set(streets.flatMap((edge) => this.streets.twinsOf(edge)));
+    for (const edge of streets) if (removed.has(edge)) this.streets.remove(edge);
+    for (const feature of added) this.streets.add(feature);
+    const twins = new Set([...before, ...streets.flatMap((edge) => this.streets.twinsOf(edge))]);
+    const isHere = ({ level }: Feature) => level === this.drawn.level;
+    const come = added.filter(isHere);
+    this.index.change([...removed].filter(isHere), come);
+    const other = [...twins].filter((twin) => isHere(twin) && !removed.has(twin) && !added.includes(twin));
+    for (const [name, layer] of Object.entries(this.layers)) {
+      const own = [...come, ...other].filter((feature) => feature.layer === name);
+      layer.change(new Set([...removed, ...other].filter((feature) => feature.layer === name)), own);
+    }
   }
 
   /** Shows the base map while it is switched on; a site without a datum has no place on it. */
@@ -413,25 +450,8 @@ export class SiteMap {
   /** A two-way street is one line: of its two edges one is drawn, without arrows. */
   private networkClass(feature: Feature): string {
     if (feature.properties.kind !== "edge") return "node";
-    const { source, target } = feature.properties as { source?: string; target?: string };
-    if (!this.pairs.has(`${target}>${source}`)) return "one-way";
-    return String(source) < String(target) ? "two-way" : "";
-  }
-
-  private pairsOf: readonly Feature[] = [];
-  private pairsSet = new Set<string>();
-
-  private get pairs(): Set<string> {
-    const features = this.shown.peek() ?? this.site.features.peek();
-    if (features !== this.pairsOf) {
-      this.pairsOf = features;
-      this.pairsSet = new Set(
-        features
-          .filter(({ properties }) => properties.kind === "edge")
-          .map(({ properties }) => `${properties.source}>${properties.target}`),
-      );
-    }
-    return this.pairsSet;
+    if (!this.streets.isTwoWay(feature)) return "one-way";
+    return String(feature.properties.source) < String(feature.properties.target) ? "two-way" : "";
   }
 
   private networkPaints() {

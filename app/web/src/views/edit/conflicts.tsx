@@ -4,8 +4,9 @@ import { boxOf, type Feature, joinBoxes } from "../../map/features";
 import { colour } from "../../theme";
 import { Button } from "../../ui/button";
 import { count } from "../../ui/text";
-import type { Editor, Pending } from "./editor";
-import { type Choice, type Conflict, canKeepBoth } from "./merge";
+import type { Editor } from "./editor";
+import type { Pending } from "./head";
+import { type Choice, type Conflict, canKeepBoth, changedFields, SHAPE, twinOf } from "./merge";
 import { titleOf } from "./words";
 
 const CHOICES: { choice: Choice; title: string }[] = [
@@ -15,7 +16,9 @@ const CHOICES: { choice: Choice; title: string }[] = [
 ];
 
 export function Conflicts({ editor, pending }: { editor: Editor; pending: Pending }) {
-  const { conflicts } = pending.merge;
+  const all = pending.merge.conflicts;
+  // Both directions of a street are decided at once.
+  const conflicts = all.filter((one, index) => all.indexOf(twinOf(one, all) ?? one) >= index);
   const [at, setAt] = useState(0);
   const conflict = conflicts[Math.min(at, conflicts.length - 1)];
   const open = conflicts.filter(({ key }) => !pending.choices.has(key)).length;
@@ -24,7 +27,7 @@ export function Conflicts({ editor, pending }: { editor: Editor; pending: Pendin
   }, [editor, conflict]);
   if (!conflict) return null;
   const decide = (choice: Choice) => {
-    editor.choose(conflict, choice);
+    editor.head.choose(conflict, choice);
     const next = conflicts.findIndex(({ key }, index) => index > at && !pending.choices.has(key));
     if (next >= 0) setAt(next);
   };
@@ -34,8 +37,7 @@ export function Conflicts({ editor, pending }: { editor: Editor; pending: Pendin
         {count(conflicts.length, "conflict")} with v{pending.version} by {pending.author}
       </h2>
       <p class="muted">
-        Both of you changed the same. Choose for each; everything else is merged. On the map yours is orange, theirs
-        purple.
+        Both of you changed the same. Choose for each; all else is merged. On the map yours is orange, theirs purple.
       </p>
       <ol class="rows">
         {conflicts.map((one, index) => (
@@ -50,9 +52,9 @@ export function Conflicts({ editor, pending }: { editor: Editor; pending: Pendin
       <div class="edit-conflict" role="group" aria-label={nameOf(conflict)}>
         <dl>
           <dt>Mine</dt>
-          <dd>{said(conflict.before, conflict.mine)}</dd>
+          <dd>{said(conflict, conflict.mine)}</dd>
           <dt>Theirs</dt>
-          <dd>{said(conflict.before, conflict.theirs)}</dd>
+          <dd>{said(conflict, conflict.theirs)}</dd>
         </dl>
         <div class="actions">
           {CHOICES.filter(({ choice }) => choice !== "both" || canKeepBoth(conflict)).map(({ choice, title }) => (
@@ -68,7 +70,7 @@ export function Conflicts({ editor, pending }: { editor: Editor; pending: Pendin
           disabled={open > 0}
           onClick={() => {
             const { resume } = pending;
-            editor.finishMerge(pending);
+            editor.head.finish(pending);
             resume?.();
           }}
         >
@@ -76,7 +78,7 @@ export function Conflicts({ editor, pending }: { editor: Editor; pending: Pendin
         </Button>
         <Button
           onClick={() => {
-            editor.pending.value = null;
+            editor.head.pending.value = null;
           }}
         >
           Later
@@ -91,25 +93,19 @@ function nameOf({ before, mine, theirs }: Conflict): string {
   return feature ? titleOf(feature) : "";
 }
 
-function said(before: Feature | null, after: Feature | null): string {
+/** Says what someone has made of the fields that both changed. */
+function said({ before, fields }: Conflict, after: Feature | null): string {
   if (!after) return "deleted";
   if (!before) return "added";
-  const parts: string[] = [];
-  if (JSON.stringify(before.geometry) !== JSON.stringify(after.geometry)) {
-    const at = after.geometry.type === "Point" ? after.geometry.coordinates : null;
-    parts.push(
-      at
-        ? `moved to ${at
-            .slice(0, 2)
-            .map((value) => value.toFixed(3))
-            .join(", ")}`
-        : "another shape",
-    );
-  }
-  for (const name of new Set([...Object.keys(before.properties), ...Object.keys(after.properties)])) {
-    const [old, now] = [before.properties[name], after.properties[name]].map((value) => JSON.stringify(value));
-    if (old !== now) parts.push(now === undefined ? `without ${name}` : `${name} = ${now.slice(0, 60)}`);
-  }
+  const names = fields.length ? fields : changedFields(before, after);
+  const parts = names.map((name) => {
+    if (name !== SHAPE) {
+      const value = JSON.stringify(after.properties[name]);
+      return value === undefined ? `without ${name}` : `${name} = ${value.slice(0, 60)}`;
+    }
+    const at = after.geometry.type === "Point" ? after.geometry.coordinates.slice(0, 2) : null;
+    return at ? `moved to ${at.map((value) => value.toFixed(3)).join(", ")}` : "another shape";
+  });
   return parts.join(", ") || "unchanged";
 }
 

@@ -3,7 +3,7 @@ import { type Command, Draft, isEdge, isNode, keyOf, same } from "./draft";
 import { compare, merged, withFreshIds } from "./merge";
 import * as operations from "./operations";
 import { placeOf, Transaction } from "./transaction";
-import type { Feature } from "../../map/features";
+import { type Feature, linesOf } from "../../map/features";
 
 const RUNS = 150;
 const WHERE = { level: "ground", part: "network" };
@@ -58,6 +58,16 @@ function draw(draft: Draft, from: Feature): Command {
   return edits.command("draw");
 }
 
+function join(draft: Draft, node: Feature, edge: Feature): Command {
+  const edits = new Transaction(draft);
+  const lanes = [edge, draft.twinOf(edge)].filter((one) => one !== undefined);
+  edits.place(node, ...(operations.middleOf(linesOf(edge.geometry)[0] ?? []) as [number, number]));
+  const others = lanes.map((lane) => edits.get(keyOf(lane)) ?? lane);
+  if (others.every(({ properties }) => properties.source !== node.id && properties.target !== node.id))
+    operations.joinInto(edits, edits.get(keyOf(node)) ?? node, others);
+  return edits.command("join");
+}
+
 function step(draft: Draft): void {
   const features = [...draft.features()];
   if (!features.length) return;
@@ -74,6 +84,7 @@ function step(draft: Draft): void {
             [edge, draft.twinOf(edge)].filter((one) => one !== undefined),
           )
         : "",
+    () => (edge && nodes.length ? join(draft, pick(nodes), edge) : ""),
     () => operations.merge(draft, [...new Set([pick(nodes), pick(nodes)].filter(Boolean))]),
     () => operations.reverse(draft, some),
     () => operations.makeOneWay(draft, some),
@@ -89,6 +100,41 @@ function step(draft: Draft): void {
   const outcome = pick(possible)();
   if (typeof outcome === "object") draft.execute(outcome);
 }
+
+/** What both changed in different fields is joined; of what both changed alike each keeps its own. */
+function checkFields(): void {
+  const properties = { kind: "node", name: "a", speed_limit: 1 };
+  const base: Feature = {
+    ...WHERE,
+    id: "a",
+    layer: "topology",
+    geometry: { type: "Point", coordinates: [0, 0] },
+    properties,
+  };
+  const key = keyOf(base);
+  const moved = { ...base, geometry: { type: "Point" as const, coordinates: [1, 0] } };
+  const named = { ...base, properties: { kind: "node", name: "b", speed_limit: 2 } };
+  const met = (mine: Feature | null, theirs: Feature | null) =>
+    compare([{ key, before: base, after: mine }], new Map(theirs ? [[key, theirs]] : []));
+  const joined = met(moved, named);
+  require(!joined.conflicts.length &&
+    same(joined.clean[0]?.after, {
+      ...moved,
+      properties: named.properties,
+    }), "different fields are joined");
+  const { speed_limit: _, ...without } = properties;
+  const both = { ...moved, properties: { ...without, name: "c" } };
+  const [clash] = met(both, named).conflicts;
+  require(same(clash?.fields, ["name", "speed_limit"]), "a property that one removed is a conflict");
+  require(same(clash?.mine, both), "mine keeps its own");
+  require(same(clash?.theirs, { ...named, geometry: moved.geometry }), "theirs has what only I have changed");
+  require(!met(named, { ...moved, properties: named.properties }).conflicts
+    .length, "the same on both sides is no conflict");
+  require(same(met(null, named).conflicts[0]?.fields, []), "deleting what they changed is a conflict");
+  require(met(moved, base).keepsHistory, "history stays when they changed something else");
+}
+
+checkFields();
 
 for (let run = 0; run < RUNS; run++) {
   seed = run + 7;

@@ -52,7 +52,7 @@ export default function EditView({ site, map }: ViewProps) {
 
 function Panel({ desk }: { desk: Desk }) {
   const { editor, map } = desk;
-  const pending = editor.pending.value;
+  const pending = editor.head.pending.value;
   const area = map.map.getTargetElement()?.parentElement;
   return (
     <div class="edit-panel">
@@ -119,7 +119,7 @@ function Notes({ editor }: { editor: Editor }) {
               <small key={detail}>{detail}</small>
             ))}
           </p>
-          {id === "moved" && <Button onClick={() => editor.mergeWithHead(null)}>Merge now</Button>}
+          {id === "moved" && <Button onClick={() => editor.head.merge(null)}>Merge now</Button>}
           <Button quiet icon={X} label="Dismiss" onClick={() => editor.dismiss(id)} />
         </div>
       ))}

@@ -7,16 +7,23 @@ import { Transaction } from "./transaction";
 export interface Conflict {
   key: string;
   before: Feature | null;
+  /** Mine, with what only they have changed; and theirs with what only I have. */
   mine: Feature | null;
   theirs: Feature | null;
+  /** What both have changed: names of properties, or the shape. Empty: one of them has deleted it. */
+  fields: string[];
 }
 
-export type Choice = "mine" | "theirs" | "both";
+type Side = "mine" | "theirs";
+
+export type Choice = Side | "both";
 
 export interface Merge {
   /** Changes that touch nothing of theirs. */
   clean: Change[];
   conflicts: Conflict[];
+  /** Features that both have changed, in different fields: they hold the changes of both. */
+  joined: Feature[];
   /** Whether all history of the draft stays valid. */
   keepsHistory: boolean;
 }
@@ -25,6 +32,7 @@ export interface Merge {
 export function compare(changes: readonly Change[], theirs: ReadonlyMap<string, Feature>): Merge {
   const clean: Change[] = [];
   const conflicts: Conflict[] = [];
+  const joined: Feature[] = [];
   let keepsHistory = true;
   for (const { key, before, after } of changes) {
     const their = theirs.get(key) ?? null;
@@ -37,9 +45,75 @@ export function compare(changes: readonly Change[], theirs: ReadonlyMap<string, 
     }
     keepsHistory = false;
     if (same(base, ours) || same(ours, other)) continue; // theirs, or the same as ours
-    conflicts.push({ key, before, mine: after, theirs: their });
+    if (!before || !after || !their) {
+      conflicts.push({ key, before, mine: after, theirs: their, fields: [] });
+      continue;
+    }
+    const both = byField(before, after, their);
+    if (both.fields.length) conflicts.push({ key, before, ...both });
+    else {
+      joined.push(both.mine);
+      clean.push({ key, before: their, after: both.mine });
+    }
   }
-  return { clean, conflicts, keepsHistory };
+  return { clean, conflicts, joined, keepsHistory };
+}
+
+/** Stands among the names of fields for where something is and how it is bent or turned. */
+export const SHAPE = "(shape)";
+const SHAPED = ["bends", "pose"];
+
+/** Returns what can differ of a feature, by name. */
+function fieldsOf(feature: Feature): Map<string, unknown> {
+  const { geometry, inner } = core(feature) as { geometry?: unknown; inner?: unknown };
+  const shape = [geometry ?? inner, ...SHAPED.map((name) => feature.properties[name] ?? null)];
+  const others = Object.entries(feature.properties).filter(([name]) => !SHAPED.includes(name));
+  return new Map<string, unknown>([[SHAPE, shape], ...others]);
+}
+
+/** Returns the fields in which two forms of a feature differ. */
+export function changedFields(one: Feature, other: Feature): string[] {
+  const [left, right] = [fieldsOf(one), fieldsOf(other)];
+  return [...new Set([...left.keys(), ...right.keys()])].filter((name) => !same(left.get(name), right.get(name)));
+}
+
+/** Joins two forms of a feature, field by field. Where both changed the same, each keeps its own. */
+function byField(before: Feature, mine: Feature, theirs: Feature): Pick<Conflict, "fields"> & Record<Side, Feature> {
+  const [ours, others] = [changedFields(before, mine), changedFields(before, theirs)];
+  const differing = new Set(changedFields(mine, theirs));
+  const fields = ours.filter((name) => others.includes(name) && differing.has(name));
+  const isOnlyMine = (name: string) => ours.includes(name) && !fields.includes(name);
+  const isOnlyTheirs = (name: string) => others.includes(name) && !fields.includes(name);
+  return {
+    fields,
+    mine: withFields(mine, theirs, others.filter(isOnlyTheirs)),
+    theirs: withFields(theirs, mine, ours.filter(isOnlyMine)),
+  };
+}
+
+/** Returns a feature with some fields of another form of it. */
+function withFields(feature: Feature, other: Feature, names: readonly string[]): Feature {
+  const properties = { ...feature.properties };
+  for (const name of names.flatMap((one) => (one === SHAPE ? SHAPED : one))) {
+    if (name in other.properties) properties[name] = other.properties[name];
+    else delete properties[name];
+  }
+  return { ...feature, properties, geometry: names.includes(SHAPE) ? other.geometry : feature.geometry };
+}
+
+/** Returns the conflict of the other direction of the same street, if it is one of the same fields. */
+export function twinOf(conflict: Conflict, all: readonly Conflict[]): Conflict | undefined {
+  const own = conflict.mine ?? conflict.theirs;
+  if (!isEdge(own)) return undefined;
+  return all.find((other) => {
+    const edge = other.mine ?? other.theirs;
+    const isBack =
+      isEdge(edge) &&
+      edge.properties.source === own.properties.target &&
+      edge.properties.target === own.properties.source;
+    const isAlike = same(other.fields, conflict.fields) && !other.mine === !conflict.mine;
+    return isBack && isAlike && edge.level === own.level && edge.part === own.part;
+  });
 }
 
 /** Gives new features other ids where theirs took the same: two people who draw both make `n1`. */
@@ -109,8 +183,8 @@ export function merged(
   for (const { key, after } of clean) stage(edits, key, after);
   for (const conflict of conflicts) {
     const choice = choices.get(conflict.key) ?? "mine";
-    if (choice === "mine") stage(edits, conflict.key, conflict.mine);
-    else if (choice === "both" && conflict.mine) edits.put(copyOf(edits, conflict.mine));
+    if (choice !== "both") stage(edits, conflict.key, conflict[choice]);
+    else if (conflict.mine) edits.put(copyOf(edits, conflict.mine));
   }
   restoreNodes(edits, before, notes);
   keepNodes(edits, notes);

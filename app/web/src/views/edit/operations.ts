@@ -50,8 +50,14 @@ export function split(draft: Draft, edges: Feature[], at?: Position): Outcome {
 export function splitInto(edits: Transaction, edges: Feature[], at?: Position): Feature | string {
   const first = edges.find(isEdge);
   if (!first || first.geometry.type !== "LineString") return "Choose a lane to split";
-  const point = at ?? middleOf(first.geometry.coordinates);
-  const node = edits.addNode(point, first);
+  const node = edits.addNode(at ?? middleOf(first.geometry.coordinates), first);
+  joinInto(edits, node, edges);
+  return node;
+}
+
+/** Joins a node into lanes: each is split there. */
+export function joinInto(edits: Transaction, node: Feature, edges: Feature[]): void {
+  const point = placeOf(node) as Position;
   for (const edge of edges) {
     if (edge.geometry.type !== "LineString") continue;
     const [source, target] = [edits.endOf(edge, "source"), edits.endOf(edge, "target")];
@@ -60,10 +66,9 @@ export function splitInto(edits: Transaction, edges: Feature[], at?: Position): 
     const segment = nearestSegment(line, point);
     const { bends: _, ...properties } = withoutIndex(edge.properties);
     edits.remove(edge);
-    edits.addEdge(source, node, properties, line.slice(1, segment + 1));
-    edits.addEdge(node, target, properties, line.slice(segment + 1, -1));
+    if (!edits.edgesBetween(source, node).length) edits.addEdge(source, node, properties, line.slice(1, segment + 1));
+    if (!edits.edgesBetween(node, target).length) edits.addEdge(node, target, properties, line.slice(segment + 1, -1));
   }
-  return node;
 }
 
 /** Merges nodes into the first: their lanes end there, and lanes between them go. */

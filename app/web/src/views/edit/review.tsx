@@ -23,7 +23,7 @@ export function Review({ desk }: { desk: Desk }) {
   const close = () => {
     desk.review.value = false;
   };
-  const isOpen = desk.review.value && editor.pending.value === null;
+  const isOpen = desk.review.value && editor.head.pending.value === null;
   useEffect(() => setProblem(null), [isOpen]);
   const submit = async () => {
     setBusy(true);
@@ -69,7 +69,7 @@ export function Review({ desk }: { desk: Desk }) {
           Offline: your changes are kept on this device. Save when the server answers again.
         </p>
       )}
-      {editor.isBehind && (
+      {editor.head.isBehind && (
         <p class="note" role="status">
           v{editor.site.number} was saved in the meantime. Saving merges your changes with it.
         </p>
@@ -197,7 +197,7 @@ function Warnings({ editor, open }: { editor: Editor; open: boolean }) {
   const revision = editor.revision.value;
   useEffect(() => {
     setAnswer(null);
-    if (!open || editor.count.peek() === 0 || !online.peek() || editor.isBehind) return;
+    if (!open || editor.count.peek() === 0 || !online.peek() || editor.head.isBehind) return;
     let isOver = false;
     dryRun(editor).then(
       ({ warnings }) => {

@@ -8,10 +8,11 @@ export type Saved = { version: Version } | "conflict";
 
 const MAX_ROUNDS = 5;
 
-/** Throws ApiError. `resume` is called when conflicts that hold it up are decided. */
+/** Sends first and merges when it is refused: a save whose answer was lost is answered again, not merged with itself.
+ *
+ * Throws ApiError. `resume` is called when conflicts that hold it up are decided. */
 export async function save(editor: Editor, resume: () => void): Promise<Saved> {
   for (let round = 0; ; round++) {
-    if (editor.isBehind && !editor.mergeWithHead(resume)) return "conflict";
     try {
       const version = await send(editor);
       editor.saved(version.version ?? 0);
@@ -20,7 +21,11 @@ export async function save(editor: Editor, resume: () => void): Promise<Saved> {
     } catch (error) {
       if (asApiError(error).status !== 412 || round >= MAX_ROUNDS) throw error;
       await editor.site.refresh();
-      if (!editor.isBehind) throw editor.site.problem.peek() ?? error;
+      const { head, site } = editor;
+      if (!head.isBehind) throw site.problem.peek() ?? error;
+      if (!head.merge(resume)) return "conflict";
+      const version = site.version.peek() as Version;
+      if (editor.count.peek() === 0) return { version }; // others have saved the same
     }
   }
 }
@@ -42,7 +47,7 @@ async function send(editor: Editor): Promise<Version> {
       "content-type": "application/json",
       "if-match": `"${editor.base.peek()}"`,
       // The same draft has the same key: a repeated save whose answer was lost is not saved twice.
-      "idempotency-key": `edit-${editor.draftId}-${editor.base.peek()}-${hash(body)}`,
+      "idempotency-key": `edit-${editor.store.id}-${editor.base.peek()}-${hash(body)}`,
     },
     body,
   });

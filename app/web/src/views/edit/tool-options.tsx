@@ -3,12 +3,13 @@ import { useState } from "preact/hooks";
 import type { Position } from "../../map/features";
 import { Button } from "../../ui/button";
 import type { Desk } from "./desk";
-import type { Editor, ToolName } from "./editor";
+import type { Editor } from "./editor";
+import type { ToolName } from "./options";
 import { AreaTool } from "./tools/area";
 import { PathTool } from "./tools/path";
 
 const HINTS: Record<ToolName, string> = {
-  select: "Click a node, lane or area. Drag moves it; drop a node onto another to merge them.",
+  select: "Click a node, lane or area. Drag moves it; drop a node onto another to merge them, onto a lane to join it.",
   path: "Click in the void for a node and a lane to it, on a node to connect it, on a lane to split it. Enter ends.",
   split: "Click on a lane where it is to be split.",
   zone: "Click the corners. Click the first again, or press Enter, to finish.",

@@ -17,7 +17,7 @@ import {
 } from "lucide-preact";
 import { Button } from "../../ui/button";
 import type { Desk } from "./desk";
-import type { ToolName } from "./editor";
+import type { ToolName } from "./options";
 
 const TOOLS = [
   { name: "select", title: "Select and move (S)", icon: MousePointer2 },

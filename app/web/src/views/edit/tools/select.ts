@@ -12,7 +12,7 @@ import {
 import { isHidden } from "../../../map/site-map";
 import { type Command, isEdge, isNode, keyOf } from "../draft";
 import { closed, crossesItself, distance, movedTo, outlinesOf } from "../geometry";
-import { mergeInto } from "../operations";
+import { joinInto, mergeInto } from "../operations";
 import { type Handle, handlesOf, mark, marksOf } from "../sketch";
 import type { Snapped } from "../snap";
 import { Transaction } from "../transaction";
@@ -105,7 +105,20 @@ export class SelectTool extends Tool {
     this.offset = [snapped.at[0] - drag.anchor[0], snapped.at[1] - drag.anchor[1]];
     const edits = new Transaction(this.editor.draft);
     edits.move(drag.keys, ...this.offset);
-    this.context.sketch.marks.value = [...drawn(edits.edits().map(({ to }) => to)), ...marksOf(snapped)];
+    const joined = this.joined(drag)[0];
+    const lane = joined ? [mark("edge", joined.geometry)] : [];
+    this.context.sketch.marks.value = [...lane, ...drawn(edits.edits().map(({ to }) => to)), ...marksOf(snapped)];
+  }
+
+  /** The lanes that a node is dropped onto: a street is both of its directions. */
+  private joined({ node, keys }: Drag & { kind: "move" }): Feature[] {
+    const lane = this.onto?.kind === "edge" ? this.onto.feature : undefined;
+    if (!node || keys.length > 1 || !isEdge(lane) || lane.part !== node.part) return [];
+    const { draft } = this.editor;
+    return this.editor
+      .wholeOf(lane)
+      .map((key) => draft.get(key))
+      .filter((one) => one !== undefined);
   }
 
   private dragHandle(drag: Drag & { kind: "handle" }, press: Press): void {
@@ -149,6 +162,13 @@ export class SelectTool extends Tool {
     if (target && dragged && drag.keys.length === 1) {
       mergeInto(edits, target, [dragged]);
       editor.run(edits.command(`Merge ${dragged.id} into ${target.id}`), [keyOf(target)]);
+      return;
+    }
+    const lanes = this.joined(drag);
+    if (dragged && lanes[0]) {
+      joinInto(edits, dragged, lanes);
+      const { source, target } = lanes[0].properties;
+      editor.run(edits.command(`Join ${dragged.id} into ${String(source)} – ${String(target)}`));
       return;
     }
     const count = drag.keys.length;

@@ -1,0 +1,155 @@
+/** The version that a draft builds on: loaded, restored, and met by newer ones of others. */
+import { computed, signal } from "@preact/signals";
+import { param } from "../../address";
+import type { Feature, LayerName } from "../../map/features";
+import { count } from "../../ui/text";
+import { type Command, type Draft, EDITED_LAYERS, keyOf } from "./draft";
+import type { Editor } from "./editor";
+import { type Choice, type Conflict, compare, type Merge, merged, twinOf, withFreshIds } from "./merge";
+import type { StoredDraft } from "./storage";
+import { titleOf } from "./words";
+
+/** What was found when the site moved on, and waits for decisions. */
+export interface Pending {
+  merge: Merge;
+  version: number;
+  theirs: Feature[];
+  author: string;
+  choices: Map<string, Choice>;
+  /** Continues what was interrupted, with the merged draft. */
+  resume: (() => void) | null;
+}
+
+export class Head {
+  readonly pending = signal<Pending | null>(null);
+  private readonly isLatest = computed(() => param("version") === "latest");
+
+  constructor(private readonly editor: Editor) {}
+
+  /** Whether the site has a newer version than the draft builds on. */
+  get isBehind(): boolean {
+    const { site, base } = this.editor;
+    return site.number !== null && base.value !== null && site.number > base.value;
+  }
+
+  /** Takes up the site's version; called again when it changes. */
+  follow(): void {
+    const { site, base } = this.editor;
+    const version = site.version.value;
+    const features = site.features.value;
+    const head = site.environment.value?.version;
+    if (!this.isLatest.value || !version || version.version === null || head === undefined) return;
+    if (version.version !== head) return; // it is being loaded
+    if (base.peek() === null) void this.start(features, version.version);
+    else this.meet(features, version.version, version.author);
+  }
+
+  private async start(features: Feature[], version: number): Promise<void> {
+    const { editor } = this;
+    editor.setDraft(editor.newDraft(features), version);
+    const stored = await editor.store.load().catch(() => null);
+    // The site may have moved on, and the draft have another id.
+    editor.setDraft(editor.newDraft(editor.site.features.peek()), editor.site.number ?? version);
+    if (stored && stored.head.position + stored.log.length > 0) this.restore(stored);
+    editor.ready.value = true;
+    editor.selectFromAddress();
+  }
+
+  private restore({ head, log }: StoredDraft): void {
+    const { editor } = this;
+    const features = editor.site.features.peek();
+    const version = editor.site.number ?? 0;
+    editor.message.value = head.message;
+    const older = head.version === version ? features : featuresBefore(features, log);
+    editor.setDraft(editor.newDraft(older, log, head.position), head.version);
+    const total = editor.count.value;
+    const made = head.version === version ? "" : `, made on v${head.version}`;
+    if (total) editor.note("restored", `Restored ${count(total, "change")}, kept on this device${made}.`);
+    if (made) this.meet(features, version, editor.site.version.peek()?.author ?? "");
+  }
+
+  /** Meets the site's features, which may be those of a newer version. */
+  private meet(features: Feature[], version: number, author: string): void {
+    const { editor } = this;
+    const base = editor.base.peek() ?? version;
+    if (version === base) {
+      editor.draft.addBase(features); // more was loaded of the same version
+      editor.setDraft(editor.draft, base);
+    } else if (!editor.draft.log.length) editor.setDraft(editor.newDraft(features), version);
+    else {
+      const by = author || "someone else";
+      editor.note("moved", `v${version} was saved by ${by}. Your changes will be merged when you save.`);
+    }
+  }
+
+  /** Merges the draft with the site's newest version; asks where both changed the same. Returns whether it is done. */
+  merge(resume: (() => void) | null): boolean {
+    const { site, draft, base } = this.editor;
+    const version = site.number;
+    if (version === null || version === base.peek()) return true;
+    const theirs = site.features.peek().filter(({ layer }) => EDITED_LAYERS.includes(layer as LayerName));
+    const byKey = new Map(theirs.map((feature) => [keyOf(feature), feature]));
+    for (const layer of site.partial.peek()) addUnseen(byKey, draft, layer);
+    const changes = draft.changes();
+    const fresh = withFreshIds(changes, byKey);
+    const merge = compare(fresh, byKey);
+    if (fresh.some((change, index) => change !== changes[index])) merge.keepsHistory = false;
+    const author = site.version.peek()?.author || "someone else";
+    const pending: Pending = { merge, version, theirs: [...byKey.values()], author, choices: new Map(), resume };
+    if (merge.conflicts.length) {
+      this.pending.value = pending;
+      return false;
+    }
+    this.finish(pending);
+    return true;
+  }
+
+  /** Decides a conflict, and that of the other direction of the same street. */
+  choose(conflict: Conflict, choice: Choice): void {
+    const pending = this.pending.peek();
+    if (!pending) return;
+    const choices = new Map(pending.choices).set(conflict.key, choice);
+    const twin = twinOf(conflict, pending.merge.conflicts);
+    if (twin) choices.set(twin.key, choice);
+    this.pending.value = { ...pending, choices };
+  }
+
+  finish({ merge, version, theirs, choices, author }: Pending): void {
+    const { editor } = this;
+    const old = editor.draft;
+    const title = `Your changes, merged with v${version}`;
+    let details: string[] = [];
+    if (merge.keepsHistory && !merge.conflicts.length)
+      editor.setDraft(editor.newDraft(theirs, old.log, old.position), version);
+    else {
+      const { command, notes } = merged(theirs, merge, choices, (key) => old.before(key), title);
+      details = [...merge.joined.map((feature) => `${titleOf(feature)} has the changes of both`), ...notes];
+      const draft = editor.newDraft(theirs);
+      draft.execute({ title, edits: [], ...command, cells: old.cells() });
+      editor.setDraft(draft, version);
+    }
+    this.pending.value = null;
+    editor.dismiss("moved");
+    editor.note("merged", `Merged with v${version}, saved by ${author}.`, details);
+    editor.keep(0);
+  }
+}
+
+/** Returns the features that a log of changes began with: those of an older version are known from it. */
+function featuresBefore(features: readonly Feature[], log: readonly Command[]): Iterable<Feature> {
+  const older = new Map(features.map((feature) => [keyOf(feature), feature]));
+  const first = new Map<string, Feature | null>();
+  for (const { edits } of log) for (const { key, from } of edits) if (!first.has(key)) first.set(key, from);
+  for (const [key, from] of first) {
+    if (from) older.set(key, from);
+    else older.delete(key);
+  }
+  return older.values();
+}
+
+/** Features beyond the loaded extent count as unchanged. */
+function addUnseen(theirs: Map<string, Feature>, draft: Draft, layer: LayerName): void {
+  for (const { key, before } of draft.changes()) {
+    if (before && before.layer === layer && !theirs.has(key)) theirs.set(key, before);
+  }
+}
