@@ -1,22 +1,26 @@
-"""All networks of a site as one graph in arrays, in local metres."""
+"""All networks of a site as one graph in arrays, in local metres.
+
+SciPy is imported where it is used: the server's own process, which only names the rules, starts without it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from app.errors import Invalid, MissingDatum
 from app.model.features import Features, Properties
 from app.model.layers import Layers, PartKey
 from app.review.lifts import lift_stops
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -94,6 +98,8 @@ class Network:
 
     def graph(self, usable: Mask) -> csr_array:
         """Return the adjacency matrix of these edges and of lifts."""
+        from scipy.sparse import csr_array
+
         k = np.flatnonzero(usable)
         n = len(self.nodes)
         rides = [(stops[0], stop) for stops in self.lifts.values() for stop in stops[1:]]
@@ -182,6 +188,8 @@ MAX_NETWORKS = 50
 
 def reach(network: Network, usable: Mask) -> Reach:
     """Search the largest strongly connected part of each network (the parts with one name), and what it reaches."""
+    from scipy.sparse.csgraph import breadth_first_order, connected_components
+
     n = len(network.nodes)
     graph = network.graph(usable)
     _, group = connected_components(graph, directed=True, connection="strong") if n else (0, np.empty(0, np.int64))
@@ -206,6 +214,8 @@ def reach(network: Network, usable: Mask) -> Reach:
 
 def weak_groups(network: Network, usable: Mask, chosen: Mask) -> list[Indices]:
     """Group chosen nodes by connection among themselves, the largest group first."""
+    from scipy.sparse.csgraph import connected_components
+
     inner = usable.copy()
     k = np.flatnonzero(usable)
     inner[k] = chosen[network.source[k]] & chosen[network.target[k]]

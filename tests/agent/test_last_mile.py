@@ -103,8 +103,9 @@ def test_accepted_closure_blocks_robot_until_its_end(
     assert len(lines(one)) == len(graph) - 1
     listed = json.loads((one.into / "current" / "closures.json").read_text())["closures"]
     assert [(c["id"], c["edge"]) for c in listed] == [(pending, edge["id"])]
-    eventually(lambda: edges(one) == before, 60)
-    assert lines(one) == graph
+    since = one.lines.index(one.wait("active", after=since), since) + 1
+    one.wait("active", 60, after=since)
+    assert (edges(one), lines(one)) == (before, graph)
 
     def is_released() -> bool:
         channel = next(c for c in api.get(f"environments/{name}/channels").json() if c["channel"] == "production")

@@ -34,6 +34,9 @@ def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tupl
         "  translation: {x: 0.0, y: 0.0, z: 0.0}",
         "nodes:",
     ]
+    leaving: dict[str, list[str]] = {}
+    for a, b in edges:
+        leaving.setdefault(a, []).append(b)
     for name, (x, y) in positions.items():
         lines += [
             "- meta:",
@@ -52,18 +55,18 @@ def tmap2(nodes: dict[str, tuple[float, float]] | None = None, edges: tuple[tupl
             "    localise_by_topic: ''",
             "    verts: []",
         ]
-        node_edges = [(a, b) for a, b in edges if a == name]
-        lines += ["    edges: []" if not node_edges else "    edges:"]
-        for a, b in node_edges:
+        targets = leaving.get(name, [])
+        lines += ["    edges:" if targets else "    edges: []"]
+        for target in targets:
             lines += [
                 "    - action: move_base",
                 "      action_type: move_base_msgs/MoveBaseGoal",
                 "      config: []",
-                f"      edge_id: {a}_{b}",
+                f"      edge_id: {name}_{target}",
                 "      fail_policy: fail",
                 "      fluid_navigation: true",
                 "      goal: {target_pose: {header: {frame_id: $node.parent_frame}, pose: $node.pose}}",
-                f"      node: {b}",
+                f"      node: {target}",
                 "      recovery_behaviours_config: ''",
                 "      restrictions_planning: 'True'",
                 "      restrictions_runtime: 'True'",

@@ -27,7 +27,14 @@ def loaded(statement: str) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize("statement", ["import app.cli.server, app.main", f"import {', '.join(PRELOADED_MODULES)}"])
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import app.cli.server, app.main\nfrom app.config import Settings\napp.main.create_app(Settings())",
+        f"import {', '.join(PRELOADED_MODULES)}",
+    ],
+    ids=["server", "workers"],
+)
 def test_start_imports_only_required_modules(statement: str) -> None:
     assert loaded(statement) == []
 

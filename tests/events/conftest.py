@@ -68,13 +68,15 @@ class Listener:
 
 
 def eventually(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
+    """Wait until a condition holds and return its value. The longer it takes, the less often it is tried."""
+    start = time.monotonic()
     while True:
         value = condition()
         if value:
             return value
-        assert time.monotonic() < deadline, "it did not come about in time"
-        time.sleep(0.02)
+        elapsed = time.monotonic() - start
+        assert elapsed < seconds, "it did not come about in time"
+        time.sleep(min(max(0.02, elapsed / 10), 0.25))
 
 
 def nothing(*_: Any) -> Any:
