@@ -83,7 +83,15 @@ def read_layers(
     """
     pyogrio = _pyogrio()
     pyogrio.set_gdal_config_options({"DXF_ENCODING": encoding})
-    errors = (*_errors(pyogrio), ValueError, TypeError, LookupError, ArithmeticError, OSError, NameError)
+    errors: tuple[type[Exception], ...] = (
+        *_errors(pyogrio),
+        ValueError,
+        TypeError,
+        LookupError,
+        ArithmeticError,
+        OSError,
+        NameError,
+    )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:

@@ -167,7 +167,7 @@ def _objects(table: Table, unit: float, crs: str | None, options: ReadOptions, c
         context.warn(f"{int((~chosen).sum())} entities of the paper space are not read")
     if options.layers is not None:
         chosen &= _in_layers(layers, options.layers)
-    indices = np.flatnonzero(chosen)
+    indices = np.flatnonzero(chosen).tolist()
     details = [_details(columns, layers, k) for k in indices]
     is_point = shapely.get_type_id(table.geometry[indices]) == 0  # the texts of hatches are names of patterns
     labels = [d.get("text") if point else None for d, point in zip(details, is_point, strict=True)]
