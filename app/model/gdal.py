@@ -1,6 +1,6 @@
 """Configuration of GDAL for images: single-threaded, in memory, without copies of pixels.
 
-No other module sets it up.
+No other module sets it up; ``app.syntax.ogr`` has another GDAL for vectors.
 """
 
 from __future__ import annotations

@@ -50,6 +50,13 @@ class LocalFrame:
         return self._definition("+datum=WGS84")
 
     @property
+    def wkt(self) -> str:
+        """Return ``crs`` as WKT 1, in the dialect of GDAL, with a name for people."""
+        definition = CRS.from_user_input(self.crs).to_json_dict()
+        definition["name"] = "local frame: metres east and north of the datum"
+        return str(CRS.from_json_dict(definition).to_wkt("WKT1_GDAL"))
+
+    @property
     def from_local(self) -> tuple[float, float, float, float]:
         """Return (p, q, r, s) with east = p·x + q·y and north = r·x + s·y in ``crs``."""
         return self._cos, self._sin, -self._sin, self._cos
@@ -194,6 +201,25 @@ def crs_to_wgs84(crs: str, points: Array) -> Array:
     except (ProjError, Invalid) as error:
         raise Invalid(f"unknown CRS {_short(crs)!r}: use a code such as EPSG:32632") from error
     return out
+
+
+def engineering_unit(crs: str) -> float | None:
+    """Return the metres of a unit of an engineering CRS (a local frame without a position on earth), else None.
+
+    Raises Invalid for a CRS that PROJ does not know.
+    """
+    try:
+        definition = CRS.from_user_input(crs)
+    except ProjError as error:
+        raise Invalid(f"unknown CRS {_short(crs)!r}: use a code such as EPSG:32632") from error
+    if definition.type_name != "Engineering CRS":
+        return None
+    return float(definition.axis_info[0].unit_conversion_factor) if definition.axis_info else 1.0
+
+
+def wgs84_wkt() -> str:
+    """Return WGS 84 in degrees as WKT 1, in the dialect of GDAL."""
+    return str(CRS.from_user_input(WGS84).to_wkt("WKT1_GDAL"))
 
 
 def check_crs(crs: str) -> None:
