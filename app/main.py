@@ -43,6 +43,7 @@ from app.config import Settings
 from app.convert.maps import Maps
 from app.convert.preview import Previews
 from app.convert.tiles import Tiles
+from app.convert.views import Views
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
@@ -288,6 +289,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         deltas=Deltas(service.cache),
         tiles=tiles,
         previews=Previews(store, tiles, service.cache),
+        views=Views(store, tiles),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
     )

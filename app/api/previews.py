@@ -14,13 +14,13 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router
 from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
+from app.convert.painting import ThemeName
 from app.convert.preview import (
     DEFAULT_WIDTH,
     LAYERS,
     MAX_WIDTH,
     MIN_WIDTH,
     PreviewRequest,
-    ThemeName,
     parse_layers,
     preview_key,
 )

@@ -47,21 +47,30 @@ def fit_frame(box: Box, width: int, margin: float, aspect: tuple[float, float]) 
 
 
 class Canvas:
-    """Picture in local metres, drawn from the bottom up. Widths and radii are pixels of the finished picture."""
+    """Picture in local metres, drawn from the bottom up. Widths and radii are pixels of the finished picture.
 
-    def __init__(self, frame: Frame, background: Colour) -> None:
+    background: None for a transparent one.
+    """
+
+    def __init__(self, frame: Frame, background: Colour | None) -> None:
         self.frame = frame
         self._size = (frame.height * OVERSAMPLING, frame.width * OVERSAMPLING)
         self._scale = frame.scale / OVERSAMPLING
-        self._pixels = np.empty((*self._size, 3), np.uint8)
-        self._pixels[:] = background
+        # Red, green, blue and opacity; the colours are multiplied by the opacity.
+        self._pixels = np.zeros((*self._size, 3 if background else 4), np.uint8)
+        if background:
+            self._pixels[:] = background
 
     def finish(self) -> Pixels:
-        """Return the picture: uint8 [height, width, 3]."""
+        """Return the picture: uint8 [height, width, 3], or 4 with a transparent background."""
         import cv2
 
         size = (self.frame.width, self.frame.height)
-        return np.asarray(cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+        small = np.asarray(cv2.resize(self._pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if small.shape[2] == 4:
+            opacity = np.maximum(small[..., 3:], 1).astype(np.float32)
+            small[..., :3] = np.round(small[..., :3] * (np.float32(255) / opacity)).clip(0, 255)
+        return small
 
     def raster(self, rgba: Pixels, transform: Affine) -> None:
         """Lay an image over the picture. transform: from its pixels to metres."""
@@ -78,7 +87,8 @@ class Canvas:
         how = cv2.INTER_LINEAR if shrinks else cv2.INTER_NEAREST
         drawn = np.asarray(cv2.warpAffine(weighted, matrix, (self._size[1], self._size[0]), flags=how))
         clear = np.float32(1.0) - drawn[..., 3:] / np.float32(255)
-        self._pixels = np.round(self._pixels * clear + drawn[..., :3]).clip(0, 255).astype(np.uint8)
+        bands = self._pixels.shape[2]
+        self._pixels = np.round(self._pixels * clear + drawn[..., :bands]).clip(0, 255).astype(np.uint8)
 
     def areas(self, shapes: NDArray[np.object_], colour: Colour, opacity: float) -> None:
         """Fill polygons; where they overlap, the colour is not added."""
@@ -136,7 +146,8 @@ class Canvas:
         x, y, width, height = cv2.boundingRect(mask)
         part = self._pixels[y : y + height, x : x + width]
         share = mask[y : y + height, x : x + width, None] * np.float32(opacity / 255)
-        part[...] = np.round(part + (np.array(colour, np.float32) - part) * share).astype(np.uint8)
+        full = np.array((*colour, 255)[: part.shape[2]], np.float32)
+        part[...] = np.round(part + (full - part) * share).astype(np.uint8)
 
     def _places(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
         """Convert (x, y) in metres to OpenCV's fixed-point pixels, whose middles are whole numbers."""

@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from app.convert.cache import Cache, ConvertedMap
-from app.convert.drawing import Canvas, Colour, Pixels, fit_frame
+from app.convert.drawing import Canvas, Pixels, fit_frame
+from app.convert.painting import THEMES, Painter, Shapes, ThemeName, cells_of_columns, shapes_of
 from app.convert.placement import Placement, place_columns, place_raster
 from app.convert.pyramid import Size, reduced_transform
 from app.convert.report import Report
 from app.convert.tiles import Tiles
-from app.derive.zones_to_occupancy import KEEPOUTS, LANES, SPEEDS
 from app.errors import Invalid, MissingDatum, NotFound, Problem
 from app.model import masks
 from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.geodesy import LocalFrame, local_frame
-from app.model.grid import FREE, OCCUPIED, UNKNOWN
+from app.model.grid import UNKNOWN
 from app.model.imagery import Affine
 from app.model.layers import MAP, VECTOR_LAYERS, PartKey
 from app.model.names import did_you_mean
@@ -39,8 +39,6 @@ PreviewLayer = Literal["imagery", "voxels", "occupancy", "zones", "objects", "to
 LAYERS: tuple[PreviewLayer, ...] = get_args(PreviewLayer)
 """Layers of a preview, from the bottom up."""
 
-ThemeName = Literal["light", "dark"]
-
 WRITER = 1
 """Version of the picture: raise it whenever equal content gives another one."""
 
@@ -51,12 +49,6 @@ ASPECT = (0.5, 1.25)
 MARGIN = 0.04
 """Margin around the content, as a share of the width."""
 
-DIMMED = 0.7
-"""Brightness of images in the dark theme."""
-
-SLICE = (0.2, 2.0)
-"""Heights in metres above the lowest voxel at which a voxel is drawn as occupied; lower ones are the floor."""
-
 MAX_SURROUNDINGS = 4.0
 """Maximum area of a site with its objects, per area without them; beyond it, objects are cut off."""
 
@@ -65,59 +57,6 @@ SURROUNDINGS = 0.1
 
 MAX_IMAGES = 8
 """Maximum number of images below a picture; those with the coarsest pixels are at the bottom."""
-
-
-@dataclass(frozen=True, slots=True)
-class Theme:
-    """Colours of a picture."""
-
-    background: Colour
-    free: Colour
-    occupied: Colour
-    edge: Colour
-    node: Colour
-    halo: Colour
-    fence: Colour
-    objects: Colour
-    keepout: Colour
-    lane: Colour
-    speed: Colour
-    zone: Colour
-    text: Colour
-
-
-THEMES: Mapping[ThemeName, Theme] = {
-    "light": Theme(
-        background=(238, 240, 242),
-        free=(254, 254, 254),
-        occupied=(58, 64, 72),
-        edge=(37, 99, 202),
-        node=(22, 66, 148),
-        halo=(255, 255, 255),
-        fence=(92, 104, 116),
-        objects=(120, 130, 142),
-        keepout=(206, 58, 58),
-        lane=(34, 146, 86),
-        speed=(214, 138, 22),
-        zone=(118, 92, 190),
-        text=(96, 104, 114),
-    ),
-    "dark": Theme(
-        background=(20, 23, 27),
-        free=(38, 43, 50),
-        occupied=(176, 186, 198),
-        edge=(96, 158, 252),
-        node=(172, 206, 255),
-        halo=(20, 23, 27),
-        fence=(150, 160, 172),
-        objects=(134, 146, 160),
-        keepout=(240, 98, 98),
-        lane=(74, 196, 128),
-        speed=(240, 178, 74),
-        zone=(160, 138, 236),
-        text=(150, 158, 168),
-    ),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +156,7 @@ class _Drawing:
         self._store, self._tiles, self._version = store, tiles, version
         self._request, self._entries = request, entries
         self._theme = THEMES[request.theme]
+        self._painter = Painter(request.theme, {e.key.layer for e in entries})
         self._features = self._load_features()
         self._frame = self._choose_frame()
 
@@ -224,7 +164,7 @@ class _Drawing:
         """Draw the picture: uint8 [height, width, 3]."""
         shapes = {key: self._shapes(part) for key, part in self._features.items()}
         rasters = self._rasters()
-        box = _site_box([r.box for r in rasters], shapes)
+        box = _site_box([r.box for r in rasters], {key: part.geometry for key, part in shapes.items()})
         if box is None:
             return self._empty()
         width = self._request.width
@@ -233,15 +173,7 @@ class _Drawing:
         for raster in rasters:
             canvas.raster(raster.rgba, raster.transform)
         weight = min(max(width / DEFAULT_WIDTH, 0.5), 2.0)
-        for layer, draw in (
-            ("zones", self._draw_zones),
-            ("objects", self._draw_objects),
-            ("location", self._draw_fence),
-            ("topology", self._draw_network),
-        ):
-            for key in sorted(shapes):
-                if key.layer == layer:
-                    draw(canvas, self._features[key], shapes[key], weight)
+        self._painter.features(canvas, shapes, weight)
         return canvas.finish()
 
     def _load_features(self) -> dict[PartKey, Features]:
@@ -258,11 +190,11 @@ class _Drawing:
         boxes = [box for e in self._entries if (box := e.bounds.get("wgs84")) is not None]
         return middle_frame(np.array(boxes).reshape(-1, 2)) if boxes else None
 
-    def _shapes(self, part: Features) -> NDArray[np.object_]:
+    def _shapes(self, part: Features) -> Shapes:
         """Return geometries in metres; without a frame only those that are."""
-        shapes = part.geometry[part.local] if self._frame is None else part.in_local(self._frame)
-        out: NDArray[np.object_] = shapes[~shapely.is_empty(shapes) & ~shapely.is_missing(shapes)]
-        return out
+        if self._frame is None:
+            return shapes_of(part, part.geometry[part.local], part.local)
+        return shapes_of(part, part.in_local(self._frame), np.ones(len(part), bool))
 
     # --- rasters ---
 
@@ -296,87 +228,23 @@ class _Drawing:
         except MissingDatum:
             return None
         rgba, transform = self._reduce(entry, placement)
-        if self._request.theme == "dark":
-            rgba = np.concatenate([np.round(rgba[..., :3] * DIMMED).astype(np.uint8), rgba[..., 3:]], axis=2)
+        rgba = self._painter.image(rgba)
         return _Raster(rgba, transform, _visible_box(rgba[..., 3] > 0, transform))
 
     def _grid(self, entry: PartEntry, *, over: bool) -> _Raster:
         cells, transform = self._reduce(entry, place_raster(self._tiles.header(entry), None))
-        return self._cells(cells, transform, over=over)
+        return _Raster(self._painter.cells(cells, over=over), transform, _visible_box(cells != UNKNOWN, transform))
 
     def _columns(self, entry: PartEntry) -> _Raster:
         columns = self._tiles.columns(self._version, entry.key)
-        size = Size(columns.width, columns.height)
-        k = size.reduction(self._request.width)
-        small = size.reduced(k)
-        side, (low, high) = max(small.width, small.height), columns.heights
-        cells = columns.tile(k, 0, 0, side, columns.heights)
-        cells[cells != UNKNOWN] = FREE
-        heights = (low + math.ceil(SLICE[0] / columns.resolution), low + math.ceil(SLICE[1] / columns.resolution))
-        walls = columns.tile(k, 0, 0, side, heights if heights[0] < high else columns.heights) == OCCUPIED
-        cells[walls] = OCCUPIED
-        cells = cells[: small.height, : small.width]
-        return self._cells(cells, reduced_transform(place_columns(columns).transform, k), over=False)
-
-    def _cells(self, cells: Pixels, transform: Affine, *, over: bool) -> _Raster:
-        """Colour cells from free to occupied; unknown ones are transparent, and free ones over an image."""
-        table = np.zeros((256, 4), np.uint8)
-        share = np.arange(OCCUPIED + 1)[:, None] / OCCUPIED
-        free, occupied = np.array(self._theme.free), np.array(self._theme.occupied)
-        table[: OCCUPIED + 1, :3] = occupied if over else np.round(free + (occupied - free) * share)
-        table[: OCCUPIED + 1, 3] = np.round(share[:, 0] * 230) if over else 255
-        return _Raster(table[cells], transform, _visible_box(cells != UNKNOWN, transform))
+        k = Size(columns.width, columns.height).reduction(self._request.width)
+        cells, transform = cells_of_columns(columns, k), reduced_transform(place_columns(columns).transform, k)
+        return _Raster(self._painter.cells(cells, over=False), transform, _visible_box(cells != UNKNOWN, transform))
 
     def _mask(self, entry: PartEntry) -> _Raster:
         """Tint the marked cells of a costmap filter mask."""
         cells, transform = self._reduce(entry, place_raster(self._tiles.header(entry), None))
-        marked = (cells > 0) & (cells != UNKNOWN)
-        rgba = np.zeros((*cells.shape, 4), np.uint8)
-        rgba[marked] = (*(self._theme.speed if "speed" in entry.key.name else self._theme.keepout), 70)
-        return _Raster(rgba, transform, None)
-
-    # --- features ---
-
-    def _kinds(self, part: Features) -> list[str]:
-        """Return the kind of each geometry of ``_shapes``."""
-        shown = part.local if self._frame is None else np.ones(len(part), bool)
-        shown = shown & ~shapely.is_empty(part.geometry) & ~shapely.is_missing(part.geometry)
-        return [str(part.properties[k].get("kind", "")).lower() for k in np.flatnonzero(shown).tolist()]
-
-    def _draw_zones(self, canvas: Canvas, part: Features, shapes: NDArray[np.object_], weight: float) -> None:
-        kinds, theme = np.array(self._kinds(part), object), self._theme
-        named = ((KEEPOUTS, theme.keepout), (LANES, theme.lane), (SPEEDS, theme.speed))
-        group = np.array([next((k for k, (names, _) in enumerate(named) if kind in names), -1) for kind in kinds])
-        for k, colour in ((-1, theme.zone), (1, theme.lane), (2, theme.speed), (0, theme.keepout)):
-            chosen = shapes[group == k]
-            if len(chosen):
-                canvas.areas(chosen, colour, 0.2)
-                canvas.lines(chosen, colour, 1.1 * weight, 0.8)
-
-    def _draw_objects(self, canvas: Canvas, part: Features, shapes: NDArray[np.object_], weight: float) -> None:
-        del part
-        raster = any(e.key.layer not in VECTOR_LAYERS for e in self._entries)
-        canvas.areas(shapes, self._theme.objects, 0.12 if raster else 0.28)
-        canvas.lines(shapes, self._theme.objects, 0.9 * weight, 0.9)
-        canvas.dots(shapes, self._theme.objects, 1.6 * weight, 0.9)
-
-    def _draw_fence(self, canvas: Canvas, part: Features, shapes: NDArray[np.object_], weight: float) -> None:
-        del part
-        canvas.dashes(shapes, self._theme.fence, 1.2 * weight, 7.0 * weight, 5.0 * weight)
-
-    def _draw_network(self, canvas: Canvas, part: Features, shapes: NDArray[np.object_], weight: float) -> None:
-        del part
-        types = shapely.get_type_id(shapes)
-        edges, nodes = shapes[types != 0], shapes[types == 0]
-        spacing = _spacing(edges, nodes) / canvas.frame.scale  # pixels
-        width = min(max(spacing * 0.12, 0.5), 1.5) * weight
-        if any(e.key.layer == "imagery" for e in self._entries):
-            canvas.lines(edges, self._theme.halo, width + 1.6 * weight, 0.6)
-        canvas.lines(edges, self._theme.edge, width, 0.95)
-        radius = min(max(spacing * 0.16, 0.8), 2.8) * weight
-        if radius >= 1.5 * weight:
-            canvas.dots(nodes, self._theme.halo, radius + 1.1 * weight)
-        canvas.dots(nodes, self._theme.node, radius)
+        return _Raster(self._painter.mask(cells, entry.key.name), transform, None)
 
     def _empty(self) -> Pixels:
         """Return a picture that says that there is nothing to draw."""
@@ -425,16 +293,6 @@ def _area(box: Box) -> float:
 
 def _areas(bounds: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((bounds[:, 2] - bounds[:, 0]) * (bounds[:, 3] - bounds[:, 1]))
-
-
-def _spacing(edges: NDArray[np.object_], nodes: NDArray[np.object_]) -> float:
-    """Return the typical distance in metres between neighbours of a network."""
-    if len(edges):
-        return float(np.median(shapely.length(edges)))
-    if len(nodes) < 2:
-        return math.inf
-    x0, y0, x1, y1 = shapely.total_bounds(nodes)
-    return math.hypot(x1 - x0, y1 - y0) / math.sqrt(len(nodes))
 
 
 def _visible_box(visible: NDArray[np.bool_], transform: Affine) -> Box | None:

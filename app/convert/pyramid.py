@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from app.model.grid import UNKNOWN
+from app.model.grid import UNKNOWN, halve_cells
 from app.model.imagery import Affine, GeoImage, display_pixels, display_range
 from app.store.windows import RasterReader
 from app.syntax import images
@@ -164,19 +164,6 @@ def encode_cells(cells: Pixels) -> bytes:
     out = np.full((TILE, TILE), UNKNOWN, np.uint8)
     out[: cells.shape[0], : cells.shape[1]] = cells
     return images.encode_png(out)
-
-
-def halve_cells(cells: Pixels) -> Pixels:
-    """Join 2 × 2 cells: the maximum of the known ones, unknown if there are none."""
-    shifted: Pixels = cells + np.uint8(256 - UNKNOWN)  # in uint8 arithmetic 255 becomes 0, the least
-    if len(shifted) % 2:
-        shifted = np.concatenate([shifted, np.zeros_like(shifted[:1])])
-    shifted = np.maximum(shifted[0::2], shifted[1::2])
-    if shifted.shape[1] % 2:
-        shifted = np.concatenate([shifted, np.zeros_like(shifted[:, :1])], axis=1)
-    shifted = np.maximum(shifted[:, 0::2], shifted[:, 1::2])
-    shifted -= np.uint8(256 - UNKNOWN)
-    return shifted
 
 
 def halve_colours(pixels: Pixels) -> Pixels:

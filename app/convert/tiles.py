@@ -11,12 +11,10 @@ import hashlib
 import io
 import os
 import struct
-import threading
 import zlib
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, TypeVar, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import orjson
@@ -36,6 +34,7 @@ from app.convert.pyramid import (
     piece_of_image,
     range_of_image,
 )
+from app.convert.recently_used import RecentlyUsed
 from app.convert.report import Report
 from app.convert.voxel_tiles import Columns, Span
 from app.errors import NotFound, Unavailable
@@ -61,34 +60,6 @@ MAX_LOST_ATTEMPTS = 3
 _INDEX = struct.Struct("<QII")
 """Entry of a pyramid's index: offset, size and CRC-32 of a tile."""
 
-T = TypeVar("T")
-
-
-class _RecentlyUsed(Generic[T]):
-    """Values in memory by key; beyond ``limit`` (a sum of sizes) the least recently used are dropped. Thread-safe."""
-
-    def __init__(self, limit: int, size: Callable[[T], int]) -> None:
-        self._limit, self._size, self._total = limit, size, 0
-        self._values: OrderedDict[Any, T] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: Any) -> T | None:
-        """Return the value, which is then the most recently used one."""
-        with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-            return self._values.get(key)
-
-    def put(self, key: Any, value: T) -> T:
-        """Keep a value; the newest stays, whatever its size."""
-        with self._lock:
-            if key not in self._values:
-                self._values[key] = value
-                self._total += self._size(value)
-            while self._total > self._limit and len(self._values) > 1:
-                self._total -= self._size(self._values.popitem(last=False)[1])
-        return value
-
 
 @dataclass(frozen=True, slots=True)
 class TileAddress:
@@ -104,9 +75,9 @@ class Tiles:
 
     def __init__(self, store: Store, cache: Cache) -> None:
         self._store, self._cache = store, cache
-        self._tiles: _RecentlyUsed[bytes] = _RecentlyUsed(MAX_TILE_BYTES, len)
-        self._sources: _RecentlyUsed[Source] = _RecentlyUsed(MAX_SOURCES, lambda _: 1)
-        self._columns: _RecentlyUsed[Columns] = _RecentlyUsed(MAX_COLUMN_BYTES, lambda columns: columns.size_bytes)
+        self._tiles: RecentlyUsed[bytes] = RecentlyUsed(MAX_TILE_BYTES, len)
+        self._sources: RecentlyUsed[Source] = RecentlyUsed(MAX_SOURCES, lambda _: 1)
+        self._columns: RecentlyUsed[Columns] = RecentlyUsed(MAX_COLUMN_BYTES, lambda columns: columns.size_bytes)
 
     def header(self, entry: PartEntry) -> RasterReader:
         """Return the reader of a stored grid or image: size and position without a pixel."""
@@ -152,14 +123,23 @@ class Tiles:
         if k < STORED:
             return source.reduce_all(k)
         size = source.size.reduced(k)
+        return self.window(entry, k, (0, 0, size.height, size.width))
+
+    def window(self, entry: PartEntry, k: int, box: tuple[int, int, int, int]) -> NDArray[np.uint8]:
+        """Return some pixels of a grid or image at a reduction. box: first row and column, and those after the last."""
+        source = self._source(entry)
+        top, left, bottom, right = box
+        if k < STORED:
+            return source.reduce(k, top, left, bottom - top, right - left)
         z = source.size.levels - 1 - k
-        out = np.empty((size.height, size.width, *source.bands), np.uint8)
-        rows, columns = size.tiles()
-        for row in range(rows):
-            for column in range(columns):
+        out = np.empty((bottom - top, right - left, *source.bands), np.uint8)
+        for row in range(top // TILE, -(-bottom // TILE)):
+            for column in range(left // TILE, -(-right // TILE)):
                 tile = _decode(self.raster_tile(entry, TileAddress(z, row, column)), source)
-                place = out[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
-                place[...] = tile[: place.shape[0], : place.shape[1]]
+                r0, r1 = max(top, row * TILE), min(bottom, (row + 1) * TILE)
+                c0, c1 = max(left, column * TILE), min(right, (column + 1) * TILE)
+                part = tile[r0 - row * TILE : r1 - row * TILE, c0 - column * TILE : c1 - column * TILE]
+                out[r0 - top : r1 - top, c0 - left : c1 - left] = part
         return out
 
     def columns(self, version: Version, key: PartKey) -> Columns:

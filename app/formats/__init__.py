@@ -134,13 +134,12 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[FileGroup]
     mains = {main for _, main in groups}
     names = tuple(sorted(files))
     speaking = tuple(sorted(main for fmt, main in groups if fmt.claims.is_sidecar(main)))
-    speakers = {fmt.name for fmt, main in groups if fmt.claims.is_sidecar(main)}
     yielding = {
         other
         for fmt, main in groups
-        if fmt.name in speakers and not fmt.claims.is_sidecar(main)
+        if speaking and not fmt.claims.is_sidecar(main)
         for other in fmt.claims.companions(main, files[main], speaking)
-        if fmt.claims.is_sidecar(other)
+        if other in speaking
     }
     groups = [(fmt, main) for fmt, main in groups if main not in yielding]
     mains -= yielding

@@ -27,7 +27,8 @@ from app.formats import Claims, Files, Format, LayerRequirements, Parts, ReadCon
 from app.formats._select import file_stem, select_part
 from app.limits import Limits
 from app.model.frame import MAX_METRES, is_writable
-from app.model.geodesy import WGS84
+from app.model.geodesy import WGS84, LocalFrame
+from app.model.georeference import to_earth, to_local
 from app.model.imagery import DEFAULT_COLOURS, LOCAL, Affine, GeoImage, display_pixels, pixel_positions
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resample
@@ -61,6 +62,9 @@ DEGREE_PIXEL = 2e-4
 HOW_TO_SUPPLY = (
     "no position for the image: add a world file (.pgw, .jgw, .tfw), or set corners=lat,lon,… of two opposite "
     "or all four corners, or, for a floor plan, metres_per_pixel with origin and yaw"
+)
+NO_PLACE = (
+    "its coordinates are metres of the local frame, an engineering CRS without a position on earth: set a datum for one"
 )
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?|[-+]?(nan|inf(inity)?)", re.IGNORECASE)
 
@@ -197,8 +201,13 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise type(error)(f"{image}: {error.detail}", [Problem(error.detail, image)]) from error
     for doubt in raster.doubts:
         context.warn(doubt, file=image)
-    file_crs = raster.crs or _sidecar_crs(files, context)
-    transform, crs = _place(replace(raster, crs=file_crs), image, world, files, options, context)
+    if raster.crs is None:
+        raster = _with_sidecar(raster, files, context)
+    transform, crs = _place(raster, image, world, files, options, context)
+    if raster.is_local and context.frame is not None and crs != LOCAL:
+        height, width = raster.pixels.shape[:2]
+        metres = to_local(transform, crs, (width, height), context.frame)
+        transform, crs = (transform, crs) if metres is None else (metres, LOCAL)
     try:
         picture = GeoImage(raster.pixels, transform, crs, raster.properties)
     except Invalid as error:
@@ -382,8 +391,8 @@ def _from_corners(corners: Sequence[float], width: int, height: int, image: str,
     return transform
 
 
-def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
-    """Return the CRS of a .prj or .aux.xml beside an image."""
+def _with_sidecar(raster: geotiff.Raster, files: Files, context: ReadContext) -> geotiff.Raster:
+    """Return an image with the CRS and our own mark of a .prj or .aux.xml beside it."""
     for name in sorted(files):
         lower, data = name.lower(), files[name]
         if not lower.endswith((".prj", ".aux.xml")):
@@ -391,16 +400,19 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
         if len(data) > MAX_SIDECAR:
             raise TooLarge(f"{name} has {len(data)} bytes; the limit is {MAX_SIDECAR}", [Problem("too large", name)])
         try:
+            is_local = raster.is_local
             if lower.endswith(".prj"):
                 text: str | None = data.decode("utf-8-sig")
             else:
-                text = xml.parse(data, context.limits).findtext(".//SRS")
+                root = xml.parse(data, context.limits)
+                text = root.findtext(".//SRS")
+                is_local = root.findtext(f".//MDI[@key='{geotiff.OWN_TAG}']") == LOCAL
             if text and text.strip():
-                return geotiff.crs_from_wkt(text)
+                return replace(raster, crs=geotiff.crs_from_wkt(text), is_local=is_local)
         except (UnreadableFile, UnicodeError) as error:
             reason = error.detail if isinstance(error, UnreadableFile) else "not UTF-8 text"
             raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name)]) from error
-    return None
+    return raster
 
 
 def _check_place(picture: GeoImage, image: str) -> None:
@@ -431,26 +443,27 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     elif options.resampling is not None:
         raise Invalid("resampling has no effect without crs=local, crs=wgs84 or a resolution: set one of them")
     stem = file_stem(options.picture or NAME, NAME)
-    named: str | None = picture.crs
-    if picture.crs == LOCAL:
-        named = None
-        if options.crs == "local" and layers.frame is not None and layers.frame.datum.heading == 0.0:
-            named = layers.frame.crs
+    picture, named = _on_earth(picture, layers.frame)
     if options.file_type == "png":
         return _write_png(picture, named, stem, context)
     if named is None:
-        context.warn(
-            "its coordinates are metres of the local frame, an engineering CRS without a position on earth; use "
-            "crs=wgs84 for one (needs a datum)",
-            file=f"{stem}.tif",
-        )
+        context.warn(NO_PLACE, file=f"{stem}.tif")
     tags = _tags(picture)
-    if named is None:
+    if picture.crs == LOCAL:
         tags[geotiff.OWN_TAG] = LOCAL
     credit = [*picture.attribution, *context.attribution]
     if credit:
         tags.setdefault("TIFFTAG_COPYRIGHT", "; ".join(dict.fromkeys(credit)))
     return {f"{stem}.tif": geotiff.write_cog(picture, named, tags)}
+
+
+def _on_earth(picture: GeoImage, frame: LocalFrame | None) -> tuple[GeoImage, str | None]:
+    """Return an image with the transform to write, and the CRS of that; None without a datum for local metres."""
+    if picture.crs != LOCAL:
+        return picture, picture.crs
+    if frame is None:
+        return picture, None
+    return replace(picture, transform=to_earth(picture.transform, frame)), frame.wkt
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
@@ -506,33 +519,13 @@ def _write_png(picture: GeoImage, crs: str | None, stem: str, context: WriteCont
     extra = count - shown - any(c in ("alpha", "mask") for c in colours)
     context.drop("bands", extra, "PNG is written as grey or RGB with transparency; file_type=tif keeps all bands")
     context.drop("tags", len(_tags(picture)), "they are GeoTIFF metadata; file_type=tif keeps them")
-    a, b, c, d, e, f = picture.transform
-    digits = METRES if crs is None or abs(a) + abs(e) > 0.1 else DEGREES
-    numbers = [*map(_exact, (a, d, b, e)), _round(c + a / 2 + b / 2, digits), _round(f + d / 2 + e / 2, digits)]
-    out = {f"{stem}.png": images.encode_png(pixels), f"{stem}.pgw": ("\n".join(numbers) + "\n").encode()}
+    digits = METRES if crs is None or abs(picture.transform[0]) + abs(picture.transform[4]) > 0.1 else DEGREES
+    out = {f"{stem}.png": images.encode_png(pixels), f"{stem}.pgw": geotiff.world_file(picture.transform, digits)}
     if crs is None:
-        context.warn(
-            "its coordinates are metres of the local frame; upload it again with crs=local", file=f"{stem}.pgw"
-        )
+        context.warn(f"{NO_PLACE}. To upload it again, set crs=local", file=f"{stem}.pgw")
     else:
-        out[f"{stem}.png.aux.xml"] = _aux_xml(crs)
+        out[f"{stem}.png.aux.xml"] = geotiff.aux_xml(crs, is_local=picture.crs == LOCAL)
     return out
-
-
-def _exact(value: float) -> str:
-    return repr(float(value) + 0.0)
-
-
-def _round(value: float, digits: int) -> str:
-    """Round to a nanometre, or to 15 digits if these are fewer, so that a shift by half a pixel and back is exact."""
-    return repr(float(f"{round(value, digits):.15g}") + 0.0)
-
-
-def _aux_xml(crs: str) -> bytes:
-    """Return GDAL's sidecar file with the CRS, which QGIS and GDAL read."""
-    from xml.sax.saxutils import escape
-
-    return f"<PAMDataset>\n  <SRS>{escape(geotiff.crs_to_wkt(crs))}</SRS>\n</PAMDataset>\n".encode()
 
 
 register(
@@ -544,7 +537,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        version=2,
+        version=3,
         needs=LayerRequirements((frozenset({"imagery"}),)),
         read_options=ReadOptions,
         write_options=WriteOptions,

@@ -14,6 +14,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from pyproj import CRS, Geod, Proj, Transformer
+from pyproj.crs import ProjectedCRS
+from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 from pyproj.exceptions import ProjError
 
 from app.errors import Invalid
@@ -22,6 +24,9 @@ from app.model.frame import MAX_METRES, Datum
 Array = NDArray[np.float64]
 
 WGS84 = "EPSG:4326"
+
+SAME_METRES = 1e-6
+"""Maximum distance of coordinates that are equal in two definitions of a CRS."""
 
 
 class LocalFrame:
@@ -52,10 +57,18 @@ class LocalFrame:
 
     @property
     def wkt(self) -> str:
-        """Return ``crs`` as WKT 1, in the dialect of GDAL, with a name for people."""
-        definition = CRS.from_user_input(self.crs).to_json_dict()
-        definition["name"] = "local frame: metres east and north of the datum"
-        return str(CRS.from_json_dict(definition).to_wkt("WKT1_GDAL"))
+        """Return ``crs`` with a name as WKT 1, which every GIS reads."""
+        datum = self.datum
+        conversion = TransverseMercatorConversion(datum.latitude, datum.longitude, 0.0, 0.0, 1.0)
+        name = f"metres east and north of {datum.latitude:.7f}, {datum.longitude:.7f}"
+        return str(ProjectedCRS(conversion, name, geodetic_crs=WGS84).to_wkt("WKT1_GDAL"))
+
+    def is_same_crs(self, crs: str, points: Array) -> bool:
+        """Return whether these points (x, y) of a CRS have the same coordinates in ``crs``: float64 [n, 2]."""
+        try:
+            return bool((np.abs(between(crs, self.crs, points) - points) <= SAME_METRES).all())
+        except Invalid:
+            return False
 
     @property
     def from_local(self) -> tuple[float, float, float, float]:

@@ -95,6 +95,19 @@ class OccupancyGrid:
         return {"occupied": occupied, "free": free, "unknown": unknown, "other": other}
 
 
+def halve_cells(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Join 2 × 2 cells: the maximum of the known ones, unknown if there are none."""
+    shifted: NDArray[np.uint8] = cells + np.uint8(256 - UNKNOWN)  # in uint8 arithmetic 255 becomes 0, the least
+    if len(shifted) % 2:
+        shifted = np.concatenate([shifted, np.zeros_like(shifted[:1])])
+    shifted = np.maximum(shifted[0::2], shifted[1::2])
+    if shifted.shape[1] % 2:
+        shifted = np.concatenate([shifted, np.zeros_like(shifted[:, :1])], axis=1)
+    shifted = np.maximum(shifted[:, 0::2], shifted[:, 1::2])
+    shifted -= np.uint8(256 - UNKNOWN)
+    return shifted
+
+
 UNKNOWN_GREY = "unknown_grey"
 """Property of a grid: the free cells with map_saver's grey for unknown (205). Nav2 treats them as free by the grid's
 free_thresh; whether they were observed is unknown.

@@ -18,6 +18,7 @@ from app.errors import Invalid, MissingDatum
 from app.model.frame import MAX_METRES
 from app.model.gdal import gdal, native, open_memory_dataset
 from app.model.geodesy import WGS84, LocalFrame, between
+from app.model.georeference import Turn, turn
 from app.model.imagery import CLEAR, LOCAL, Affine, GeoImage, pixel_positions
 
 Method = Literal["nearest", "bilinear", "cubic"]
@@ -63,7 +64,7 @@ def resample(
     if picture.crs == LOCAL and crs == LOCAL:
         source = target = _NO_CRS
         back = forth = (1.0, 0.0, 0.0, 1.0)
-    base = _rotate_transform(picture.transform, forth)
+    base = turn(picture.transform, forth)
 
     def to_target(points: NDArray[np.float64]) -> NDArray[np.float64]:
         return _rotate_back(points if source == target else between(source, target, points), back)
@@ -90,16 +91,13 @@ def resample(
         )
     grid = (resolution, 0.0, float(low[0]) * resolution, 0.0, -resolution, float(high[1]) * resolution)
     shape = (int(rows), int(columns))
-    pixels, properties = _warp(picture, method, shape, base, source, _rotate_transform(grid, back), target)
+    pixels, properties = _warp(picture, method, shape, base, source, turn(grid, back), target)
     return replace(picture, pixels=pixels, transform=grid, crs=crs, properties=properties)
 
 
 def _is_upright(transform: Affine) -> bool:
     a, b, _, d, e, _ = transform
     return b == 0.0 and d == 0.0 and a > 0.0 and abs(a + e) <= 1e-12 * a
-
-
-Turn = tuple[float, float, float, float]
 
 
 def _target_crs(crs: str, frame: LocalFrame | None) -> tuple[str, Turn]:
@@ -109,21 +107,14 @@ def _target_crs(crs: str, frame: LocalFrame | None) -> tuple[str, Turn]:
     return crs, (1.0, 0.0, 0.0, 1.0)
 
 
-def _rotate_transform(transform: Affine, turn: Turn) -> Affine:
-    """Return a transform with rotated coordinates."""
-    a, b, c, d, e, f = transform
-    p, q, r, s = turn
-    return (p * a + q * d, p * b + q * e, p * c + q * f, r * a + s * d, r * b + s * e, r * c + s * f)
-
-
-def _transform_points(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
-    p, q, r, s = turn
+def _transform_points(points: NDArray[np.float64], matrix: Turn) -> NDArray[np.float64]:
+    p, q, r, s = matrix
     return np.column_stack([p * points[:, 0] + q * points[:, 1], r * points[:, 0] + s * points[:, 1]])
 
 
-def _rotate_back(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
+def _rotate_back(points: NDArray[np.float64], matrix: Turn) -> NDArray[np.float64]:
     """Rotate back: the inverse of a rotation is its transpose."""
-    p, q, r, s = turn
+    p, q, r, s = matrix
     return _transform_points(points, (p, r, q, s))
 
 

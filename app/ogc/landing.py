@@ -5,7 +5,9 @@ from __future__ import annotations
 from starlette.responses import Response
 
 from app.api.http.schemas import component_schemas
+from app.ogc.crs import CRS84, reference_systems
 from app.ogc.extensions import Extension, extensions
+from app.ogc.extent import site_box
 from app.ogc.negotiation import HTML, JSON, OPENAPI, PAGES, Representation
 from app.ogc.pages import add, link_list, page, representations, respond_page
 from app.ogc.routing import both, ogc_router
@@ -56,6 +58,11 @@ async def get_landing_page(service: Service, f: Representation = None) -> Respon
     credits_ = _attribution(service)
     if credits_:
         document["attribution"] = credits_
+    box = site_box(service)
+    if service.version.datum is not None:
+        document["crs"] = list(reference_systems(service, service.version.datum))
+    if box is not None:
+        document["extent"] = {"spatial": {"bbox": [list(box)], "crs": CRS84}}
     if used == "json":
         return service.respond_json({**document, "links": links})
     root, body = page(service.title)

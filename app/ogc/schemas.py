@@ -19,23 +19,6 @@ class OgcLinkOut(BaseModel):
     title: str
 
 
-class OgcLandingOut(BaseModel):
-    """Landing page."""
-
-    title: str
-    description: str
-    attribution: str | SkipJsonSchema[None] = omittable("Credits of the sources; omitted if there are none.")
-    links: list[OgcLinkOut]
-
-
-class OgcConformanceOut(BaseModel):
-    """Conformance classes."""
-
-    model_config = ConfigDict(populate_by_name=True)
-
-    conforms_to: list[str] = Field(alias="conformsTo")
-
-
 class OgcSpatialExtentOut(BaseModel):
     """Boxes of a collection."""
 
@@ -49,6 +32,25 @@ class OgcExtentOut(BaseModel):
     """Extent of a collection."""
 
     spatial: OgcSpatialExtentOut
+
+
+class OgcLandingOut(BaseModel):
+    """Landing page."""
+
+    title: str
+    description: str
+    attribution: str | SkipJsonSchema[None] = omittable("Credits of the sources; omitted if there are none.")
+    crs: list[str] | SkipJsonSchema[None] = omittable("CRSs of maps; omitted without a datum.")
+    extent: OgcExtentOut | SkipJsonSchema[None] = omittable("Omitted if nothing has a position.")
+    links: list[OgcLinkOut]
+
+
+class OgcConformanceOut(BaseModel):
+    """Conformance classes."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    conforms_to: list[str] = Field(alias="conformsTo")
 
 
 class OgcCollectionOut(BaseModel):

@@ -10,7 +10,7 @@ import itertools
 import math
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,7 +30,7 @@ BLOCK = 512
 """Side of a written tile, in pixels."""
 
 OWN_TAG = "FLEETMAP_CRS"
-"""Private metadata item: ``local`` if the coordinates are metres of the local frame."""
+"""Private metadata item: ``local`` if the raster is anchored in the local frame, whatever CRS the file names."""
 
 LOCAL_WKT = 'LOCAL_CS["local frame",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
 """The local frame as an engineering CRS, without a position on earth: GDAL keeps its name and unit in GeoTIFF keys."""
@@ -48,6 +48,8 @@ MAX_TAGS = 4096
 MAX_PAGES = 1000
 """Maximum number of pages. Overviews and masks are pages, too: real files have up to about thirty."""
 
+Halve = Callable[[NDArray[Any]], NDArray[Any]]
+
 CRS_NAME = re.compile(r"(EPSG|ESRI|IAU_\d{4}):\d{1,7}|OGC:CRS84", re.IGNORECASE)
 
 _MEMORY_NAME = re.compile(r"/vsimem/[0-9a-f-]+/[0-9a-f-]+\.tif(?:, band \d+)?:?\s*")
@@ -55,13 +57,17 @@ _MEMORY_NAME = re.compile(r"/vsimem/[0-9a-f-]+/[0-9a-f-]+\.tif(?:, band \d+)?:?\
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Decoded TIFF. transform, crs: None if it has none. properties: as in ``GeoImage``, with the file's tags."""
+    """Decoded TIFF. transform, crs: None if it has none. properties: as in ``GeoImage``, with the file's tags.
+
+    is_local: our own mark, see ``OWN_TAG``.
+    """
 
     pixels: NDArray[Any]
     transform: Affine | None
     crs: str | None
     properties: dict[str, Any] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
+    is_local: bool = False
 
 
 # --- detection ----------------------------------------------------------------------------------------------------
@@ -72,11 +78,13 @@ def is_tiff(data: bytes) -> bool:
 
 def is_georeferenced(data: bytes) -> bool:
     """Return whether the first page of a TIFF has georeferencing tags."""
-    tags = _tags(data)
-    if GEO_TAGS & tags.keys():
-        return True
-    start, size = tags.get(GDAL_METADATA, (0, 0))
-    return OWN_TAG.encode() in data[start : start + size]
+    return bool(GEO_TAGS & _tags(data).keys()) or has_item(data, OWN_TAG)
+
+
+def has_item(data: bytes, name: str) -> bool:
+    """Return whether the first page of a TIFF has a metadata item of GDAL."""
+    start, size = _tags(data).get(GDAL_METADATA, (0, 0))
+    return name.encode() in data[start : start + size]
 
 
 MAX_BANDS = 1024
@@ -253,7 +261,7 @@ def _decode(dataset: Any, rasterio: Any) -> Raster:
     is_local = tags.pop(OWN_TAG, None) == LOCAL
     transform, crs = _placement(dataset, is_local, doubts)
     properties = _properties(dataset, tags, masked)
-    return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts))
+    return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts), is_local)
 
 
 def _pixels(dataset: Any, rasterio: Any, masked: bool) -> NDArray[Any]:
@@ -376,11 +384,12 @@ def fit_affine(points: Sequence[tuple[float, float, float, float]]) -> tuple[Aff
 
 
 # --- writing ------------------------------------------------------------------------------------------------------
-def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> bytes:
+def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str], halve: Halve | None = None) -> bytes:
     """Write a cloud optimized GeoTIFF: tiles of 512 pixels, overviews above that size, deflate with a predictor.
 
-    crs: its name or WKT; None: metres of the local frame. tags: of the whole file. The pixels are not copied: GDAL
-    reads the array in place.
+    crs: its name or WKT; None: metres of the local frame. tags: of the whole file. halve: makes an overview of the
+    level below it, both [height, width], of an image with one band; None: GDAL averages shades and takes the nearest of
+    others. The pixels are not copied: GDAL reads the array in place.
     The file has no time stamp and no version, so equal images give equal bytes.
     """
     from rasterio import shutil
@@ -402,13 +411,33 @@ def write_cog(picture: GeoImage, crs: str | None, tags: Mapping[str, str]) -> by
     }
     # Cache two rows of the largest overview's tiles: an incomplete tile would be written twice.
     cache = max(CACHE // 4, BLOCK * pixels.shape[1] * pixels.shape[2] * pixels.itemsize)
-    with gdal(cache) as rasterio, MemoryFile() as out:
+    with gdal(cache) as rasterio, MemoryFile(ext=".tif") as draft, MemoryFile() as out:
         with open_memory_dataset(rasterio, pixels, count, described=True) as dataset:
             _describe(dataset, picture, colours[:count], crs, tags, rasterio)
             if masked:
                 dataset.write_mask(pixels[..., count] != 0)
-            shutil.copy(dataset, out.name, driver="COG", **options)
+            if halve is None or max(pixels.shape[:2]) <= BLOCK:
+                shutil.copy(dataset, out.name, driver="COG", **options)
+            else:
+                _write_overviews(dataset, draft.name, halve, pixels[..., 0], rasterio)
+                with rasterio.open(draft.name) as complete:
+                    shutil.copy(complete, out.name, driver="COG", **options, OVERVIEWS="FORCE_USE_EXISTING")
         return buffer_bytes(out.getbuffer())
+
+
+def _write_overviews(dataset: Any, name: str, halve: Halve, pixels: NDArray[Any], rasterio: Any) -> None:
+    """Copy a dataset to a plain GeoTIFF, and write its overviews: GDAL cannot be given their pixels otherwise."""
+    from rasterio import shutil
+
+    options = {"TILED": "YES", "BLOCKXSIZE": str(BLOCK), "BLOCKYSIZE": str(BLOCK), "COMPRESS": "DEFLATE", "ZLEVEL": "1"}
+    shutil.copy(dataset, name, driver="GTiff", **options)
+    count = ((max(pixels.shape) - 1) // BLOCK).bit_length()
+    with rasterio.open(name, "r+") as draft:
+        draft.build_overviews([2**k for k in range(1, count + 1)], rasterio.enums.Resampling.nearest)
+    for k in range(count):
+        pixels = halve(pixels)
+        with rasterio.open(f"GTIFF_DIR:{k + 2}:{name}", "r+") as overview:
+            overview.write(pixels, 1)
 
 
 def _is_shade(picture: GeoImage) -> bool:
@@ -465,3 +494,28 @@ def crs_to_wkt(crs: str) -> str:
     """Format a CRS as WKT 1 if possible, since older tools read no other, else WKT 2."""
     with gdal() as rasterio:
         return str(rasterio.crs.CRS.from_user_input(crs).to_wkt())
+
+
+# --- files beside an image ----------------------------------------------------------------------------------------
+def world_file(transform: Affine, digits: int) -> bytes:
+    """Format a world file: for the centre of a pixel, in the order of ESRI. digits: decimals of the position."""
+    a, b, c, d, e, f = transform
+    numbers = [*map(_exact, (a, d, b, e)), _round(c + a / 2 + b / 2, digits), _round(f + d / 2 + e / 2, digits)]
+    return ("\n".join(numbers) + "\n").encode()
+
+
+def _exact(value: float) -> str:
+    return repr(float(value) + 0.0)
+
+
+def _round(value: float, digits: int) -> str:
+    """Round to a nanometre, or to 15 digits if these are fewer, so that a shift by half a pixel and back is exact."""
+    return repr(float(f"{round(value, digits):.15g}") + 0.0)
+
+
+def aux_xml(crs: str, *, is_local: bool) -> bytes:
+    """Format GDAL's sidecar file with the CRS, which QGIS and GDAL read, and our own mark."""
+    from xml.sax.saxutils import escape
+
+    mark = f'  <Metadata>\n    <MDI key="{OWN_TAG}">{LOCAL}</MDI>\n  </Metadata>\n' if is_local else ""
+    return f"<PAMDataset>\n  <SRS>{escape(crs_to_wkt(crs))}</SRS>\n{mark}</PAMDataset>\n".encode()

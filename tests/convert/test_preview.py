@@ -13,9 +13,9 @@ from PIL import Image
 
 from app.convert.cache import Cache
 from app.convert.drawing import Canvas, fit_frame
+from app.convert.painting import THEMES
 from app.convert.preview import (
     ASPECT,
-    THEMES,
     PreviewRequest,
     Previews,
     parse_layers,

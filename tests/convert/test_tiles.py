@@ -17,13 +17,13 @@ from PIL import Image
 from app.convert import pyramid
 from app.convert.cache import Cache
 from app.convert.placement import place_columns, place_raster
-from app.convert.pyramid import TILE, Size, halve_cells, halve_colours
+from app.convert.pyramid import TILE, Size, halve_colours
 from app.convert.tiles import TileAddress, Tiles
 from app.convert.voxel_tiles import Columns, slice_heights
 from app.errors import Invalid, MissingDatum, NotFound
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
-from app.model.grid import OccupancyGrid
+from app.model.grid import OccupancyGrid, halve_cells
 from app.model.imagery import GeoImage, display_pixels
 from app.model.layers import Part, PartKey
 from app.model.voxels import VoxelMap, morton

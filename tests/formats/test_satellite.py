@@ -24,7 +24,7 @@ from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.formats.satellite import ReadOptions, WriteOptions, detect, options_from_filename
 from app.limits import Limits
 from app.model.frame import Datum
-from app.model.geodesy import crs_bounds
+from app.model.geodesy import crs_bounds, local_frame
 from app.model.imagery import GeoImage, pixel_positions
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resample
@@ -622,14 +622,49 @@ def test_crs_option_resamples_image(tmp_path: Path) -> None:
         extent = np.array(gdalinfo(tmp_path / name)["wgs84Extent"]["coordinates"][0])
         assert extent.min(axis=0) == pytest.approx(box[:2], abs=1e-5)
         assert extent.max(axis=0) == pytest.approx(box[2:], abs=1e-5)
-    turned, context = written(picture, Datum(53.2686, -0.5245, heading=30.0), crs="local")
-    back, _ = read(turned)
-    assert back.crs == "local"
-    assert "metres of the local frame" in context.warnings[0].problem
     with pytest.raises(MissingDatum, match="datum"):
         written(picture, crs="local")
     with pytest.raises(Invalid, match="set one of them"):
         written(picture, resampling="nearest")
+
+
+TURNED = Datum(53.2686123456, -0.5245123456, heading=37.5)
+
+
+@pytest.mark.parametrize("crs", ["source", "local"])
+@pytest.mark.parametrize("kind", ["tif", "png"])
+def test_local_image_is_placed_on_earth_with_the_heading(kind: str, crs: str, tmp_path: Path) -> None:
+    """Corners as GDAL computes them from the file are those of the local frame to 1 mm, and come back unchanged."""
+    transform = (0.04, 0.03, 812.25, 0.03, -0.04, -1500.5) if crs == "source" else (0.05, 0.0, 812.25, 0.0, -0.05, 9.5)
+    picture = GeoImage(np.arange(60, dtype=np.uint8).reshape(4, 5, 3), transform)
+    files, context = written(picture, TURNED, file_type=kind, crs=crs)
+    assert context.warnings == []
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    frame = local_frame(TURNED)
+    corners = np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 4.0], [0.0, 4.0]])
+    degrees = gdaltransform(tmp_path / f"satellite.{kind}", corners)
+    off = frame.to_local(degrees) - pixel_positions(transform, corners[:, 0], corners[:, 1])
+    assert np.abs(off).max() < 1e-3
+    back, context = read(files, f"satellite.{kind}", frame=frame)
+    assert (back.crs, back.transform, context.warnings) == ("local", transform, [])
+    elsewhere, _ = read(files, f"satellite.{kind}", frame=local_frame(HERE))
+    assert elsewhere.crs != "local"
+    box = crs_bounds(elsewhere.crs, elsewhere.outline())
+    assert box is not None
+    assert np.abs(np.array(box) - [*degrees.min(axis=0), *degrees.max(axis=0)]).max() < 1e-8
+
+
+def gdaltransform(path: Path, pixels: Any) -> Any:
+    """Convert (column, row) of a file to (longitude, latitude) with GDAL's own program."""
+    program = shutil.which("gdaltransform")
+    if program is None:
+        pytest.skip("gdaltransform is not installed")
+    lines = "\n".join(f"{u} {v}" for u, v in pixels.tolist())
+    done = subprocess.run(
+        [program, "-output_xy", "-t_srs", "EPSG:4326", path], input=lines, capture_output=True, text=True, check=True
+    )
+    return np.array([[float(word) for word in line.split()] for line in done.stdout.splitlines()])
 
 
 def test_resolution_option_resamples_image() -> None:

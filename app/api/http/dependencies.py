@@ -22,6 +22,7 @@ from app.api.http.uploads import UploadSpool
 from app.convert.maps import Maps
 from app.convert.preview import Previews
 from app.convert.tiles import Tiles
+from app.convert.views import Views
 from app.errors import Unavailable
 from app.fleet import ReportQueue as FleetIntake
 from app.ingest import CommitRequest, Ingest
@@ -116,6 +117,7 @@ class Services:
     deltas: Deltas
     tiles: Tiles
     previews: Previews
+    views: Views
     fleet: FleetIntake
     writability: Writability
     prepared: threading.Event = field(default_factory=threading.Event)

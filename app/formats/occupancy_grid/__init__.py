@@ -8,6 +8,8 @@ top row is the map's last one. Comparisons are in float32. Source: nav2_map_serv
 
 A costmap filter mask (keepout, speed) is such a grid with an additional ``<grid>_filter_info.yaml``: see ``_masks``.
 
+``<grid>.tif`` is the same grid for GIS: see ``geotiff_grid``.
+
 Frame: local; ``origin`` = [x, y, yaw] of the lower left corner, metres and radians. Nav2 ignores the yaw.
 """
 
@@ -19,12 +21,12 @@ from collections.abc import Iterable, Sequence
 from app.errors import FleetMapError
 from app.formats import BAD_INPUT, Claims, Format, LayerRequirements, Parts, Selection, _masks, register
 from app.formats._select import file_stem
-from app.formats.occupancy_grid import rules
-from app.formats.occupancy_grid.reading import IMAGE_ENDS, YAML_ENDS, ReadOptions, find_image, is_image, read
+from app.formats.occupancy_grid import geotiff_grid, rules
+from app.formats.occupancy_grid.reading import IMAGE_ENDS, TIFF_ENDS, YAML_ENDS, ReadOptions, find_image, is_image, read
 from app.formats.occupancy_grid.words import NAME
 from app.formats.occupancy_grid.writing import WriteOptions, choose, write
 from app.limits import Limits
-from app.syntax import yaml
+from app.syntax import geotiff, yaml
 
 _BLOCK = re.compile(
     rb'^["\']?(image|resolution|origin|occupied_thresh|free_thresh|negate)(?=["\']?[ \t]*:)', re.MULTILINE
@@ -35,8 +37,10 @@ HEAD = 2**16
 
 
 def detect(name: str, data: bytes) -> bool:
-    """Detect YAML with an image and at least two of a grid's other keys. A single image is not detected."""
+    """Detect YAML with an image and at least two of a grid's other keys, and our GeoTIFF; no other single image."""
     del name
+    if geotiff_grid.is_grid(data):
+        return True
     head = data[:HEAD]
     if b"image" not in head or b"\0" in head:
         return False
@@ -47,27 +51,38 @@ def detect(name: str, data: bytes) -> bool:
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
     """Find the image of a YAML file, and a mask's parameters; for an image, the YAML file with the same stem."""
+    if geotiff.is_tiff(data):
+        return _masks.companions(main, names)
     if is_image(main, data):
         stem = main.rpartition(".")[0]
         return [n for n in names if n in (stem + ".yaml", stem + ".yml")]
     try:
         image = yaml.load(data, Limits(yaml_nodes=10_000))["image"]
-        return [n for n in [find_image(str(image), main, names)[0]] if n] + _masks.companions(main, names)
+        picture = find_image(str(image), main, names)[0]
+        return [n for n in [picture] if n] + _world_files(str(image), main, names) + _masks.companions(main, names)
     except (*BAD_INPUT, FleetMapError):  # the reader reports the error
         return []
+
+
+def _world_files(image: str, main: str, names: Sequence[str]) -> list[str]:
+    """Find the world file and the CRS beside an image. They say nothing that the YAML file does not."""
+    folder = main.rpartition("/")[0]
+    base = re.split(r"[/\\]", image)[-1]
+    path = f"{folder}/{base}" if folder else base
+    return [n for n in (path.rpartition(".")[0] + ".pgw", path + ".aux.xml") if n in names]
 
 
 def options_from_filename(name: str) -> dict[str, str]:
     """Select the grid ``keepout`` for ``keepout.yaml``, ``.pgm`` and ``keepout_filter_info.yaml``.
 
-    ``keepout.png`` also selects PNG.
+    ``keepout.png`` also selects PNG, ``keepout.tif`` GeoTIFF.
     """
     stem, _, end = name.rpartition(".")
     if f".{end}" in YAML_ENDS:
         stem = stem.removesuffix(_masks.SUFFIX)
-    if not stem or f".{end}" not in (*YAML_ENDS, ".pgm", ".png"):
+    if not stem or f".{end}" not in (*YAML_ENDS, ".pgm", ".png", ".tif"):
         return {}
-    return {"grid": stem, **({"file_type": end} if end in ("pgm", "png") else {})}
+    return {"grid": stem, **({"file_type": end} if end in ("pgm", "png", "tif") else {})}
 
 
 register(
@@ -83,8 +98,8 @@ register(
         read_options=ReadOptions,
         write_options=WriteOptions,
         check=rules.check,
-        version=4,
-        extensions=(*YAML_ENDS, *IMAGE_ENDS),
+        version=5,
+        extensions=(*YAML_ENDS, *IMAGE_ENDS, *TIFF_ENDS),
         selection=Selection(choose, options_from_filename, Parts("occupancy", "grid", file_stem)),
         claims=Claims(priority=40, companions=companions),
     )

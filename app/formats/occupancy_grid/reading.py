@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from app.errors import BadUpload, Problem, UnreadableFile
 from app.formats import Files, ReadContext, _fields, _masks
+from app.formats.occupancy_grid import geotiff_grid
 from app.formats.occupancy_grid.words import KEYS, MAP_SAVER_PIXELS, NAME, Table, cell_table, reads_unknown_as_free
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, UNKNOWN, UNKNOWN_GREY, Mode, OccupancyGrid, outline, pack_cells
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
-from app.syntax import images, yaml
+from app.syntax import geotiff, images, yaml
 
 MODES: tuple[Mode, ...] = ("trinary", "scale", "raw")
 SHAPE = _fields.record(
@@ -32,6 +33,7 @@ SHAPE = _fields.record(
 """Schema of a map's YAML file. Source: Nav2's map_io, slam_toolbox."""
 REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 YAML_ENDS = (".yaml", ".yml")
+TIFF_ENDS = (".tif", ".tiff")
 IMAGE_ENDS = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 
 
@@ -95,6 +97,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     """Read one grid. Raises UnreadableFile (with key and line) or TooLarge."""
     main = context.main or next(iter(files))
     options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
+    if geotiff.is_tiff(files[main]):
+        return _read_tiff(files, main, options, context)
     if not is_image(main, files[main]):
         return _read_yaml(files, main, options, context)
     beside = next((n for n in files if n != main and n.lower().endswith(YAML_ENDS)), None)
@@ -112,6 +116,29 @@ def read(files: Files, context: ReadContext) -> Layers:
         "negate": options.negate,
     }
     return _layers(parameters, {}, main, main, files, context)
+
+
+def _read_tiff(files: Files, main: str, options: ReadOptions, context: ReadContext) -> Layers:
+    if not context.wants("occupancy"):
+        return Layers()
+    if options != ReadOptions():
+        context.warn("the options for images without a YAML file are ignored; it is a GeoTIFF", file=main)
+    try:
+        grid = geotiff_grid.read_grid(files[main], context)
+    except BadUpload as error:
+        raise type(error)(f"{main}: {error.detail}", [Problem(error.detail, main)]) from error
+    grid = replace(grid, properties=_mask_meaning(files, main, context))
+    return Layers({PartKey("occupancy", context.level, _name(main, context)): grid})
+
+
+def _mask_meaning(files: Files, main: str, context: ReadContext) -> dict[str, Any]:
+    """Read the parameters of a mask beside its main file; empty if there are none."""
+    mask_file = next((n for n in _masks.companions(main, list(files)) if n in files), None)
+    return _masks.read(mask_file, files[mask_file], context) if mask_file else {}
+
+
+def _name(main: str, context: ReadContext) -> str:
+    return context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
 
 
 def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadContext) -> Layers:
@@ -222,8 +249,7 @@ def _layers(
         parameters["negate"],
         {**({NAME: extra} if extra else {}), **meaning},
     )
-    name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
-    return Layers({PartKey("occupancy", context.level, name): grid})
+    return Layers({PartKey("occupancy", context.level, _name(main, context)): grid})
 
 
 def _cells(

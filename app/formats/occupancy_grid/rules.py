@@ -18,7 +18,7 @@ from app.errors import BadUpload, Problem
 from app.formats import Files
 from app.formats._rules import LIMITS, cpp_bool, cpp_number, error_finding, shown, warning_finding
 from app.limits import Limits
-from app.syntax import images, yaml
+from app.syntax import geotiff, images, yaml
 
 REQUIRED = ("image", "resolution", "origin", "free_thresh", "occupied_thresh", "negate")
 MODES = ("trinary", "scale", "raw")
@@ -35,7 +35,7 @@ _YAML = Limits(yaml_nodes=10_000)
 
 def check(files: Files) -> Iterator[Problem]:
     """Check a YAML file as map_server reads it, and its image's header. A single image has no rules."""
-    main = next((n for n in files if images.detect_kind(files[n]) is None), None)
+    main = next((n for n in files if images.detect_kind(files[n]) is None and not geotiff.is_tiff(files[n])), None)
     if main is None:
         return
     members = yaml.load(files[main], _YAML, typed=False)

@@ -13,16 +13,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Invalid
+from app.errors import Invalid, Problem
 from app.formats import WriteContext, _masks
 from app.formats._select import file_stem, select_part
+from app.formats.occupancy_grid import geotiff_grid
 from app.formats.occupancy_grid.resampling import normalize, resample
 from app.formats.occupancy_grid.words import KEYS, MAP_SAVER_PIXELS, NAME, Table, cell_table, reads_unknown_as_free
+from app.model.geodesy import LocalFrame
 from app.model.grid import (
     FREE,
     OCCUPIED,
     UNKNOWN,
     UNKNOWN_GREY,
+    Mode,
     OccupancyGrid,
     pack_cells,
     unknown_grey,
@@ -31,7 +34,10 @@ from app.model.grid import (
 )
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
-from app.syntax import images, yaml
+from app.syntax import geotiff, images, yaml
+from app.syntax.decimals import DEGREES
+
+Picture = Literal["pgm", "png"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +48,13 @@ class WriteOptions:
         None, "name of the grid; *: all, including masks drawn from zones; default: map, else the only one"
     )
     level: str | None = parameter(None, "level of the grid; *: all; default: ground, or the only one that has it")
-    file_type: Literal["pgm", "png"] | None = parameter(
-        None, "image format; default: pgm, or png if unknown can only be transparent"
+    file_type: Literal["pgm", "png", "tif"] | None = parameter(
+        None,
+        "image format; tif: a cloud optimized GeoTIFF for GIS instead of both files (0 free to 100 occupied, no data "
+        "255 unknown); default: pgm, or png if unknown can only be transparent",
+    )
+    world_file: bool = parameter(
+        False, "with file_type=png: also a world file (.pgw) and the CRS (.png.aux.xml), for GIS"
     )
     mode: Literal["trinary", "scale", "raw"] | None = parameter(
         None, "encoding of cells as grey values; default: as uploaded, or raw if that cannot represent every value"
@@ -64,7 +75,7 @@ class WriteOptions:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """Write ``<grid>.yaml`` and its image, and ``<grid>_filter_info.yaml`` of a mask.
+    """Write ``<grid>.yaml`` and its image (or ``<grid>.tif``), and ``<grid>_filter_info.yaml`` of a mask.
 
     Raises MissingLayer, NotFound, Ambiguous, or Invalid for impossible options.
     """
@@ -76,7 +87,12 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if options.normalize:
         grid = _with_mask(grid, normalize)
     stem = file_stem(key.name)
-    grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
+    if options.world_file and options.file_type != "png":
+        reason = "world_file is for PNG: set file_type=png, or omit it (a GeoTIFF contains its position)"
+        raise Invalid(reason, [Problem(reason, where="world_file")])
+    if options.file_type == "tif":
+        return _geotiff(grid, options.mode, stem, layers.frame, context)
+    grid, pixels, kind = _encoding(grid, options.mode, options.file_type, context, stem + ".yaml")
     grid, pixels = _with_grey(grid, pixels)
     if grid.origin[2] != 0.0:
         reason = (
@@ -85,7 +101,24 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.warn(reason, file=stem + ".yaml", where="origin")
     picture = f"{stem}.{kind}"
     files = {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
+    if options.world_file:
+        transform, crs = geotiff_grid.place(grid, layers.frame)
+        files[f"{stem}.pgw"] = geotiff.world_file(transform, DEGREES)
+        if crs is not None:
+            files[f"{picture}.aux.xml"] = geotiff.aux_xml(crs, is_local=True)
     return files | _masks.write(grid, stem, context)
+
+
+def _geotiff(
+    grid: OccupancyGrid, mode: Mode | None, stem: str, frame: LocalFrame | None, context: WriteContext
+) -> dict[str, bytes]:
+    """Write ``<grid>.tif``, and ``<grid>_filter_info.yaml`` of a mask."""
+    if mode is not None:
+        grid = replace(grid, mode=mode)
+    if mode == "trinary":
+        grid = _apply_thresholds(grid, context)
+    file = f"{stem}.tif"
+    return {file: geotiff_grid.write_grid(grid, frame, context, file)} | _masks.write(grid, stem, context)
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
@@ -95,35 +128,35 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
 
 
 def _encoding(
-    grid: OccupancyGrid, options: WriteOptions, context: WriteContext, file: str
-) -> tuple[OccupancyGrid, Table, Literal["pgm", "png"]]:
+    grid: OccupancyGrid, mode: Mode | None, file_type: Picture | None, context: WriteContext, file: str
+) -> tuple[OccupancyGrid, Table, Picture]:
     """Return the grid in its output mode, the pixel value of each cell value, and the image format.
 
     In a PNG, unknown cells without a pixel value are transparent.
     """
     present = np.flatnonzero(_present_file(grid.cells))
-    if options.mode is not None:
-        same_mode = options.mode == grid.mode
-        grid = replace(grid, mode=options.mode)
-        if options.mode == "trinary":
+    if mode is not None:
+        same_mode = mode == grid.mode
+        grid = replace(grid, mode=mode)
+        if mode == "trinary":
             if not same_mode and _pixels(grid, present) is None:
                 grid = replace(grid, occupied_thresh=0.65, free_thresh=0.196)
             grid = _apply_thresholds(grid, context)
             present = np.flatnonzero(_present_file(grid.cells))
-        elif options.mode == "scale" and not same_mode and _pixels(grid, present[present != UNKNOWN]) is None:
+        elif mode == "scale" and not same_mode and _pixels(grid, present[present != UNKNOWN]) is None:
             grid = replace(grid, occupied_thresh=1.0, free_thresh=0.0)
     pixels = _pixels(grid, present)
     if pixels is not None:
-        return grid, pixels, options.file_type or "pgm"
+        return grid, pixels, file_type or "pgm"
     cell_values = present[present != UNKNOWN]
     pixels = _pixels(grid, cell_values)
-    if pixels is not None and options.file_type != "pgm":
+    if pixels is not None and file_type != "pgm":
         return grid, pixels, "png"
-    if options.mode is not None:
+    if mode is not None:
         reason = (
-            f"mode={options.mode} with these thresholds has no grey for unknown: request file_type=png or mode=raw"
+            f"mode={mode} with these thresholds has no grey for unknown: request file_type=png or mode=raw"
             if pixels is not None
-            else f"mode={options.mode} has no grey for every value of this grid: request mode=raw"
+            else f"mode={mode} has no grey for every value of this grid: request mode=raw"
         )
         raise Invalid(reason)
     why = "unknown" if pixels is not None else "every value of this grid"
@@ -132,7 +165,7 @@ def _encoding(
     pixels = _pixels(grid, present)
     if pixels is None:
         raise AssertionError("raw represents every value")
-    return grid, pixels, options.file_type or "pgm"
+    return grid, pixels, file_type or "pgm"
 
 
 def _with_mask(grid: OccupancyGrid, change: Callable[[OccupancyGrid], OccupancyGrid]) -> OccupancyGrid:
@@ -259,7 +292,7 @@ def _value(value: Any) -> str:
     return str(int(value))
 
 
-def _picture(grid: OccupancyGrid, pixels: Table, kind: Literal["pgm", "png"]) -> bytes:
+def _picture(grid: OccupancyGrid, pixels: Table, kind: Picture) -> bytes:
     table = pixels.tobytes()
     if kind == "pgm":
         header = f"P5\n{grid.width} {grid.height}\n255\n".encode()
