@@ -105,7 +105,9 @@ ROWS = [
         f"DELETE {E}/channels/{{channel}}/planned, POST {E}/derivations, POST {E}/generations, PUT {E}/templates, "
         f"DELETE {E}/templates, PUT {E}/templates/{{format}}, DELETE {E}/templates/{{format}}, POST {E}/alignments, "
         f"POST {E}/overlays/{{id}}/accept, POST {E}/overlays/{{id}}/reject, POST {E}/overlays/{{id}}/end, "
-        f"POST {E}/overlays/{{id}}/keep",
+        f"POST {E}/overlays/{{id}}/keep, GET {E}/drafts, POST {E}/drafts, GET {E}/drafts/{{draft}}, "
+        f"DELETE {E}/drafts/{{draft}}, POST {E}/drafts/{{draft}}/edits, POST {E}/drafts/{{draft}}/rebase, "
+        f"POST {E}/drafts/{{draft}}/commit",
         admin=f"DELETE {E}, POST {E}/restore, POST {E}/purge",
     ),
 ]
@@ -114,7 +116,7 @@ NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
           "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
-          "z": "0", "row": "0", "col": "0"}  # fmt: skip
+          "z": "0", "row": "0", "col": "0", "draft": "0" * 16}  # fmt: skip
 
 
 @dataclass
