@@ -68,7 +68,7 @@ class DraftOut(BaseModel):
     environment: str
     name: str
     owner: str = Field(description="Name of the token that made it.")
-    mine: bool = Field(description="Whether your token made it. Only its owner and administrators may change it.")
+    is_owner: bool = Field(description="Whether your token made it. Only its owner and administrators may change it.")
     base: int = Field(description="Number of the version that it was made from or rebased on.")
     head: int = Field(description="Number of the environment's newest version.")
     behind: bool = Field(description="Whether `head` is newer than `base`: rebase it before you commit it.")
@@ -218,7 +218,7 @@ def writer(principal: Principal) -> Writer:
 
 
 def _as_json(draft: Draft, principal: Principal) -> dict[str, Any]:
-    return {**draft.as_dict(), "mine": draft.owner_id == principal.id}
+    return {**draft.as_dict(), "is_owner": draft.owner_id == principal.id}
 
 
 def _headers(draft: Draft) -> dict[str, str]:

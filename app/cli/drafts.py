@@ -57,13 +57,13 @@ def show(
     Example: `fleetmap draft show farm 'new lanes'`
     """
     with Client(server, token) as client:
-        found = _find(client, environment, draft)
+        chosen = _find(client, environment, draft)
     if as_json:
-        output.show_json(found)
+        output.show_json(chosen)
         return
     members = ("id", "name", "version", "created", "changed", "expires")
-    shown = {name: found[name] for name in members}
-    output.show_members({**shown, "owner": _owner(found), "base": _base(found), "changes": _changes(found)})
+    shown = {name: chosen[name] for name in members}
+    output.show_members({**shown, "owner": _owner(chosen), "base": _base(chosen), "changes": _changes(chosen)})
 
 
 @commands.command("create")
@@ -79,11 +79,11 @@ def create(
     Example: `fleetmap draft create farm 'new lanes'`
     """
     with Client(server, token) as client:
-        made = client.post(quote_path("environments", environment, "drafts"), {"name": name})
+        created = client.post(quote_path("environments", environment, "drafts"), {"name": name})
     if as_json:
-        output.show_json(made)
+        output.show_json(created)
     else:
-        output.print_result(f"{environment}: draft {made['id']} {made['name']!r}, from version {made['base']}")
+        output.print_result(f"{environment}: draft {created['id']} {created['name']!r}, from version {created['base']}")
 
 
 @commands.command("diff")
@@ -99,8 +99,8 @@ def diff(
     Example: `fleetmap draft diff farm 'new lanes'`
     """
     with Client(server, token) as client:
-        found = _find(client, environment, draft)
-    versions.diff(environment, str(found["base"]), found["version"], server, token, as_json)
+        chosen = _find(client, environment, draft)
+    versions.diff(environment, str(chosen["base"]), chosen["version"], server, token, as_json)
 
 
 @commands.command("commit")
@@ -117,8 +117,8 @@ def commit(
     Example: `fleetmap draft commit farm 'new lanes' -m 'lanes of the new shed'`
     """
     with Client(server, token) as client:
-        found = _find(client, environment, draft)
-        version = client.post(f"{_path(environment, found)}/commit", {"message": message}, repeat=True)
+        chosen = _find(client, environment, draft)
+        version = client.post(f"{_path(environment, chosen)}/commit", {"message": message}, repeat=True)
     if as_json:
         output.show_json(version)
     else:
@@ -133,7 +133,7 @@ def rebase(
         str | None,
         typer.Option(
             "--prefer",
-            help="draft or head: the side that wins where both changed the same [default: list these places].",
+            help="Side: draft or head. It wins where both changed the same [default: list these places].",
             autocompletion=lambda: list(PREFER),
         ),
     ] = None,
@@ -147,8 +147,8 @@ def rebase(
     """
     options.check_choice("--prefer", prefer, PREFER)
     with Client(server, token) as client:
-        found = _find(client, environment, draft)
-        rebased = client.post(f"{_path(environment, found)}/rebase", {"prefer": prefer})
+        chosen = _find(client, environment, draft)
+        rebased = client.post(f"{_path(environment, chosen)}/rebase", {"prefer": prefer})
     if as_json:
         output.show_json(rebased)
     else:
@@ -168,12 +168,12 @@ def delete(
     Example: `fleetmap draft delete farm 'new lanes'`
     """
     with Client(server, token) as client:
-        found = _find(client, environment, draft)
-        client.delete(_path(environment, found))
+        chosen = _find(client, environment, draft)
+        client.delete(_path(environment, chosen))
     if as_json:
-        output.show_json({"id": found["id"], "deleted": True})
+        output.show_json({"id": chosen["id"], "deleted": True})
     else:
-        output.print_result(f"deleted draft {found['id']} {found['name']!r}")
+        output.print_result(f"deleted draft {chosen['id']} {chosen['name']!r}")
 
 
 def _all(client: Client, environment: str) -> list[dict[str, Any]]:
@@ -185,13 +185,13 @@ def _find(client: Client, environment: str, draft: str) -> dict[str, Any]:
     """Find a draft by id or name; of several with this name one's own. Raises NotFound."""
     rows = _all(client, environment)
     fitting = [row for row in rows if draft.removeprefix("draft:") == row["id"]]
-    fitting = fitting or sorted((r for r in rows if r["name"] == draft), key=lambda r: not r["mine"])
+    fitting = fitting or sorted((r for r in rows if r["name"] == draft), key=lambda r: not r["is_owner"])
     if not fitting:
         names = [row["name"] for row in rows]
-        known = ", ".join(repr(name) for name in names) or "none"
-        detail = f"unknown draft {draft[:80]!r}{did_you_mean(draft, names)}; available: {known}"
+        available = ", ".join(repr(name) for name in names) or "none"
+        detail = f"unknown draft {draft[:80]!r}{did_you_mean(draft, names)}; available: {available}"
         raise NotFound(detail)
-    if len(fitting) > 1 and not fitting[0]["mine"]:
+    if len(fitting) > 1 and not fitting[0]["is_owner"]:
         raise typer.BadParameter(f"several drafts are named {draft!r}: use an id of `fleetmap draft list`")
     return fitting[0]
 
@@ -201,7 +201,7 @@ def _path(environment: str, draft: Mapping[str, Any]) -> str:
 
 
 def _owner(draft: Mapping[str, Any]) -> str:
-    return f"{draft['owner']} (you)" if draft["mine"] else str(draft["owner"])
+    return f"{draft['owner']} (you)" if draft["is_owner"] else str(draft["owner"])
 
 
 def _base(draft: Mapping[str, Any]) -> str:

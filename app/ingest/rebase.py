@@ -168,12 +168,12 @@ class _Merge:
             rows = slice(change.row, change.row + change.cells.shape[0])
             columns = slice(change.column, change.column + change.cells.shape[1])
             old, new = was.cells[rows, columns], now.cells[rows, columns]
-            mine = change.cells != old
-            both = mine & (new != old) & (new != change.cells)
+            edited = change.cells != old
+            both = edited & (new != old) & (new != change.cells)
             contested += int(both.sum())
             if self.prefer == "head":
-                mine &= ~both
-            cells[rows, columns][mine] = change.cells[mine]
+                edited &= ~both
+            cells[rows, columns][edited] = change.cells[edited]
         if contested and self.prefer is None:
             reason = f"the draft and version {self.head.number} changed {contested} cells differently"
             self.refuse(key, None, ["cells"], reason)
@@ -203,15 +203,15 @@ class _PartMerge:
 
     def merge_items(self) -> None:
         """Decide each feature that the draft changed."""
-        for item, mine in self._ours.put.items():
+        for item, ours in self._ours.put.items():
             if not self._theirs.has_touched(item):
-                self.put[item] = mine
+                self.put[item] = ours
             elif item in self._theirs.deleted:
                 reason = f"the draft changed it, version {self._work.head.number} deleted it"
                 if self._work.takes_draft(self.key, item, [DELETED], reason):
-                    self.put[item] = mine
+                    self.put[item] = ours
             else:
-                self._merge_item(item, self._base.get(item), mine, self._theirs.put[item])
+                self._merge_item(item, self._base.get(item), ours, self._theirs.put[item])
         for item in self._ours.deleted:
             if item in self._theirs.put:
                 reason = f"the draft deleted it, version {self._work.head.number} changed it"
@@ -220,19 +220,19 @@ class _PartMerge:
             elif item not in self._theirs.deleted:
                 self.deleted.add(item)
 
-    def _merge_item(self, item: str, was: _Row | None, mine: _Row, theirs: _Row) -> None:
-        takes_mine = self._work.prefer == "draft"
+    def _merge_item(self, item: str, was: _Row | None, ours: _Row, theirs: _Row) -> None:
+        takes_ours = self._work.prefer == "draft"
         fields: list[str] = []
         properties: dict[str, Any] = {}
         old = {} if was is None else was.properties
-        for name in (*theirs.properties, *(n for n in mine.properties if n not in theirs.properties)):
-            values = tuple(row.get(name, _ABSENT) for row in (old, mine.properties, theirs.properties))
-            value, is_contested = _merged_value(*values, takes_mine=takes_mine)
+        for name in (*theirs.properties, *(n for n in ours.properties if n not in theirs.properties)):
+            values = tuple(row.get(name, _ABSENT) for row in (old, ours.properties, theirs.properties))
+            value, is_contested = _merged_value(*values, takes_ours=takes_ours)
             if value is not _ABSENT:
                 properties[name] = value
             if is_contested:
                 fields.append(name)
-        shape, is_contested = _merged_shape(was, mine, theirs, takes_mine=takes_mine)
+        shape, is_contested = _merged_shape(was, ours, theirs, takes_ours=takes_ours)
         if is_contested:
             fields.append("geometry")
         if fields and self._work.prefer is None:
@@ -328,31 +328,31 @@ def _rows(features: Features) -> dict[str, _Row]:
     return {i: _Row(geometry, properties, local) for i, geometry, properties, local in columns}
 
 
-def _merged_value(was: Any, mine: Any, theirs: Any, *, takes_mine: bool) -> tuple[Any, bool]:
+def _merged_value(was: Any, ours: Any, theirs: Any, *, takes_ours: bool) -> tuple[Any, bool]:
     """Return the merged value of a property, and whether both sides changed it differently."""
-    if _is_same(mine, theirs) or _is_same(was, mine):
+    if _is_same(ours, theirs) or _is_same(was, ours):
         return theirs, False
     if _is_same(was, theirs):
-        return mine, False
-    return (mine if takes_mine else theirs), True
+        return ours, False
+    return (ours if takes_ours else theirs), True
 
 
-def _merged_shape(was: _Row | None, mine: _Row, theirs: _Row, *, takes_mine: bool) -> tuple[tuple[Any, bool], bool]:
+def _merged_shape(was: _Row | None, ours: _Row, theirs: _Row, *, takes_ours: bool) -> tuple[tuple[Any, bool], bool]:
     """Return the merged geometry with its anchor; the ends and the course of an edge are merged separately."""
-    chosen = mine if takes_mine else theirs
-    if _is_same_shape(mine, theirs) or (was is not None and _is_same_shape(was, mine)):
+    chosen = ours if takes_ours else theirs
+    if _is_same_shape(ours, theirs) or (was is not None and _is_same_shape(was, ours)):
         return (theirs.geometry, theirs.local), False
     if was is not None and _is_same_shape(was, theirs):
-        return (mine.geometry, mine.local), False
-    rows = (was, mine, theirs)
+        return (ours.geometry, ours.local), False
+    rows = (was, ours, theirs)
     if was is None or not all(r is not None and r.is_edge and r.geometry.geom_type == "LineString" for r in rows):
         return (chosen.geometry, chosen.local), True
-    if len({r.local for r in (was, mine, theirs)}) > 1:
+    if len({r.local for r in (was, ours, theirs)}) > 1:
         return (chosen.geometry, chosen.local), True
-    parts = [_line_parts(r.geometry) for r in (was, mine, theirs)]
-    merged = [_merged_value(*values, takes_mine=takes_mine) for values in zip(*parts, strict=True)]
+    parts = [_line_parts(r.geometry) for r in (was, ours, theirs)]
+    merged = [_merged_value(*values, takes_ours=takes_ours) for values in zip(*parts, strict=True)]
     vertices = [vertex for part, _ in merged for vertex in part]
-    return (shapely.LineString(vertices), mine.local), any(is_contested for _, is_contested in merged)
+    return (shapely.LineString(vertices), ours.local), any(is_contested for _, is_contested in merged)
 
 
 def _line_parts(line: Any) -> tuple[list[list[float]], list[list[float]], list[list[float]]]:

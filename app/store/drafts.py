@@ -130,8 +130,8 @@ class Drafts:
 
     def find(self, environment: str, owner: Writer, name: str) -> Draft | None:
         """Find somebody's own draft by its name, or return None."""
-        own = (draft for draft in self.all(environment) if draft.owner_id == owner.id and draft.name == name)
-        return next(own, None)
+        owned = (draft for draft in self.all(environment) if draft.owner_id == owner.id and draft.name == name)
+        return next(owned, None)
 
     def store(
         self, environment: str, pending: Pending, prepared: Prepared, warnings: Sequence[Problem] = (), *, rebased: bool
@@ -151,8 +151,8 @@ class Drafts:
                 raise StaleParent(f"the head of {environment} moved to version {row.head} meanwhile: rebase again")
             before = _row(connection, row, pending.id, now)
             chunks.insert(connection, prepared.chunks)
-            known = [Problem(**warning) for warning in before.warnings]
-            joined = list(dict.fromkeys((*known, *warnings)))[:MAX_WARNINGS]
+            stored_warnings = [Problem(**warning) for warning in before.warnings]
+            joined = list(dict.fromkeys((*stored_warnings, *warnings)))[:MAX_WARNINGS]
             values = {"revision": pending.revision + 1, "edited": now, "expires": now + LIFETIME}
             same = (table.c.id == pending.id) & (table.c.revision == pending.revision)
             replaced = update(table).where(same).values(**values, **content_values(prepared, joined))

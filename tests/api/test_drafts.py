@@ -75,7 +75,7 @@ def edit_head(desk: Desk, *changes: Json) -> Json:
 def test_edits_gather_in_a_draft_and_become_one_version(api: Api, desk: Desk) -> None:
     env = desk.env
     assert (desk.made["base"], desk.made["head"], desk.made["behind"], desk.made["changes"]) == (3, 3, False, {})
-    assert (desk.made["name"], desk.made["mine"]) == ("new lanes", True)
+    assert (desk.made["name"], desk.made["is_owner"]) == ("new lanes", True)
     first = desk.edit(node("shed", 20, 0), edge("barn", "shed"))
     second = desk.edit(node("shed", 20, 5, name="tool shed"), cells(100, 0, 0, 1, 1))
     assert first["changes"]["topology"] == {"added": 2, "changed": 0, "deleted": 0}
@@ -155,7 +155,7 @@ def test_only_the_owner_and_administrators_write_a_draft(api: Api, farm: str) ->
     desk = Desk(ann, farm)
     assert desk.made["name"] == "draft 1"
     desk.edit(node("shed", 20, 0))
-    assert [one["mine"] for one in bob.get(f"environments/{farm}/drafts").json()] == [False]
+    assert [one["is_owner"] for one in bob.get(f"environments/{farm}/drafts").json()] == [False]
     assert "shed" in features(bob, farm, desk.ref), "editors see it"
     for method, path, body in (
         ("POST", "/edits", {"changes": [node("b", 1, 1)]}),
