@@ -97,6 +97,11 @@ class Settings(BaseSettings):
         default=None, description="Certificate for HTTPS (PEM, with its chain). Unset: HTTP."
     )
     tls_key: Path | None = Field(default=None, description="Private key of `tls_certificate` (PEM).")
+    public_url: str | None = Field(
+        default=None,
+        description="Address of the server for its clients, such as `https://maps.example.org/fleet`, for absolute "
+        "links below `/ogc`. Set it behind a proxy. Unset: scheme and `Host` of the request.",
+    )
     workers: int = Field(default=1, ge=1, le=256, description="Number of processes that serve requests.")
     admin_token: SecretStr | None = Field(
         default=None,
@@ -415,6 +420,7 @@ class Settings(BaseSettings):
         "imagery_url",
         "imagery_token",
         "basemap_url",
+        "public_url",
         "models_dir",
         mode="before",
     )
@@ -523,6 +529,13 @@ class Settings(BaseSettings):
         if not all(name in self.basemap_url for name in ("{z}", "{x}", "{y}")):
             raise ValueError("basemap_url must contain {z}, {x} and {y}")
         return self
+
+    @field_validator("public_url")
+    @classmethod
+    def _public_url_is_plain(cls, value: str | None) -> str | None:
+        if value is not None and (basemap_origin(value + "/") is None or "?" in value or "#" in value):
+            raise ValueError("public_url must be scheme, host and optional path: https://host/path")
+        return value
 
     @property
     def limits(self) -> Limits:

@@ -22,7 +22,7 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__, derive, logs
+from app import __version__, derive, logs, ogc
 from app import formats as every_format
 from app.api import events, health, maps, page, ros2, routers
 from app.api.http import openapi, problems
@@ -95,7 +95,7 @@ def create_app(settings: Settings) -> FleetMapApp:
     app.add_middleware(JsonCompression)  # the last one is the outermost
     maps.add_routes(app)
     openapi.add_pages(app)
-    for router in (*routers(), health.root_router, page.root_router):
+    for router in (*routers(), *ogc.routers(), health.root_router, page.root_router):
         app.router.routes.extend(router.routes)  # include_router() would build each route a second time, 10 ms each
     return app
 
@@ -307,6 +307,7 @@ def _api_options(settings: Settings) -> ApiOptions:
         zenoh_advertise=settings.zenoh_advertise,
         ros2=bool(settings.ros2_environments.strip()),
         manifest_seconds=int(settings.manifest_seconds),
+        public_url=settings.public_url,
         basemap_url=settings.basemap_url,
         basemap_attribution=settings.basemap_attribution.strip(),
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import shapely
@@ -175,6 +176,67 @@ def between(source: str, target: str, points: Array) -> Array:
     except ProjError as error:
         raise Invalid(f"cannot convert from the CRS {_short(source)} to {_short(target)}: {error}") from error
     return np.column_stack([x, y])
+
+
+def geometries_from_wgs84(crs: str, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Convert shapely geometries from (longitude, latitude) to a CRS, x (easting) first; a z passes through.
+
+    Points outside the CRS become infinite.
+    """
+
+    def convert(points: Array) -> Array:
+        out = np.array(points, np.float64)
+        out[:, :2] = between(WGS84, crs, points)
+        return out
+
+    return _transform(geometry, convert)
+
+
+def local_crs_wkt(datum: Datum, *, pretty: bool = False) -> str:
+    """Return the local frame as a CRS in WKT 2 (ISO 19162:2019)."""
+    return str(_local_crs(datum).to_wkt("WKT2_2019", pretty=pretty))
+
+
+def local_crs_projjson(datum: Datum) -> dict[str, Any]:
+    """Return the local frame as a CRS in PROJJSON."""
+    return dict(_local_crs(datum).to_json_dict())
+
+
+_DEGREE = 'ANGLEUNIT["degree",0.0174532925199433]'
+_METRE = 'LENGTHUNIT["metre",1]'
+_AXES = f'CS[Cartesian,2],AXIS["x",{{}},ORDER[1]],AXIS["y",{{}},ORDER[2]],{_METRE}'
+_COEFFICIENT = 'SCALEUNIT["coefficient",1]'
+LOCAL_NAME = "Fleet Map Server local frame"
+
+
+@lru_cache(maxsize=64)
+def _local_crs(datum: Datum) -> CRS:
+    """Build the local frame: a transverse Mercator projection, with a heading an affine CRS derived from it."""
+    lengths = "".join(f'PARAMETER["False {name}",0,{_METRE}],' for name in ("easting", "northing")).rstrip(",")
+    geographic = (
+        '["WGS 84",DATUM["World Geodetic System 1984",ELLIPSOID["WGS 84",6378137,298.257223563,'
+        f'{_METRE}]],PRIMEM["Greenwich",0,{_DEGREE}]]'
+    )
+    conversion = (
+        'CONVERSION["centred on the datum",METHOD["Transverse Mercator",ID["EPSG",9807]],'
+        f'PARAMETER["Latitude of natural origin",{datum.latitude:.17g},{_DEGREE}],'
+        f'PARAMETER["Longitude of natural origin",{datum.longitude:.17g},{_DEGREE}],'
+        f'PARAMETER["Scale factor at natural origin",1,SCALEUNIT["unity",1]],{lengths}]'
+    )
+    if datum.heading == 0.0:
+        axes = _AXES.format("east", "north")
+        return CRS.from_wkt(f'PROJCRS["{LOCAL_NAME}",BASEGEOGCRS{geographic},{conversion},{axes}]')
+    p, q, _, _ = LocalFrame(datum).from_local
+    rows = (("A0", 8623, 0.0), ("A1", 8624, p), ("A2", 8625, -q), ("B0", 8639, 0.0), ("B1", 8640, q), ("B2", 8641, p))
+    parameters = ",".join(
+        f'PARAMETER["{name}",{value:.17g},{_METRE if name.endswith("0") else _COEFFICIENT},ID["EPSG",{code}]]'
+        for name, code, value in rows
+    )
+    return CRS.from_wkt(
+        f'DERIVEDPROJCRS["{LOCAL_NAME}",BASEPROJCRS["north up",BASEGEOGCRS{geographic},{conversion}],'
+        f'DERIVINGCONVERSION["turned by the heading",METHOD["Affine parametric transformation",ID["EPSG",9624]],'
+        f"{parameters}],{_AXES.format('unspecified', 'unspecified')}]"
+    )
 
 
 def _short(crs: str) -> str:

@@ -175,6 +175,8 @@ def test_environment_pattern_limits_access() -> None:
         ("/api/v1/environments/farm/versions/1/maps/kml", "farm"),
         ("/api/v1/environments/fa\nrm/x", "fa\nrm"),
         ("/maps/farm/kml", "farm"),
+        ("/ogc/farm", "farm"),
+        ("/ogc/farm/versions/1/", "farm"),
         ("/api/v1/formats", None),
     ],
 )

@@ -58,7 +58,15 @@ V = f"{E}/versions/{{v}}"
 STATUS = {"environment": "{env}", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
 STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]}
 NAMED = "environment={env}"
+OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
+             "/collections/{collection}/schema", "/collections/{collection}/queryables",
+             "/collections/{collection}/items", "/collections/{collection}/items/{feature}")  # fmt: skip
 ROWS = [
+    *(
+        Row(f"GET /ogc/{{env}}{start}{path}", "viewer", "environment")
+        for start in ("", "/versions/{v}")
+        for path in OGC_PATHS
+    ),
     *rows(
         "open",
         open="GET /, GET /icon.svg, GET /service-worker.js, GET /assets/{name}, GET /openapi.json, GET /docs, "
@@ -116,7 +124,7 @@ NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
           "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
-          "z": "0", "row": "0", "col": "0", "draft": "0" * 16}  # fmt: skip
+          "collection": "nodes", "feature": "gate", "z": "0", "row": "0", "col": "0", "draft": "0" * 16}  # fmt: skip
 
 
 @dataclass

@@ -74,6 +74,10 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
         "/api/v1/stored/{kind}/{sha256}": "get",
     }  # fmt: skip
+    ogc = ("/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
+           "/collections/{collection}/items", "/collections/{collection}/items/{feature}",
+           "/collections/{collection}/schema", "/collections/{collection}/queryables")  # fmt: skip
+    wanted |= {start + path: "get" for start in ("/ogc/{env}", "/ogc/{env}/versions/{v}") for path in ogc}
     by_format = {f"/maps/{{env}}/{fmt.name}" for fmt in all_formats().values() if fmt.write}
     assert by_format < set(schema["paths"])
     assert {path: " ".join(sorted(item, key=["get", "post", "put", "patch", "delete"].index))

@@ -6,6 +6,8 @@ and access to the environment in the path. Each route declares the role that it 
 
 from __future__ import annotations
 
+import base64
+import binascii
 import hashlib
 import ipaddress
 import re
@@ -59,8 +61,14 @@ _COOKIE = re.compile(rb"(?:^|;)[ \t]*" + SESSION_COOKIE.encode() + rb"=([A-Za-z0
 PROVE = "prove"
 """Key in a request scope's ``state``: callback for the first valid token or link of a connection."""
 
+OGC = "/ogc/"
+"""Beginning of the paths that GIS programs use: HTTP Basic is allowed there, with a token as the password."""
+
+BASIC_CHALLENGE = 'Basic realm="Fleet Map Server"'
+
+_BASIC = b"basic "
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
-_ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.DOTALL)
+_ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps|ogc)/([^/]+)(?:/.*)?", re.DOTALL)
 
 
 class Credentials(NamedTuple):
@@ -75,6 +83,8 @@ class Credentials(NamedTuple):
         """Create the credentials of a request with these headers."""
         client = scope.get("client")
         match = _COOKIE.search(cookie) if cookie is not None and authorization is None else None
+        if authorization is not None and scope["path"].startswith(OGC):
+            authorization = _basic_as_bearer(authorization)
         return cls(authorization, match[1] if match else None, client[0] if client else None)
 
     @classmethod
@@ -356,6 +366,25 @@ def _token(header: bytes) -> str:
         return text.decode("ascii")
     except UnicodeDecodeError:
         return ""
+
+
+def _basic_as_bearer(header: bytes) -> bytes:
+    """Convert ``Basic`` credentials, whose password is a token, to ``Bearer``; return other headers as they are.
+
+    The converted header is what caches see, so that ``Basic`` is of no use at other paths.
+    """
+    if not is_basic(header):
+        return header
+    try:
+        pair = base64.b64decode(header[len(_BASIC) :].strip(), validate=True)
+    except binascii.Error:
+        return b"Basic"
+    return b"Bearer " + pair.partition(b":")[2]
+
+
+def is_basic(header: bytes) -> bool:
+    """Test if an Authorization header has the scheme ``Basic``."""
+    return header[: len(_BASIC)].lower() == _BASIC
 
 
 def client_source(client: str | None) -> str:

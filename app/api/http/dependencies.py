@@ -52,6 +52,7 @@ class ApiOptions:
     zenoh_advertise: str = ""
     ros2: bool = False
     manifest_seconds: int = 86_400
+    public_url: str | None = None
     basemap_url: str | None = None
     basemap_attribution: str = ""
 

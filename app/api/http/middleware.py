@@ -19,7 +19,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from app.api.http import problems
 from app.api.http.auth import (
     ANONYMOUS_VIEWER,
+    BASIC_CHALLENGE,
     MAX_SOURCES,
+    OGC,
     OPEN_CALLS,
     SAFE_METHODS,
     Credentials,
@@ -28,6 +30,7 @@ from app.api.http.auth import (
     check_same_origin,
     client_source,
     environment_in_path,
+    is_basic,
     is_open,
 )
 from app.api.http.dependencies import Services
@@ -99,7 +102,10 @@ class Guard:
             return
         except FleetMapError as error:
             reason = error.detail
-            await self._reject(problems.error_response(error), scope, body, answer)
+            response = problems.error_response(error)
+            if response.status_code == 401 and scope["path"].startswith(OGC):
+                response.headers["www-authenticate"] = BASIC_CHALLENGE
+            await self._reject(response, scope, body, answer)
         except HTTPException as error:
             reason = str(error.detail)
             await self._reject(problems.http_error_response(error), scope, body, answer)
@@ -132,6 +138,8 @@ class Guard:
                 raise Unauthenticated("a change requires a token: sign in, or send 'Authorization: Bearer <token>'")
             if principal.session_ends is not None:
                 check_same_origin(scope, required=True)
+            elif is_basic(headers.get(b"authorization", b"")):  # browsers add it by themselves, like a session
+                check_same_origin(scope, required=False)
         environment = environment_in_path(scope["path"])
         authorise(scope, principal, environment)
         scope["state"]["principal"] = principal

@@ -68,6 +68,7 @@ TAGS = {
     "layers": "Canonical content of a version.",
     "tiles": "Rasters in pieces, and pictures of sites, for screens.",
     "maps": "Maps in a format, converted on demand.",
+    "ogc": "OGC API - Features: an environment for GIS programs.",
     "maps by format": "Short URL of each format, with the parameters of that format.",
     "channels": "Names that point to the version that robots run.",
     "robots": "Status and lag of robots.",

@@ -58,11 +58,11 @@ def boxes_in_other_frame(box: Box, crs: str, frame: LocalFrame | None) -> list[B
         points = frame.to_local(ring(box))
         if not np.isfinite(points).all():
             return [(-math.inf, -math.inf, math.inf, math.inf)]
-        return [_wider(bounding_box(points))]
-    return split_box(_wider(local_box_to_wgs84(box, frame)))
+        return [widened(bounding_box(points))]
+    return split_box(widened(local_box_to_wgs84(box, frame)))
 
 
-def _wider(box: Box) -> Box:
+def widened(box: Box) -> Box:
     """Widen a box slightly on each side, for the bulge of a curve between the points."""
     x0, y0, x1, y1 = box
     dx = abs(x1 - x0) * 0.01

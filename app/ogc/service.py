@@ -1,0 +1,142 @@
+"""The service of a request: an environment's version, its addresses and its responses."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from urllib.parse import quote, urlencode
+
+from fastapi import Request
+from starlette.responses import Response
+
+from app.api.http.auth import Viewer
+from app.api.http.caching import cache_control, none_match
+from app.api.http.dependencies import Services, ServicesDep
+from app.api.http.parameters import parse_version_ref
+from app.api.http.responses import json_bytes
+from app.api.http.schemas import EnvironmentPath, VersionPath
+from app.errors import NotFound
+from app.ogc.negotiation import HTML, PAGES, choose
+from app.store.values import LATEST, Environment, Version
+
+PRODUCTION = "production"
+
+_AUTHORITY = re.compile(r"[A-Za-z0-9._-]{1,255}(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]{2,60}\](:[0-9]{1,5})?")
+
+Link = Mapping[str, str]
+"""Link as JSON: ``href``, ``rel``, ``type``, ``title``."""
+
+
+def link(href: str, rel: str, media_type: str, title: str) -> Link:
+    """Build a link."""
+    return {"href": href, "rel": rel, "type": media_type, "title": title}
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """OGC service of one version. address: absolute URL of the landing page, without a slash at its end.
+
+    ref: version number, or name of a channel whose version may change.
+    """
+
+    services: Services
+    request: Request
+    environment: Environment
+    version: Version
+    ref: str | int
+    address: str
+
+    @property
+    def title(self) -> str:
+        """Return the title of the environment, else its name."""
+        return self.environment.title or self.environment.name
+
+    @property
+    def description(self) -> str:
+        """Describe the version in a sentence."""
+        return f"{self.environment.name}, version {self.version.ref} ({self.ref})"
+
+    def url(self, *parts: str, pairs: Sequence[tuple[str, str]] = (), **query: str) -> str:
+        """Build the absolute URL of a resource of the service; each part is quoted completely."""
+        path = "".join("/" + quote(part, safe="") for part in parts)
+        listed = [*pairs, *query.items()]
+        return f"{self.address}{path}" + (f"?{urlencode(listed)}" if listed else "")
+
+    @property
+    def landing_url(self) -> str:
+        """Return the URL of the landing page."""
+        return self.address + "/"
+
+    def alternates(self, url: str, offers: Mapping[str, str], used: str) -> list[Link]:
+        """Link a resource to itself and to its other representations. url: without ``f``."""
+        join = "&" if "?" in url else "?"
+        return [
+            link(f"{url}{join}f={name}", "self" if name == used else "alternate", media, f"this document as {name}")
+            for name, media in sorted(offers.items(), key=lambda item: item[0] != used)
+        ]
+
+    def respond(
+        self, body: bytes, media_type: str, headers: Mapping[str, str] | None = None, etag: str | None = None
+    ) -> Response:
+        """Build a response that caches may store: numbered versions for good, others if they revalidate it.
+
+        etag: strong one of the body by default. A weak one starts with ``W/``.
+        """
+        etag = etag or f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+        sent = {
+            "etag": etag,
+            "vary": "accept, authorization, cookie",
+            "cache-control": cache_control(self.ref),
+            "fleetmap-version": str(self.version.ref),
+            "fleetmap-root": self.version.root,
+            **(headers or {}),
+        }
+        if none_match(self.request.headers.get("if-none-match"), etag.removeprefix("W/")):
+            return Response(status_code=304, headers=sent)
+        return Response(body, headers=sent, media_type=media_type)
+
+    def respond_json(self, value: object, media_type: str = PAGES["json"]) -> Response:
+        """Build a response of JSON."""
+        return self.respond(json_bytes(value), media_type)
+
+    def respond_page(self, page: bytes, headers: Mapping[str, str]) -> Response:
+        """Build a response of a web page."""
+        return self.respond(page, HTML, headers)
+
+    def choose(self, offers: Mapping[str, str] = PAGES) -> str:
+        """Return the requested representation."""
+        return choose(self.request, offers)
+
+
+def origin(request: Request, public_url: str | None) -> str:
+    """Return the server's address for absolute links: the configured one, else scheme and ``Host`` of the request."""
+    if public_url is not None:
+        return public_url.rstrip("/")
+    host = request.headers.get("host", "")
+    if _AUTHORITY.fullmatch(host) is None:
+        server = request.scope.get("server") or ("localhost", None)
+        host = server[0] if server[1] is None else f"{server[0]}:{server[1]}"
+    return f"{request.url.scheme}://{host}"
+
+
+def current_service(env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer) -> Service:
+    """Return the service of the channel ``production`` if it exists, else of the head."""
+    try:
+        return _service(request, services, env, PRODUCTION, f"/ogc/{env}")
+    except NotFound:
+        return _service(request, services, env, LATEST, f"/ogc/{env}")
+
+
+def version_service(
+    env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer
+) -> Service:
+    """Return the service of a version."""
+    return _service(request, services, env, parse_version_ref(v), f"/ogc/{env}/versions/{quote(v, safe=':')}")
+
+
+def _service(request: Request, services: Services, env: str, ref: str | int, path: str) -> Service:
+    version = services.store.versions.get(env, ref)
+    environment = services.store.environments.get(env)
+    return Service(services, request, environment, version, ref, origin(request, services.options.public_url) + path)

@@ -1,0 +1,148 @@
+"""Collections of the vector layers: nodes, edges, objects by geometry, zones, and the fence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from app.ogc.crs import CRS84, reference_systems
+from app.ogc.description import operation
+from app.ogc.extensions import Collection, Extension
+from app.ogc.negotiation import GEOJSON, HTML, JSON, JSONFG, SCHEMA
+from app.ogc.service import Link, Service, link
+from app.ogc.tables import CACHE, VECTOR_LAYERS, Table, VectorLayer, build_tables, table_key
+
+TITLES: Final[Mapping[str, tuple[VectorLayer, str, str]]] = {
+    "nodes": ("topology", "Nodes", "Places of the network that robots drive on."),
+    "edges": ("topology", "Edges", "Directed connections from `source` to `target`; a two-way street is two edges."),
+    "objects-points": ("objects", "Objects: points", "Objects with a point or several."),
+    "objects-lines": ("objects", "Objects: lines", "Objects with a line or several."),
+    "objects-polygons": ("objects", "Objects: areas", "Objects with a polygon or several."),
+    "objects-other": ("objects", "Objects: others", "Objects without geometry, or with geometries of several types."),
+    "zones": ("zones", "Zones", "Areas with a kind: keepout, speed, priority …"),
+    "fence": ("location", "Fence", "The area of the site."),
+}
+"""Collections by id: layer, title, description."""
+
+
+async def layer_tables(service: Service, layer: VectorLayer) -> dict[str, Table]:
+    """Return the tables of a layer. Concurrent requests wait for one that builds them."""
+    key = table_key(service.version, layer)
+    if key is None:
+        return {}
+    tables = CACHE.get(key)
+    if tables is None:
+        cache = service.services.response_cache
+        content, version = service.services.store.content, service.version
+        tables = await cache.join(("ogc", key), build_tables, content, version, layer)
+        CACHE.put(key, tables)
+    return tables
+
+
+async def find_table(service: Service, name: str) -> Table | None:
+    """Return the table of a collection; None if there is no such collection with items."""
+    entry = TITLES.get(name)
+    return None if entry is None else (await layer_tables(service, entry[0])).get(name)
+
+
+async def tables(service: Service) -> dict[str, Table]:
+    """Return all tables, in the order of TITLES."""
+    cached = {name: table for layer in VECTOR_LAYERS for name, table in (await layer_tables(service, layer)).items()}
+    return {name: cached[name] for name in TITLES if name in cached}
+
+
+def item_links(service: Service, name: str) -> list[Link]:
+    """Link to the items of a collection, and to what describes them."""
+    title = TITLES[name][1]
+    return [
+        link(service.url("collections", name, "items", f="json"), "items", GEOJSON, f"{title} as GeoJSON"),
+        link(service.url("collections", name, "items", f="jsonfg"), "items", JSONFG, f"{title} as JSON-FG"),
+        link(service.url("collections", name, "items", f="html"), "items", HTML, f"{title} as a page"),
+        link(service.url("collections", name, "schema"), "http://www.opengis.net/def/rel/ogc/1.0/schema", SCHEMA,
+             f"Schema of {title}"),
+        link(service.url("collections", name, "queryables"), "http://www.opengis.net/def/rel/ogc/1.0/queryables",
+             SCHEMA, f"Properties of {title} that filter"),
+    ]  # fmt: skip
+
+
+async def _collections(service: Service) -> Sequence[Collection]:
+    datum = service.version.datum
+    if datum is None:
+        return ()
+    crs = list(reference_systems(service, datum))
+    return [
+        Collection(
+            id=name,
+            title=TITLES[name][1],
+            description=f"{TITLES[name][2]} {len(table)} features.",
+            bbox=table.bbox,
+            members={"itemType": "feature", "crs": crs, "storageCrs": CRS84},
+            links=item_links(service, name),
+        )
+        for name, table in (await tables(service)).items()
+    ]
+
+
+ITEMS_PARAMETERS = ("limit", "bbox", "datetime", "bbox-crs", "crs", "cursor", "f")
+
+
+async def _paths(service: Service) -> Mapping[str, object]:
+    out: dict[str, object] = {}
+    for name, table in (await tables(service)).items():
+        base, title = f"/collections/{name}", TITLES[name][1]
+        suffix = name.title().replace("-", "")
+        filters = [_filter_parameter(key, sorted(types)) for key, types in queryables(table).items()]
+        item_id = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}
+        out[base] = operation(f"describe{suffix}", f"{title}: collection", (JSON, HTML))
+        out[f"{base}/items"] = operation(
+            f"get{suffix}", f"{title}: features", (GEOJSON, JSONFG, HTML), ITEMS_PARAMETERS, filters
+        )
+        out[f"{base}/items/{{featureId}}"] = operation(
+            f"getOneOf{suffix}", f"{title}: one feature", (GEOJSON, JSONFG, HTML), ("crs", "f"), [item_id]
+        )
+        out[f"{base}/schema"] = operation(f"schemaOf{suffix}", f"{title}: schema", (SCHEMA, HTML))
+        out[f"{base}/queryables"] = operation(f"queryablesOf{suffix}", f"{title}: filters", (SCHEMA, HTML))
+    return out
+
+
+RESERVED = frozenset(
+    {"limit", "bbox", "bbox-crs", "crs", "datetime", "f", "cursor", "filter", "filter-lang", "filter-crs"}
+)
+"""Names of parameters that are no property filters, even if a property has such a name."""
+
+SCALARS = frozenset({"string", "integer", "number", "boolean"})
+
+
+def queryables(table: Table) -> dict[str, frozenset[str]]:
+    """Return the properties that are parameters, with their types: those that have single values in all features."""
+    return {
+        name: types
+        for name, types in sorted(table.types.items())
+        if types <= SCALARS and name not in RESERVED and len(name) <= 200
+    }
+
+
+def _filter_parameter(name: str, types: Sequence[str]) -> dict[str, object]:
+    schema = {"type": types[0]} if len(types) == 1 else {"oneOf": [{"type": one} for one in types]}
+    return {
+        "name": name,
+        "in": "query",
+        "required": False,
+        "description": f"Only features whose property `{name}` equals this value.",
+        "schema": schema,
+        "style": "form",
+        "explode": False,
+    }
+
+
+extension = Extension(
+    conformance=(
+        "http://www.opengis.net/spec/ogcapi-common-2/1.0/conf/collections",
+        "http://www.opengis.net/spec/ogcapi-features-5/1.0/conf/schemas",
+        "http://www.opengis.net/spec/ogcapi-features-5/1.0/conf/core-roles-features",
+        "http://www.opengis.net/spec/ogcapi-features-5/1.0/conf/queryables",
+        "http://www.opengis.net/spec/json-fg-1/1.0/conf/core",
+    ),
+    collections=_collections,
+    paths=_paths,
+)
