@@ -26,7 +26,7 @@ from app.api.http.schemas import (
 from app.api.versions import Change
 from app.ingest import RebaseResult
 from app.store.drafts import LIFETIME, MAX_NAME
-from app.store.values import Draft, Writer
+from app.store.values import Draft
 
 
 class DraftCreateBody(RequestModel):
@@ -124,7 +124,7 @@ def create_draft(env: EnvironmentPath, body: DraftCreateBody, services: Services
 
     An environment has at most 200 drafts, and each changes at most 100 000 features.
     """
-    draft = services.store.drafts.create(env, writer(principal), body.name)
+    draft = services.store.drafts.create(env, principal.as_writer(), body.name)
     location = api_path("environments", env, "drafts", draft.id)
     return json_response(_as_json(draft, principal), 201, {**_headers(draft), "location": location})
 
@@ -138,7 +138,7 @@ def get_draft(env: EnvironmentPath, draft: DraftPath, services: ServicesDep, pri
 @router.delete("/{draft}", status_code=204, responses=problem_responses(None, 404), summary="Delete a draft")
 def delete_draft(env: EnvironmentPath, draft: DraftPath, services: ServicesDep, principal: Editor) -> Response:
     """Delete a draft with its changes."""
-    services.ingest.drafts.delete(env, draft, writer(principal))
+    services.ingest.drafts.delete(env, draft, principal.as_writer())
     return Response(status_code=204)
 
 
@@ -161,7 +161,7 @@ def edit_draft(
     concurrent edits are all kept.
     """
     changes = [change.model_dump(exclude_none=True) for change in body.changes]
-    return _response(services.ingest.drafts.edit(env, draft, changes, writer(principal), if_match), principal)
+    return _response(services.ingest.drafts.edit(env, draft, changes, principal.as_writer(), if_match), principal)
 
 
 @router.post(
@@ -185,7 +185,7 @@ def rebase_draft(
     What both changed differently since the draft's base is a conflict, and nothing changes: edit these places of the
     draft, or give `prefer`. Edges that would lose a node are conflicts in any case.
     """
-    result = services.ingest.drafts.rebase(env, draft, writer(principal), if_match, body.prefer)
+    result = services.ingest.drafts.rebase(env, draft, principal.as_writer(), if_match, body.prefer)
     return _conflicts(result) if result.conflicts else _response(result.draft, principal)
 
 
@@ -209,12 +209,7 @@ def commit_draft(
     change of an environment.
     """
     described = commit.with_message(body.message)
-    return commit_response(services.ingest.commit_draft(env, draft, writer(principal), described))
-
-
-def writer(principal: Principal) -> Writer:
-    """Return the caller as the writer of drafts."""
-    return Writer(principal.id, principal.name, principal.has_role("admin"))
+    return commit_response(services.ingest.commit_draft(env, draft, principal.as_writer(), described))
 
 
 def _as_json(draft: Draft, principal: Principal) -> dict[str, Any]:

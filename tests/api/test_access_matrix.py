@@ -61,11 +61,21 @@ NAMED = "environment={env}"
 OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
              "/collections/{collection}/schema", "/collections/{collection}/queryables",
              "/collections/{collection}/items", "/collections/{collection}/items/{feature}")  # fmt: skip
+OGC_ITEMS = "/ogc/{env}/drafts/{draft}/collections/{collection}/items"
+ITEM_METHODS = ("OPTIONS", "PUT", "PATCH", "DELETE")
 ROWS = [
     *(
         Row(f"GET /ogc/{{env}}{start}{path}", "viewer", "environment")
         for start in ("", "/versions/{v}")
         for path in OGC_PATHS
+    ),
+    *(Row(f"GET /ogc/{{env}}/drafts/{{draft}}{path}", "editor", "environment") for path in OGC_PATHS),
+    *(Row(f"{method} {OGC_ITEMS}", "editor", "environment", {}) for method in ("POST", "OPTIONS")),
+    *(Row(f"{m} {OGC_ITEMS}/{{feature}}", "editor", "environment", {}) for m in ("PUT", "PATCH", "DELETE", "OPTIONS")),
+    *(
+        Row(f"{method} /ogc/{{env}}{start}/collections/{{collection}}/items{end}", "viewer", "environment")
+        for start in ("", "/versions/{v}")
+        for method, end in (("OPTIONS", ""), ("POST", ""), *((m, "/{feature}") for m in ITEM_METHODS))
     ),
     *rows(
         "open",
