@@ -484,7 +484,7 @@ def _note_time(newest: datetime) -> datetime:
 
 
 async def _run_housekeeping(services: Services) -> None:
-    """Run periodic tasks: expiry of tokens, sessions, overlays and dry runs; channel moves, rollouts, collection."""
+    """Run periodic tasks: expiry of what has an end, channel moves, rollouts, collection."""
     beat = 0.0
     newest = datetime.now(UTC)
     collect = newest + COLLECT_EVERY
@@ -501,6 +501,7 @@ async def _run_housekeeping(services: Services) -> None:
             await run_in_threadpool(services.store.channels.advance_rollouts, datetime.now(UTC), next_step)
             await run_in_threadpool(services.store.overlays.end_due, datetime.now(UTC))
             await run_in_threadpool(services.store.versions.remove_expired_dry_runs)
+            await run_in_threadpool(services.store.drafts.remove_expired)
             if beat >= HEARTBEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(services.jobs.send_heartbeats)

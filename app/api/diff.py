@@ -14,7 +14,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.features import GEOJSON, Crs, PageCursor, PageLimit
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import VERSION_OR_DRY_RUN, DiffOut, EnvironmentPath, component_schemas, problem_responses
+from app.api.http.schemas import VERSION_OR_PENDING, DiffOut, EnvironmentPath, component_schemas, problem_responses
 from app.convert.change_picture import ChangePicture
 from app.errors import Invalid, Problem
 from app.store.values import Version
@@ -24,8 +24,8 @@ router = api_router("versions", "/environments/{env}")
 Ref = Annotated[
     str | None,
     Query(
-        pattern=VERSION_OR_DRY_RUN,
-        description="The newer version: number, channel, or `latest`; or `dry:…` of a dry run.",
+        pattern=VERSION_OR_PENDING,
+        description="The newer version: number, channel, or `latest`; or `dry:…` of a dry run, or `draft:…`.",
     ),
 ]
 
@@ -33,9 +33,9 @@ FromRef = Annotated[
     str | None,
     Query(
         alias="from",
-        pattern=VERSION_OR_DRY_RUN,
-        description="The older version: number, channel, or `latest`; or `dry:…` of a dry run. Default: the parent of "
-        "`to`.",
+        pattern=VERSION_OR_PENDING,
+        description="The older version: number, channel, or `latest`; or `dry:…` of a dry run, or `draft:…`. Default: "
+        "the parent of `to`.",
     ),
 ]
 

@@ -15,7 +15,7 @@ from app.api.http.auth import Viewer
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import VERSION_OR_DRY_RUN, EnvironmentPath, problem_responses
+from app.api.http.schemas import VERSION_OR_PENDING, EnvironmentPath, problem_responses
 from app.api.robots import PoseOut, place_as_json
 from app.review.touched import RobotImpact
 from app.review.worker import MAX_LISTED, compare_versions
@@ -127,13 +127,13 @@ def get_impact(
         str | None,
         Query(
             alias="from",
-            pattern=VERSION_OR_DRY_RUN,
+            pattern=VERSION_OR_PENDING,
             description="What robots drive on now: number, channel, or `latest`. Default: `production` if it has a "
             "version, else `latest`.",
         ),
     ] = None,
     to: Annotated[
-        str, Query(pattern=VERSION_OR_DRY_RUN, description="What they would drive on: number, channel, or `latest`.")
+        str, Query(pattern=VERSION_OR_PENDING, description="What they would drive on: number, channel, or `latest`.")
     ] = "latest",
 ) -> Response:
     """Return what robots lose if `to` replaces `from`, on all levels.

@@ -13,7 +13,7 @@ from app.api.http.auth import Viewer
 from app.api.http.dependencies import ServicesDep
 from app.api.http.parameters import numbers, parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import VERSION_OR_DRY_RUN, DatumOut, EnvironmentPath, problem_responses
+from app.api.http.schemas import VERSION_OR_PENDING, DatumOut, EnvironmentPath, problem_responses
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
 from app.model.geodesy import local_frame
@@ -53,8 +53,8 @@ def transform(
     version: Annotated[
         str,
         Query(
-            pattern=VERSION_OR_DRY_RUN,
-            description="Version whose datum to use: number, channel, or `latest`; or `dry:…` of a dry run.",
+            pattern=VERSION_OR_PENDING,
+            description="Version whose datum to use: number, channel, or `latest`; or `dry:…`, or `draft:…`.",
         ),
     ] = "latest",
 ) -> Response:

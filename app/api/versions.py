@@ -300,9 +300,9 @@ def create_edit(env: EnvironmentPath, body: EditsBody, services: ServicesDep, co
 
 @router.get("/versions/{v}", responses=problem_responses(VersionOut | DryRunOut, 404), summary="Get a version")
 def get_version(env: EnvironmentPath, v: VersionPath, services: ServicesDep, _: Viewer) -> Response:
-    """Return a version by number, by channel, or the newest; or a dry run by its `id`, with its differences."""
+    """Return a version by number, by channel, or the newest; or a dry run or draft, with its differences."""
     version = services.store.versions.get(env, parse_version_ref(v))
-    body = version.as_dict() if version.dry_run is None else dry_run_as_json(services.store, version)
+    body = version.as_dict() if version.pending is None else dry_run_as_json(services.store, version)
     return json_response(body, headers=version_headers(version))
 
 

@@ -37,6 +37,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("show", "show:show"),
         ("diff", "versions:diff"),
         ("revert", "versions:revert"),
+        ("draft", "drafts:commands"),
         ("where", "position:locate"),
         ("derive", "versions:derive"),
         ("align", "align:align"),
@@ -65,6 +66,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
 
 ALIASES: Mapping[str, str] = {
     "environments": "environment",
+    "drafts": "draft",
     "channel": "channels",
     "robot": "robots",
     "overlay": "overlays",

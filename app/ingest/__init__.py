@@ -6,9 +6,11 @@
 from app.ingest.alignment import AlignmentRequest
 from app.ingest.commit_request import CommitRequest
 from app.ingest.derivation import DerivationRequest
+from app.ingest.drafts import RebaseResult, check_draft_match
+from app.ingest.edits import check_depth
 from app.ingest.generation import GenerationRequest
 from app.ingest.online import Provider
-from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload, check_depth, dry_run_as_json
+from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload, dry_run_as_json
 from app.ingest.templates import TemplateUpdate
 
 __all__ = [
@@ -19,9 +21,11 @@ __all__ = [
     "GenerationRequest",
     "Ingest",
     "Provider",
+    "RebaseResult",
     "SpooledFile",
     "TemplateUpdate",
     "Upload",
     "check_depth",
+    "check_draft_match",
     "dry_run_as_json",
 ]

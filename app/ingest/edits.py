@@ -33,6 +33,9 @@ EDITED = Provenance("raw", "edit")
 SAME_METRES, SAME_DEGREES = 2e-9, 2e-12
 """Twice the rounding of coordinates in responses: a smaller difference is no edit."""
 
+MAX_DEPTH = 128
+"""Maximum nesting depth of an edit's lists and objects: that of GeoJSON files, so that it can be written again."""
+
 _SHAPES: Mapping[str, frozenset[str]] = {
     "node": frozenset({"Point"}),
     "edge": frozenset({"LineString"}),
@@ -512,3 +515,25 @@ def _network_item(item: str, properties: Mapping[str, Any]) -> Mapping[str, Any]
     if kind == "edge" and not all(isinstance(properties.get(e), str) for e in ("source", "target")):
         raise Invalid(f"edge {item} needs 'source' and 'target', the ids of its nodes")
     return {**properties, "kind": kind}
+
+
+def check_depth(changes: Sequence[Mapping[str, Any]]) -> None:
+    """Raise Invalid for edits that are nested too deeply to be stored."""
+    if _exceeds_depth(MAX_DEPTH, changes):
+        reason = f"nested deeper than {MAX_DEPTH} lists and objects"
+        raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
+
+
+def _exceeds_depth(limit: int, value: Any) -> bool:
+    """Return whether lists and mappings are nested deeper than ``limit``."""
+    front = [value]
+    for _ in range(limit):
+        front = [
+            inner
+            for one in front
+            if isinstance(one, list | tuple | Mapping)
+            for inner in (one.values() if isinstance(one, Mapping) else one)
+        ]
+        if not front:
+            return False
+    return True

@@ -19,7 +19,8 @@ from app.ingest.alignment import AlignmentRequest, AlignmentResult, prepare_alig
 from app.ingest.commit_request import CommitRequest
 from app.ingest.derivation import DerivationRequest, input_line, prepare_derivation
 from app.ingest.derivation import check as check_wish
-from app.ingest.edits import edit_changes
+from app.ingest.drafts import DraftEditor, check_writer
+from app.ingest.edits import check_depth, edit_changes
 from app.ingest.generation import GenerationRequest, prepare_generation
 from app.ingest.prepare import Mode, PreparedUpload, datum_moved_warnings, prepare_changes, prepare_upload
 from app.ingest.templates import TemplateUpdate
@@ -27,9 +28,9 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.pool import WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
-from app.store.dry_runs import as_prepared
+from app.store.pending import as_prepared
 from app.store.store import Store
-from app.store.values import Idempotency, Source, Version
+from app.store.values import DRAFT_PREFIX, Idempotency, Source, Version, Writer
 from app.upload_reader import UploadHints
 
 Run = Callable[..., Any]
@@ -37,9 +38,6 @@ Run = Callable[..., Any]
 
 UNCHANGED = "="
 """Prefix of the fingerprint of a request that changed nothing."""
-
-MAX_DEPTH = 128
-"""Maximum nesting depth of an edit's lists and objects: that of GeoJSON files, so that it can be written again."""
 
 MAX_COMMIT_ATTEMPTS = 50
 """Maximum number of attempts to commit a change without ``If-Match`` while the head moves."""
@@ -79,6 +77,7 @@ class Ingest:
     def __init__(self, store: Store, run: Run, limits: Limits, provider: online.Provider | None = None) -> None:
         self._store, self._run, self._limits = store, run, limits
         self.provider = provider
+        self.drafts = DraftEditor(store, self._run_in_worker)
 
     def upload(self, environment: str, upload: Upload, commit: CommitRequest) -> CommitResult:
         """Commit uploaded files as one version, or none of them.
@@ -255,18 +254,38 @@ class Ingest:
 
         Raises NotFound if it has expired, StaleParent if it was not made for the head, Conflict.
         """
+        again = "the dry run was made for version {}: run it again and review the changes"
+        return self._commit_pending(environment, ref, commit, again, lambda: None)
+
+    def commit_draft(self, environment: str, id: str, writer: Writer, commit: CommitRequest) -> CommitResult:
+        """Commit a draft as one version, by default with its name as message, and remove it.
+
+        Raises NotFound, Denied (it is another one's), StaleParent if it is not based on the head or was edited
+        meanwhile, Conflict if it has no changes.
+        """
+
+        def check() -> None:
+            check_writer(self._store.drafts.get(environment, id), writer)
+
+        again = "the draft is based on version {}: rebase the draft and review the changes"
+        return self._commit_pending(environment, DRAFT_PREFIX + id, commit, again, check)
+
+    def _commit_pending(
+        self, environment: str, ref: str, commit: CommitRequest, again: str, check: Callable[[], None]
+    ) -> CommitResult:
+        """Commit a dry run or draft. again: what to do if it is not based on the head. check: of the permission."""
         key = commit.idempotency(_digest(["commit", ref, commit.message]))
         replayed = self._previous_result(environment, key)
         if replayed is not None:
             return replayed
+        check()
+        tried = self._store.versions.get(environment, ref)
         head = self._store.versions.get(environment)
         check_if_match(commit.if_match, head)
-        tried = self._store.versions.get(environment, ref)
         if tried.parent != head.number:
-            raise StaleParent(
-                f"the head of {environment} is version {head.number}, the dry run was made for version {tried.parent}: "
-                "run it again and review the changes"
-            )
+            raise StaleParent(f"the head of {environment} is version {head.number}, {again.format(tried.parent)}")
+        if ref.startswith(DRAFT_PREFIX) and tried.pending is not None and not tried.pending.changed:
+            raise Conflict("the draft has no changes: edit it first, or delete it")
         described = commit.with_default_message(tried.message)
         return self._commit(environment, head, as_prepared(tried), described, key, tried.warnings, tried.sources)
 
@@ -494,28 +513,6 @@ def _fingerprint(upload: Upload, commit: CommitRequest) -> str:
     values = [hints.format, hints.layer, hints.level, hints.grid, upload.mode, commit.message, commit.dry_run]
     files = sorted([f.name, f.sha256] for f in upload.files)
     return _digest(["upload", values, dict(sorted(hints.options.items())), files])
-
-
-def check_depth(changes: Sequence[Mapping[str, Any]]) -> None:
-    """Raise Invalid for edits that are nested too deeply to be stored."""
-    if _exceeds_depth(MAX_DEPTH, changes):
-        reason = f"nested deeper than {MAX_DEPTH} lists and objects"
-        raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
-
-
-def _exceeds_depth(limit: int, value: Any) -> bool:
-    """Return whether lists and mappings are nested deeper than ``limit``."""
-    front = [value]
-    for _ in range(limit):
-        front = [
-            inner
-            for one in front
-            if isinstance(one, list | tuple | Mapping)
-            for inner in (one.values() if isinstance(one, Mapping) else one)
-        ]
-        if not front:
-            return False
-    return True
 
 
 def _digest(value: Any) -> str:

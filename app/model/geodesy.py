@@ -204,9 +204,21 @@ def geometries_from_wgs84(crs: str, geometry: NDArray[np.object_]) -> NDArray[np
     Points outside the CRS become infinite.
     """
 
+    return _between(WGS84, crs, geometry)
+
+
+def geometries_to_wgs84(crs: str, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Convert shapely geometries from a CRS, x (easting) first, to (longitude, latitude); a z passes through.
+
+    Points outside the CRS become infinite.
+    """
+    return _between(crs, WGS84, geometry)
+
+
+def _between(source: str, target: str, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
     def convert(points: Array) -> Array:
         out = np.array(points, np.float64)
-        out[:, :2] = between(WGS84, crs, points)
+        out[:, :2] = between(source, target, points)
         return out
 
     return _transform(geometry, convert)

@@ -58,6 +58,14 @@ class ReferenceSystem:
             return geodesy.local_frame(datum).geometries_to_local(geometry)
         return swap_axes(geometry) if self.swap else geodesy.geometries_from_wgs84(self.code, geometry)
 
+    def to_wgs84(self, geometry: NDArray[np.object_], datum: Datum) -> NDArray[np.object_]:
+        """Convert geometries to CRS84; coordinates outside the CRS become infinite."""
+        if self.kind == "crs84":
+            return geometry
+        if self.kind == "local":
+            return geodesy.local_frame(datum).geometries_to_wgs84(geometry)
+        return swap_axes(geometry) if self.swap else geodesy.geometries_to_wgs84(self.code, geometry)
+
     def box_in_wgs84(self, box: Box, datum: Datum, parameter: str) -> list[Box]:
         """Return the boxes in degrees around a box in this CRS. Raises Invalid if it is not on earth."""
         if self.kind == "crs84":

@@ -98,7 +98,7 @@ def operation(
     media_types: Iterable[str],
     parameters: Sequence[str] = ("f",),
     further: Sequence[Mapping[str, object]] = (),
-) -> dict[str, object]:
+) -> Mapping[str, object]:
     """Build the path item of a ``GET``. parameters: names in PARAMETERS; further: parameters of this path only."""
     problem = {"description": "Error", "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}}
     content = {media: {"schema": {"type": "string"} if media == HTML else {"type": "object"}} for media in media_types}
@@ -118,14 +118,15 @@ def operation(
 
 async def openapi_document(service: Service) -> dict[str, Any]:
     """Build the OpenAPI document of a service."""
-    paths: dict[str, object] = {
+    paths: dict[str, Mapping[str, object]] = {
         "/": operation("getLandingPage", "Landing page", (JSON, HTML)),
         "/conformance": operation("getConformance", "Conformance classes", (JSON, HTML)),
         "/api": operation("getApi", "This document", (OPENAPI, HTML)),
         "/collections": operation("getCollections", "Collections", (JSON, HTML)),
     }
     for one in extensions():
-        paths |= await one.paths(service)
+        for path, item in (await one.paths(service)).items():
+            paths[path] = {**paths.get(path, {}), **item}
     text = {"type": "string"}
     problem = {
         "type": "object",

@@ -41,7 +41,11 @@ def _no_collection_links(_service: Service, _collection: str) -> Sequence[Link]:
     return ()
 
 
-async def _no_paths(_: Service) -> Mapping[str, object]:
+def _no_conformance(_: Service) -> Sequence[str]:
+    return ()
+
+
+async def _no_paths(_: Service) -> Mapping[str, Mapping[str, object]]:
     return {}
 
 
@@ -50,7 +54,7 @@ class Extension:
     """What a module adds, as its ``extension``.
 
     Attributes:
-        conformance: URIs of conformance classes.
+        conformance: URIs of conformance classes of all services; conformance_of: of one, besides these.
         collections: entries of ``/collections``.
         landing_links: links of the landing page.
         collection_links: links of a collection of any module.
@@ -58,10 +62,11 @@ class Extension:
     """
 
     conformance: Sequence[str] = ()
+    conformance_of: Callable[[Service], Sequence[str]] = _no_conformance
     collections: Callable[[Service], Awaitable[Sequence[Collection]]] = _no_collections
     landing_links: Callable[[Service], Sequence[Link]] = _no_links
     collection_links: Callable[[Service, str], Sequence[Link]] = _no_collection_links
-    paths: Callable[[Service], Awaitable[Mapping[str, object]]] = _no_paths
+    paths: Callable[[Service], Awaitable[Mapping[str, Mapping[str, object]]]] = _no_paths
 
 
 @cache

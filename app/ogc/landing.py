@@ -87,7 +87,7 @@ async def get_landing_page(service: Service, f: Representation = None) -> Respon
 async def get_conformance(service: Service, f: Representation = None) -> Response:  # noqa: ARG001  parsed by choose()
     """Return the URIs of the conformance classes that the service implements."""
     used = service.choose()
-    classes = [uri for one in extensions() for uri in one.conformance]
+    classes = [uri for one in extensions() for uri in (*one.conformance, *one.conformance_of(service))]
     if used == "json":
         return service.respond_json({"conformsTo": classes})
     root, body = page("Conformance classes", [(service.title, service.landing_url)])

@@ -1,4 +1,4 @@
-"""Routes of the OGC API: each at two addresses, with errors as the standard demands."""
+"""Routes of the OGC API: each at three addresses, with errors as the standard demands."""
 
 from __future__ import annotations
 
@@ -16,12 +16,20 @@ from app.api.http import problems
 from app.api.http.responses import StrictRoute
 from app.api.http.schemas import problem_responses
 from app.errors import FleetMapError
+from app.ogc.drafts import DRAFT, draft_service
 from app.ogc.negotiation import HTML, prefers_html
 from app.ogc.pages import error_page, page_headers
 from app.ogc.service import Service, current_service, version_service
 
 SHORT = "/ogc/{env}"
 LONG = "/ogc/{env}/versions/{v}"
+
+SERVICES = (
+    (SHORT, current_service, ""),
+    (LONG, version_service, "_of_version"),
+    (DRAFT, draft_service, "_of_draft"),
+)
+"""Addresses of services, what finds them, and the end of the names of their operations."""
 
 Handler = Callable[..., Awaitable[Response]]
 
@@ -66,7 +74,7 @@ def ogc_router() -> APIRouter:
 def both(
     router: APIRouter, path: str, content: Mapping[str, object], *, in_schema: bool = True, **options: Any
 ) -> Callable[[Handler], Handler]:
-    """Register a handler for ``GET`` below ``/ogc/{env}`` and below ``/ogc/{env}/versions/{v}``.
+    """Register a handler for ``GET`` below each address of SERVICES.
 
     The handler's parameter of type Service gets the one of the address.
 
@@ -76,7 +84,7 @@ def both(
     """
 
     def register(handler: Handler) -> Handler:
-        for prefix, dependency, suffix in ((SHORT, current_service, ""), (LONG, version_service, "_of_version")):
+        for prefix, dependency, suffix in SERVICES:
             endpoint = _with_service(handler, dependency, suffix)
             responses: dict[int | str, dict[str, Any]] = {
                 **problem_responses(None, 404, 406),

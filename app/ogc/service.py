@@ -38,7 +38,8 @@ def link(href: str, rel: str, media_type: str, title: str) -> Link:
 class Service:
     """OGC service of one version. address: absolute URL of the landing page, without a slash at its end.
 
-    ref: version number, or name of a channel whose version may change.
+    ref: version number, or name of a channel or draft whose content may change. draft: name in the address of a draft,
+    None for versions, which cannot be written.
     """
 
     services: Services
@@ -47,6 +48,7 @@ class Service:
     version: Version
     ref: str | int
     address: str
+    draft: str | None = None
 
     @property
     def title(self) -> str:
@@ -124,19 +126,20 @@ def origin(request: Request, public_url: str | None) -> str:
 def current_service(env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer) -> Service:
     """Return the service of the channel ``production`` if it exists, else of the head."""
     try:
-        return _service(request, services, env, PRODUCTION, f"/ogc/{env}")
+        return service_at(request, services, env, PRODUCTION, f"/ogc/{env}")
     except NotFound:
-        return _service(request, services, env, LATEST, f"/ogc/{env}")
+        return service_at(request, services, env, LATEST, f"/ogc/{env}")
 
 
 def version_service(
     env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer
 ) -> Service:
     """Return the service of a version."""
-    return _service(request, services, env, parse_version_ref(v), f"/ogc/{env}/versions/{quote(v, safe=':')}")
+    return service_at(request, services, env, parse_version_ref(v), f"/ogc/{env}/versions/{quote(v, safe=':')}")
 
 
-def _service(request: Request, services: Services, env: str, ref: str | int, path: str) -> Service:
+def service_at(request: Request, services: Services, env: str, ref: str | int, path: str) -> Service:
+    """Return the service of a version at a path."""
     version = services.store.versions.get(env, ref)
     environment = services.store.environments.get(env)
     return Service(services, request, environment, version, ref, origin(request, services.options.public_url) + path)

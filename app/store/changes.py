@@ -11,7 +11,7 @@ from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import Part, PartKey
 from app.model.templates import Templates
-from app.store.values import Area, PartEntry, Provenance
+from app.store.values import Area, PartEntry, Pending, Provenance
 
 __all__ = [
     "KEEP",
@@ -103,8 +103,8 @@ class Prepared:
     chunks: hash (hex) -> stored bytes of all chunks that are missing or damaged in the base. blobs: SHA-256 -> content
     of files that belong to the content (resources). changes: counts by layer. changed: whether the root differs from
     the base's, or the provenance of derived parts is renewed. index: the changes to the index if they are few, else
-    None (the next query updates it). area: KEEP if it is the base's, None if the next query computes it. dry_run: id of
-    the dry run that stored the content, which must not have expired.
+    None (the next query updates it). area: KEEP if it is the base's, None if the next query computes it. pending: the
+    dry run or draft that stored the content, which must still exist.
     """
 
     base: int
@@ -119,4 +119,4 @@ class Prepared:
     blobs: Mapping[str, bytes] = field(default_factory=dict)
     index: tuple[IndexRows, ...] | None = None
     area: Area | Literal[Keep.KEEP] | None = None
-    dry_run: str | None = None
+    pending: Pending | None = None

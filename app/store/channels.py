@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Row, insert, select, update
 
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
-from app.store import dry_runs, outbox, tables
+from app.store import outbox, tables
 from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel
 from app.store.database import Database
 from app.store.fleet_values import (
@@ -26,6 +26,7 @@ from app.store.fleet_values import (
 )
 from app.store.manifest import read_version
 from app.store.overlays import CHANGE_CLOSURES, read_closures
+from app.store.pending import check_committed
 from app.store.robots import channel_robots
 from app.store.values import LATEST, Version, rfc3339
 
@@ -77,9 +78,10 @@ class Channels:
 
         closures: how maps show the closures in force; default: applied for a channel, ignored for a number (history).
         The sequence is that of the event that moved the channel to the version (or created the version) or, if later,
-        of the event that last changed the closures in force. Raises Invalid for a dry run, which robots cannot get.
+        of the event that last changed the closures in force. Raises Invalid for a dry run or
+        draft, which robots cannot get.
         """
-        dry_runs.check_committed(ref)
+        check_committed(ref)
         mode = closures or ("ignore" if isinstance(ref, int) else "apply")
         table, version = tables.channel, tables.version
         with self._database.snapshot() as connection:

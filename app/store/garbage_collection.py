@@ -1,4 +1,4 @@
-"""Garbage collection: mark what versions and dry runs refer to, sweep what was not used in the grace period.
+"""Garbage collection: mark what versions, dry runs and drafts refer to, sweep what was not used in the grace period.
 
 It never races an upload. The chunks that a version in progress relies on are part of its base version, which exists
 while it is marked (else the commit fails), or were written or used again within the grace period. Rows are removed with
@@ -13,7 +13,7 @@ from typing import Final
 
 from sqlalchemy import delete, select
 
-from app.store import chunks, dry_runs, parts, tables
+from app.store import chunks, drafts, dry_runs, parts, tables
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
@@ -35,11 +35,11 @@ class GarbageCollector:
         self._database, self._chunks, self._blobs = database, chunks, blobs
 
     def collect(self, grace: timedelta) -> dict[str, int]:
-        """Remove chunks and blobs that no version and no dry run refers to, unless written or used within ``grace``.
+        """Remove chunks and blobs that no version, dry run or draft refers to, unless written or used within ``grace``.
 
         Returns ``{chunks, blobs, bytes, temporary}``: numbers of removed objects, bytes of the blobs. Also removes
-        expired dry runs (before all else), old idempotency keys (7 days), finished jobs (7 days), silent robots (90
-        days), settled overlays and events of purged environments (30 days).
+        expired dry runs and drafts (before all else), old idempotency keys (7 days), finished jobs (7 days), silent
+        robots (90 days), settled overlays and events of purged environments (30 days).
 
         ``grace`` must be longer than any upload takes. Raises Damaged if a chunk of a version is damaged; nothing is
         removed then. Run it in one process at a time.
@@ -47,6 +47,7 @@ class GarbageCollector:
         self._chunks.forget()
         before = int(time.time() - grace.total_seconds()) + (1 if not grace else 0)
         dry_runs.remove_expired(self._database)
+        drafts.remove_expired(self._database)
         live_chunks, live_blobs = self._live()
         removed = self._sweep(live_chunks, before)
         blobs, size = self._blobs.collect(live_blobs, before)
@@ -55,14 +56,14 @@ class GarbageCollector:
         return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": temporary}
 
     def _live(self) -> tuple[set[bytes], set[str]]:
-        """Return every chunk and blob that a version or dry run refers to. Equal parts are walked once.
+        """Return every chunk and blob that a version, dry run or draft refers to. Equal parts are walked once.
 
-        An expired dry run counts as long as its row exists: a commit of it may have begun before it expired.
+        An expired one counts as long as its row exists: a commit of it may have begun before it expired.
         """
         hashes: dict[str, None] = {}
         # one snapshot: else content could be missed if it is cloned and its origin purged during the walk
         with self._database.snapshot() as connection:
-            for table in (tables.version, tables.dry_run):
+            for table in (tables.version, tables.dry_run, tables.draft):
                 rows = connection.execution_options(stream_results=True).execute(select(table.c.manifest))
                 for some in rows.partitions(PAGE):
                     for (manifest,) in some:

@@ -41,6 +41,19 @@ def prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsInt
         return _prepare(draft, base, changes, is_intact)
 
 
+def prepare_further(
+    draft: ChunkStage, base: Version, current: Version, changes: Changes, is_intact: IsIntact
+) -> Prepared:
+    """Prepare changes on top of an uncommitted version, as a change of the version that it is based on."""
+    with gc_paused():
+        made = _prepare(draft, current, changes, is_intact)
+        before, after = ({entry.key: entry for entry in parts} for parts in (base.parts, made.parts))
+        summary, _ = summarise(draft, before, after)
+    summary |= frame_changes(base.datum, made.datum, base.levels, made.levels)
+    summary |= template_changes(base.templates, made.templates)
+    return replace(made, base=base.number, changes=summary, changed=made.root != base.root, index=None, area=None)
+
+
 def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
     entries = {entry.key: entry for entry in base.parts}
     before = dict(entries)

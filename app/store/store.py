@@ -18,6 +18,7 @@ from app.store.chunks import Chunks
 from app.store.commit_counter import CommitCounter
 from app.store.content import ContentReader
 from app.store.database import Database
+from app.store.drafts import Drafts
 from app.store.environments import Environments
 from app.store.garbage_collection import GarbageCollector
 from app.store.index import SpatialIndex
@@ -62,6 +63,7 @@ class Store:
         self.blobs = Blobs(database, self.blob_dir, readonly=readonly)
         self.environments = Environments(database, self.chunks)
         self.versions = Versions(database, self.chunks, self.blobs)
+        self.drafts = Drafts(database)
         self.content = ContentReader(self.chunks, self.blobs)
         self.channels = Channels(database)
         self.overlays = Overlays(database)

@@ -207,26 +207,52 @@ source = Table(
 )
 """Files of a version, in the order of the upload."""
 
+
+def _pending_content() -> tuple[Column[Any], ...]:
+    return (
+        Column("base", Integer, nullable=False),
+        Column("root", String(64), nullable=False),
+        Column("created", UtcDateTime, nullable=False),
+        Column("expires", UtcDateTime, nullable=False, index=True),
+        Column("changed", Boolean, nullable=False),
+        Column("changes", JSON, nullable=False),
+        Column("warnings", JSON, nullable=False),
+        Column("manifest", LargeBinary, nullable=False),
+    )
+
+
 dry_run = Table(
     "dry_run",
     metadata,
     Column("id", String(32), primary_key=True),
     _environment(nullable=False, index=True),
-    Column("base", Integer, nullable=False),
-    Column("root", String(64), nullable=False),
+    *_pending_content(),
     Column("author", Text, nullable=False),
     Column("message", Text, nullable=False),
-    Column("created", UtcDateTime, nullable=False),
-    Column("expires", UtcDateTime, nullable=False, index=True),
-    Column("changed", Boolean, nullable=False),
-    Column("changes", JSON, nullable=False),
-    Column("warnings", JSON, nullable=False),
     Column("sources", JSON, nullable=False),
-    Column("manifest", LargeBinary, nullable=False),
 )
 """Versions that were tried and not committed; garbage collection keeps their content as long as the row exists.
 
 base: number of the head that they were made for. sources: as in ``source``. changed: see ``Prepared``.
+"""
+
+draft = Table(
+    "draft",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    _environment(nullable=False),
+    *_pending_content(),
+    Column("name", Text, nullable=False),
+    Column("owner", Text, nullable=False),
+    Column("owner_id", String(32), nullable=False),
+    Column("revision", Integer, nullable=False),
+    Column("edited", UtcDateTime, nullable=False),
+    Index("ix_draft_owner", "environment_id", "owner_id", "name", unique=True),
+)
+"""Versions that people work on; garbage collection keeps their content as long as the row exists.
+
+base, changed: as in ``dry_run``. owner, owner_id: name and id of the token, which may have ended. revision: rises with
+every edit, so that of two at once only one is stored.
 """
 
 chunk = Table(

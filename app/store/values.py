@@ -197,23 +197,38 @@ def datum_information(datum: Datum, parts: Iterable[PartEntry]) -> Information:
     return "generated" if made_up else "raw"
 
 
-DRY_PREFIX = "dry:"
-"""Start of the name of a dry run among the names of versions: ``dry:<id>``."""
+PendingKind = Literal["dry", "draft"]
 
-DRY_NUMBER = -1
-"""``Version.number`` of a dry run: no version has it."""
+DRY_PREFIX, DRAFT_PREFIX = "dry:", "draft:"
+"""Start of the name of a dry run and of a draft among the names of versions: ``dry:<id>``, ``draft:<id>``."""
+
+PENDING_NUMBER = -1
+"""``Version.number`` of a dry run or draft: no version has it."""
 
 
 @dataclass(frozen=True, slots=True)
-class DryRun:
-    """A version that was tried and not committed.
+class Pending:
+    """A version that is not committed: a dry run, or the content of a draft at one of its revisions.
 
-    id: 32 hexadecimal digits. expires: until when it can be read. changed: whether committing it makes a version.
+    id: hexadecimal digits. expires: until when it can be read. changed: whether committing it makes a version.
+    revision: rises with every edit of a draft; 0 for a dry run, which never changes.
     """
 
+    kind: PendingKind
     id: str
     expires: datetime
     changed: bool
+    revision: int = 0
+
+    @property
+    def ref(self) -> str:
+        """Return the name by which it can be read like a version of its environment."""
+        return f"{self.kind}:{self.id}"
+
+    @property
+    def tag(self) -> str:
+        """Return a name of this content, which no later edit has."""
+        return f"{self.ref}.{self.revision}" if self.kind == "draft" else self.ref
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +237,8 @@ class Version:
 
     environment: its name. changes: counts of changes against its parent, by layer. warnings: of its sources. parts:
     sorted by key. templates: values for formats that need more than the layers have. closures: those that its maps
-    show; None: none (as it is stored). dry_run: set if it is not committed; number is then ``DRY_NUMBER`` and time that
-    of the dry run.
+    show; None: none (as it is stored). pending: set if it is not committed; number is then ``PENDING_NUMBER`` and time
+    that of the dry run, or of the draft's last edit.
     """
 
     environment: str
@@ -241,12 +256,12 @@ class Version:
     parts: tuple[PartEntry, ...]
     templates: Templates = NO_TEMPLATES
     closures: Closures | None = None
-    dry_run: DryRun | None = None
+    pending: Pending | None = None
 
     @property
     def ref(self) -> int | str:
-        """Return the name by which it can be read in its environment: its number, or ``dry:<id>``."""
-        return self.number if self.dry_run is None else DRY_PREFIX + self.dry_run.id
+        """Return the name by which it can be read: its number, ``dry:<id>`` or ``draft:<id>``."""
+        return self.number if self.pending is None else self.pending.ref
 
     def part(self, key: PartKey) -> PartEntry | None:
         """Return the entry of a part, or None."""
@@ -296,16 +311,16 @@ class Version:
         return out
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the version as JSON; of a dry run without number and time, but with its ``id`` and expiry."""
-        dry = self.dry_run
+        """Return the version as JSON; of a dry run or draft without number and time, but with ``id`` and expiry."""
+        pending = self.pending
         return {
             "environment": self.environment,
-            "version": self.number if dry is None else None,
+            "version": self.number if pending is None else None,
             "root": self.root,
             "parent": self.parent,
             "author": self.author,
             "message": self.message,
-            "time": rfc3339(self.time) if dry is None else None,
+            "time": rfc3339(self.time) if pending is None else None,
             "changes": dict(self.changes),
             "sources": [source.as_dict() for source in self.sources],
             "warnings": [warning.as_dict() for warning in self.warnings],
@@ -314,7 +329,70 @@ class Version:
                 {"layer": k.layer, "level": k.level, "name": k.name, "changed": list(changed)}
                 for k, changed in self.stale.items()
             ],
-            **({} if dry is None else {"id": self.ref, "expires": rfc3339(dry.expires)}),
+            **({} if pending is None else {"id": self.ref, "expires": rfc3339(pending.expires)}),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Writer:
+    """Who edits drafts: the id and name of a token, and whether it may write those of others."""
+
+    id: str
+    name: str
+    is_admin: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A named working version of an environment, which edits gather in until it is committed or deleted.
+
+    base: number of the version that it was made from or rebased on. head: that of the environment. revision: rises with
+    every edit. changed: time of the last one. changes: counts against the base, by layer.
+    """
+
+    id: str
+    environment: str
+    name: str
+    owner: str
+    owner_id: str
+    base: int
+    head: int
+    revision: int
+    created: datetime
+    changed: datetime
+    expires: datetime
+    changes: Mapping[str, Any]
+
+    @property
+    def ref(self) -> str:
+        """Return the name by which it can be read like a version of its environment."""
+        return DRAFT_PREFIX + self.id
+
+    @property
+    def tag(self) -> str:
+        """Return the name of its present content, as ``Pending.tag``."""
+        return f"{self.ref}.{self.revision}"
+
+    def may_write(self, writer: Writer) -> bool:
+        """Test if somebody may edit, commit and delete it: its owner, or an administrator."""
+        return writer.is_admin or writer.id == self.owner_id
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the draft as JSON."""
+        return {
+            "id": self.id,
+            "version": self.ref,
+            "environment": self.environment,
+            "name": self.name,
+            "owner": self.owner,
+            "base": self.base,
+            "head": self.head,
+            "behind": self.head != self.base,
+            "revision": self.revision,
+            "created": rfc3339(self.created),
+            "changed": rfc3339(self.changed),
+            "expires": rfc3339(self.expires),
+            "changes": dict(self.changes),
         }
 
 

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent, Unavailable
 from app.model.templates import template_changes
-from app.store import chunks, dry_runs, index, outbox, parts, tables
+from app.store import chunks, drafts, dry_runs, index, outbox, parts, tables
 from app.store.area import area_after, write_area
 from app.store.audit import skip_audit
 from app.store.base import (
@@ -28,8 +28,9 @@ from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
-from app.store.prepare import frame_changes, prepare, summarise
-from app.store.values import DRY_PREFIX, LATEST, Area, Idempotency, Source, Version
+from app.store.pending import check_committed
+from app.store.prepare import frame_changes, prepare, prepare_further, summarise
+from app.store.values import DRAFT_PREFIX, DRY_PREFIX, LATEST, Area, Idempotency, Pending, Source, Version
 
 MAX_REVERT_ATTEMPTS: Final = 8
 
@@ -176,7 +177,7 @@ class Versions:
         self._database, self._chunks, self._blobs = database, chunks, blobs
 
     def get(self, environment: str, ref: str | int = LATEST) -> Version:
-        """Read a version by number, channel or ``latest``, or a dry run by ``dry:<id>``.
+        """Read a version by number, channel or ``latest``, a dry run by ``dry:<id>``, a draft by ``draft:<id>``.
 
         Raises NotFound, or Gone if the environment is deleted.
         """
@@ -184,11 +185,13 @@ class Versions:
             row = environment_row(connection, environment)
             if isinstance(ref, str) and ref.startswith(DRY_PREFIX):
                 return dry_runs.read(connection, row, ref, self._database.now())
+            if isinstance(ref, str) and ref.startswith(DRAFT_PREFIX):
+                return drafts.read(connection, row, ref.removeprefix(DRAFT_PREFIX), self._database.now())
             return read_version(connection, row, resolve(connection, row, ref))
 
     def get_committed(self, environment: str, ref: str | int) -> Version:
-        """Read a version that robots may be given. Raises Invalid for a dry run, and the errors of ``get``."""
-        dry_runs.check_committed(ref)
+        """Read a version that robots may be given. Raises Invalid for a dry run or draft, and as ``get``."""
+        check_committed(ref)
         return self.get(environment, ref)
 
     def page(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
@@ -217,6 +220,10 @@ class Versions:
         """
         return prepare(self._chunks.stage(), base, changes, self._is_intact)
 
+    def prepare_further(self, base: Version, current: Version, changes: Changes) -> Prepared:
+        """Prepare changes on top of a draft's content, as a change of its base. Like ``prepare``."""
+        return prepare_further(self._chunks.stage(), base, current, changes, self._is_intact)
+
     def _is_intact(self, part: str) -> bool:
         """Return whether the database has all chunks of a part intact, bypassing the cache."""
         try:
@@ -240,7 +247,8 @@ class Versions:
 
         A key that was used before returns the version of that request. A prepared version without changes adds the
         sources to the head and returns it. Raises StaleParent if the head has moved since ``prepared.base``, Conflict
-        if the key was used with another fingerprint, NotFound if ``prepared.dry_run`` has expired.
+        if the key was used with another fingerprint, NotFound if ``prepared.pending`` has expired; a draft is removed,
+        or StaleParent is raised if it was edited meanwhile.
         """
         checked_text(author, "an author")
         checked_text(message, "a message")
@@ -253,8 +261,8 @@ class Versions:
                 return read_version(connection, row, previous)
             _check_head(row, prepared.base)
             now = self._database.now()
-            if prepared.dry_run is not None:
-                dry_runs.lock(connection, row, prepared.dry_run, now)
+            if prepared.pending is not None:
+                _claim(connection, row, prepared.pending, now)
             chunks.insert(connection, prepared.chunks)  # without changes: the repaired chunks
             if not prepared.changed:
                 _append_sources(connection, row.id, row.head, sources)
@@ -395,6 +403,14 @@ class Versions:
             )
             record = connection.execute(query).one_or_none()
         return None if record is None else (record.fingerprint, record.version)
+
+
+def _claim(connection: Connection, environment: Row[Any], pending: Pending, now: datetime) -> None:
+    """Keep a dry run until the transaction ends, or remove a draft that becomes a version."""
+    if pending.kind == "draft":
+        drafts.remove(connection, environment, pending, now)
+    else:
+        dry_runs.lock(connection, environment, pending.id, now)
 
 
 def _check_head(row: Row[Any], base: int) -> None:

@@ -61,11 +61,21 @@ NAMED = "environment={env}"
 OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
              "/collections/{collection}/schema", "/collections/{collection}/queryables",
              "/collections/{collection}/items", "/collections/{collection}/items/{feature}")  # fmt: skip
+OGC_ITEMS = "/ogc/{env}/drafts/{draft}/collections/{collection}/items"
+ITEM_METHODS = ("OPTIONS", "PUT", "PATCH", "DELETE")
 ROWS = [
     *(
         Row(f"GET /ogc/{{env}}{start}{path}", "viewer", "environment")
         for start in ("", "/versions/{v}")
         for path in OGC_PATHS
+    ),
+    *(Row(f"GET /ogc/{{env}}/drafts/{{draft}}{path}", "editor", "environment") for path in OGC_PATHS),
+    *(Row(f"{method} {OGC_ITEMS}", "editor", "environment", {}) for method in ("POST", "OPTIONS")),
+    *(Row(f"{m} {OGC_ITEMS}/{{feature}}", "editor", "environment", {}) for m in ("PUT", "PATCH", "DELETE", "OPTIONS")),
+    *(
+        Row(f"{method} /ogc/{{env}}{start}/collections/{{collection}}/items{end}", "viewer", "environment")
+        for start in ("", "/versions/{v}")
+        for method, end in (("OPTIONS", ""), ("POST", ""), *((m, "/{feature}") for m in ITEM_METHODS))
     ),
     *rows(
         "open",
@@ -113,7 +123,9 @@ ROWS = [
         f"DELETE {E}/channels/{{channel}}/planned, POST {E}/derivations, POST {E}/generations, PUT {E}/templates, "
         f"DELETE {E}/templates, PUT {E}/templates/{{format}}, DELETE {E}/templates/{{format}}, POST {E}/alignments, "
         f"POST {E}/overlays/{{id}}/accept, POST {E}/overlays/{{id}}/reject, POST {E}/overlays/{{id}}/end, "
-        f"POST {E}/overlays/{{id}}/keep, PATCH {E}/overlays/{{id}}",
+        f"POST {E}/overlays/{{id}}/keep, PATCH {E}/overlays/{{id}}, GET {E}/drafts, POST {E}/drafts, "
+        f"GET {E}/drafts/{{draft}}, DELETE {E}/drafts/{{draft}}, POST {E}/drafts/{{draft}}/edits, POST {E}/drafts/{{draft}}/rebase, "
+        f"POST {E}/drafts/{{draft}}/commit",
         admin=f"DELETE {E}, POST {E}/restore, POST {E}/purge",
     ),
 ]
@@ -122,7 +134,7 @@ NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
           "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
-          "collection": "nodes", "feature": "gate", "z": "0", "row": "0", "col": "0"}  # fmt: skip
+          "collection": "nodes", "feature": "gate", "z": "0", "row": "0", "col": "0", "draft": "0" * 16}  # fmt: skip
 
 
 @dataclass

@@ -17,7 +17,8 @@ import pytest
 from app.errors import Invalid, NotFound, StaleParent, Unavailable
 from app.model.layers import Layers
 from app.store.changes import Changes, Operation, Replace
-from app.store.dry_runs import LIFETIME, MAX_DRY_RUNS, as_prepared
+from app.store.dry_runs import LIFETIME, MAX_DRY_RUNS
+from app.store.pending import as_prepared
 from app.store.store import Store
 from app.store.values import Source, Version
 from tests.store.samples import DATUM, GRID, TOPOLOGY, assert_same_layers, everything, grid, network, replaces, save
@@ -66,8 +67,8 @@ def count(store: Store, table: str) -> int:
 def test_dry_run_is_read_by_its_id_only(farm: Store) -> None:
     head, sequence = farm.versions.get("farm"), farm.environments.get("farm").sequence
     dry = attempt(farm, *replaces(everything()))
-    assert dry.dry_run is not None
-    assert (dry.parent, dry.dry_run.changed, dry.dry_run.expires) == (head.number, True, NOW + LIFETIME)
+    assert dry.pending is not None
+    assert (dry.parent, dry.pending.changed, dry.pending.expires) == (head.number, True, NOW + LIFETIME)
     assert farm.versions.get("farm", dry.ref) == dry
     farm.chunks.forget()
     assert_same_layers(farm.content.load(farm.versions.get("farm", dry.ref)), Layers(everything(), DATUM))
@@ -90,7 +91,7 @@ def test_committed_dry_run_equals_the_direct_commit(farm: Store) -> None:
     direct = save(farm, "direct", *replaces(everything()))
     version = commit(farm, dry)
     assert (version.root, version.changes, version.parts) == (direct.root, direct.changes, direct.parts)
-    assert (version.number, version.dry_run, version.sources) == (2, None, dry.sources)
+    assert (version.number, version.pending, version.sources) == (2, None, dry.sources)
     with pytest.raises(StaleParent):
         commit(farm, dry)
     hits = {(hit.environment, hit.id) for hit in farm.index.find(box(farm, direct))}

@@ -28,7 +28,7 @@ from starlette.types import Scope
 from app.api.http.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.sessions import Session
-from app.store.values import Role, Token
+from app.store.values import Role, Token, Writer
 
 RequiredRole = Literal["viewer", "robot", "editor", "admin"]
 
@@ -127,6 +127,10 @@ class Principal:
     def has_role(self, need: RequiredRole) -> bool:
         """Test if the role includes ``need``."""
         return self.role in _CAN[need]
+
+    def as_writer(self) -> Writer:
+        """Return the caller as the writer of drafts."""
+        return Writer(self.id, self.name, self.has_role("admin"))
 
     def can_access(self, environment: str) -> bool:
         """Test if the token can access this environment."""

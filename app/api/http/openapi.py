@@ -63,6 +63,7 @@ Stores the maps of environments, versioned in canonical layers, and exports them
 TAGS = {
     "environments": "Mapped places, each with its own history of versions.",
     "versions": "Immutable states of an environment: upload, edit, revert, compare.",
+    "drafts": "Working versions: edits that gather until they are committed as one version.",
     "sources": "Uploaded files, byte for byte.",
     "layers": "Canonical content of a version.",
     "tiles": "Rasters in pieces, and pictures of sites, for screens.",

@@ -51,9 +51,9 @@ def next_page(request: Request, cursor: str | None) -> dict[str, str]:
 
 
 def version_headers(version: Version) -> dict[str, str]:
-    """Build the headers of a version: ``ETag`` for ``If-Match``, number and root. A dry run has its id for both."""
-    name = str(version.ref)
-    return {"etag": f'"{name}"', "fleetmap-version": name, "fleetmap-root": version.root}
+    """Build the headers of a version: ``ETag`` for ``If-Match``, number and root. What is not committed has its id."""
+    tag = str(version.ref if version.pending is None else version.pending.tag)
+    return {"etag": f'"{tag}"', "fleetmap-version": str(version.ref), "fleetmap-root": version.root}
 
 
 def commit_response(outcome: CommitResult) -> Response:

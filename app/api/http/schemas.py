@@ -18,7 +18,7 @@ NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"
 CHANNEL = r"^[a-z][a-z0-9_-]{0,62}$"
 VERSION = r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$"
 DRY_RUN = r"^dry:[0-9a-f]{32}$"
-VERSION_OR_DRY_RUN = r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62}|dry:[0-9a-f]{32})$"
+VERSION_OR_PENDING = r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62}|dry:[0-9a-f]{32}|draft:[0-9a-f]{16})$"
 MAX_TEXT = 20_000
 
 
@@ -115,7 +115,9 @@ class VersionOut(VersionContentOut):
     time: datetime
 
 
-VersionName = Annotated[int | str, Field(description="Number of the version, or `dry:…` of a dry run.", examples=[3])]
+VersionName = Annotated[
+    int | str, Field(description="Number of the version, `dry:…` of a dry run, or `draft:…`.", examples=[3])
+]
 
 
 class DiffOut(BaseModel):
@@ -129,10 +131,10 @@ class DiffOut(BaseModel):
 
 
 class DryRunOut(VersionContentOut):
-    """Version that a change would create. It can be read by its `id` for ten minutes, and committed."""
+    """Version that a change or draft would create. A dry run can be read by its `id` for ten minutes, and committed."""
 
     id: str = Field(
-        description="Name by which the dry run can be read like a version of its environment, and committed.",
+        description="Name by which it can be read like a version of its environment: `dry:…` or `draft:…`.",
         examples=["dry:0123456789abcdef0123456789abcdef"],
     )
     expires: datetime = Field(description="Time from which it returns 404.")
@@ -148,8 +150,8 @@ EnvironmentPath = Annotated[
 VersionPath = Annotated[
     str,
     Path(
-        pattern=VERSION_OR_DRY_RUN,
-        description="Version: number, channel, or `latest`. To read: also the `id` of a dry run, `dry:…`.",
+        pattern=VERSION_OR_PENDING,
+        description="Version: number, channel, or `latest`. To read: also a dry run, `dry:…`, or a draft, `draft:…`.",
         examples=["latest"],
     ),
 ]

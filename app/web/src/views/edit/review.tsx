@@ -1,6 +1,7 @@
 /** The changes in words, a message, and saving. */
 import { Crosshair, Undo2 } from "lucide-preact";
 import { useEffect, useState } from "preact/hooks";
+import { go } from "../../address";
 import { type ApiError, asApiError, online, type Version } from "../../api/client";
 import { type Feature } from "../../map/features";
 import { expired } from "../../session";
@@ -11,7 +12,7 @@ import { count } from "../../ui/text";
 import { notify } from "../../ui/toast";
 import type { Desk } from "./desk";
 import type { Editor } from "./editor";
-import { dryRun, save } from "./save";
+import { dryRun, save, saveAsDraft } from "./save";
 import { type ChangeRow, cellTitle, summary } from "./words";
 
 const SHOWN = 200;
@@ -40,6 +41,19 @@ export function Review({ desk }: { desk: Desk }) {
     }
     setBusy(false);
   };
+  const keep = async () => {
+    setBusy(true);
+    setProblem(null);
+    try {
+      const draft = await saveAsDraft(editor, editor.message.peek().trim().slice(0, 100));
+      editor.discard();
+      close();
+      notify(`Kept as the draft ${draft.name}`, { action: { label: "Drafts", run: () => go({ view: "history" }) } });
+    } catch (error) {
+      setProblem(asApiError(error));
+    }
+    setBusy(false);
+  };
   const total = editor.count.value;
   return (
     <Dialog
@@ -52,6 +66,13 @@ export function Review({ desk }: { desk: Desk }) {
           <DiscardButton editor={editor} close={close} />
           <span class="spacer" />
           <Button onClick={close}>Go on editing</Button>
+          <Button
+            busy={busy}
+            disabled={total === 0 || !online.value || expired.value || editor.isBehind}
+            onClick={() => void keep()}
+          >
+            Keep as a draft
+          </Button>
           <Button
             main
             busy={busy}

@@ -1,5 +1,5 @@
 /** Saving a draft as one version; what others saved in the meantime is merged first. */
-import { apiPath, asApiError, requestJson, type Version } from "../../api/client";
+import { apiPath, asApiError, request, requestJson, type Schemas, type Version } from "../../api/client";
 import { toWire } from "./draft";
 import type { Editor } from "./editor";
 import { summary } from "./words";
@@ -51,6 +51,25 @@ async function send(editor: Editor): Promise<Version> {
     },
     body,
   });
+}
+
+/** Stores the changes as a draft on the server, to go on with on another machine. Throws ApiError. */
+export async function saveAsDraft(editor: Editor, name: string): Promise<Schemas["DraftOut"]> {
+  const send = <T>(path: string, body: unknown) =>
+    requestJson<T>(path, {
+      method: "POST",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify(body),
+    });
+  const drafts = editor.site.path("drafts");
+  const made = await send<Schemas["DraftOut"]>(apiPath(drafts), name ? { name } : {});
+  try {
+    const changes = toWire(editor.draft.changes(), editor.draft.cells());
+    return await send<Schemas["DraftOut"]>(apiPath([...drafts, made.id, "edits"]), { changes });
+  } catch (error) {
+    await request(apiPath([...drafts, made.id]), { method: "DELETE" }).catch(() => undefined);
+    throw error;
+  }
 }
 
 function bodyOf(editor: Editor, more: Record<string, unknown> = {}): string {

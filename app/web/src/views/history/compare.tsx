@@ -63,12 +63,18 @@ export function Compare({ site, map, from, to, versions }: Props) {
 }
 
 function leave(): void {
-  go({ from: null, to: null, mode: null, change: null, version: param("to")?.startsWith("dry:") ? null : param("to") });
+  go({
+    from: null,
+    to: null,
+    mode: null,
+    change: null,
+    version: /^(dry|draft):/.test(param("to") ?? "") ? null : param("to"),
+  });
 }
 
 /** References by name, such as `latest`, are compared again when the head moves. */
 function headOf(site: Site, ...refs: string[]): number | undefined {
-  return refs.every((ref) => /^(\d+|dry:.*)$/.test(ref)) ? undefined : site.environment.value?.version;
+  return refs.every((ref) => /^(\d+|(dry|draft):.*)$/.test(ref)) ? undefined : site.environment.value?.version;
 }
 
 function Compared({ site, map, comparison }: ViewProps & { comparison: Comparison }) {
@@ -198,7 +204,7 @@ function Ends({ site, from, to, onRestore }: EndsProps) {
           Promote {refName(to)}…
         </Button>
       )}
-      {run?.version === null && run.id === to && (
+      {run?.version === null && run.id === to && to.startsWith("dry:") && (
         <Button main icon={Save} disabled={!online.value} onClick={() => void save(site, run)}>
           Save this as a version
         </Button>

@@ -11,6 +11,7 @@ import type { ViewProps } from "../registry";
 import { can } from "../../session";
 import { Channels } from "./channels";
 import { Compare } from "./compare";
+import { Drafts } from "./drafts";
 import { useVersions } from "./loads";
 import { Promote } from "./promote";
 import { RobotTime } from "./robot-time";
@@ -31,6 +32,7 @@ export default function HistoryView({ site, map }: ViewProps) {
   return (
     <div class="stack">
       <Channels site={site} />
+      <Drafts site={site} />
       <RobotTime site={site} />
       <TimeLine site={site} versions={versions} />
     </div>

@@ -79,5 +79,5 @@ export function marksOf(version: Version, parent: Version | undefined): string[]
 
 /** Name of a reference to a version, as people read it. */
 export function refName(ref: string): string {
-  return /^\d+$/.test(ref) ? `v${ref}` : ref.startsWith("dry:") ? "dry run" : ref;
+  return /^\d+$/.test(ref) ? `v${ref}` : ref.startsWith("dry:") ? "dry run" : ref.startsWith("draft:") ? "draft" : ref;
 }

@@ -1,0 +1,201 @@
+"""Part 4 on drafts: features written one by one by GIS programs gather in a draft, and become one version."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.api.conftest import Api
+
+Json = dict[str, Any]
+
+UTM = "http://www.opengis.net/def/crs/EPSG/0/32630"
+MERGE = {"content-type": "application/merge-patch+json"}
+GEOJSON = {"content-type": "application/geo+json"}
+
+
+class Gis:
+    """A GIS program that was given one address."""
+
+    def __init__(self, api: Api, env: str, draft: str = "mine") -> None:
+        self.api, self.env = api, env
+        self.at = f"/ogc/{env}/drafts/{draft}"
+        self.local = {"content-crs": f"<{api.url}{self.at}/crs/local>"}
+
+    def item(self, collection: str, feature: str, *, local: bool = True) -> Json:
+        query = f"?crs={self.api.url}{self.at}/crs/local" if local else ""
+        return dict(self.api.get(f"{self.at}/collections/{collection}/items/{feature}{query}").json())
+
+    def add(self, collection: str, geometry: Json, expect: int = 201, id: str | None = None, **properties: Any) -> Any:
+        body = {"type": "Feature", "geometry": geometry, "properties": properties} | ({} if id is None else {"id": id})
+        path = f"{self.at}/collections/{collection}/items"
+        return self.api("POST", path, expect, json=body, headers={**GEOJSON, **self.local})
+
+    def patch(self, collection: str, feature: str, expect: int = 204, headers: Any = None, **body: Any) -> Any:
+        path = f"{self.at}/collections/{collection}/items/{feature}"
+        return self.api("PATCH", path, expect, json=body, headers={**MERGE, **self.local, **(headers or {})})
+
+    def drafts(self) -> list[Json]:
+        return list(self.api.get(f"environments/{self.env}/drafts").json())
+
+
+@pytest.fixture
+def gis(api: Api, farm: str) -> Gis:
+    return Gis(api, farm)
+
+
+def point(x: float, y: float) -> Json:
+    return {"type": "Point", "coordinates": [x, y]}
+
+
+def line(*points: tuple[float, float]) -> Json:
+    return {"type": "LineString", "coordinates": [list(p) for p in points]}
+
+
+def path(item: Json) -> list[Any]:
+    return [pytest.approx(vertex, abs=1e-6) for vertex in item["geometry"]["coordinates"]]
+
+
+def test_one_address_gathers_edits_that_become_one_version(api: Api, gis: Gis) -> None:
+    assert gis.item("nodes", "barn")["geometry"]["coordinates"] == pytest.approx([10, 0]), "of the head"
+    assert gis.drafts() == [], "reading makes no draft"
+    gis.patch("nodes", "barn", properties={"colour": "red"})
+    (draft,) = gis.drafts()
+    assert (draft["name"], draft["is_owner"], draft["base"]) == ("mine", True, 3)
+    gis.patch("nodes", "barn", geometry=point(12, 0))
+    made = gis.add("nodes", point(20, 5), name="shed").headers["location"]
+    assert made == f"{api.url}{gis.at}/collections/nodes/items/shed"
+    new = gis.add("edges", line((12.2, 0.1), (15, 3), (20, 5))).headers["location"].rpartition("/")[2]
+    edge = gis.item("edges", new)
+    assert (new, edge["properties"]["source"], edge["properties"]["target"]) == ("barn_shed", "barn", "shed")
+    assert path(edge) == [[12, 0], [15, 3], [20, 5]], "onto its nodes"
+    assert path(gis.item("edges", "gate_barn")) == [[0, 0], [12, 0]], "edges follow their nodes"
+    api("DELETE", f"{gis.at}/collections/edges/items/barn_field", 204)
+    assert api.get(f"environments/{gis.env}").json()["version"] == 3
+    (draft,) = gis.drafts()
+    assert draft["changes"]["topology"] == {"added": 2, "changed": 3, "deleted": 1}
+    version = api.post(f"environments/{gis.env}/drafts/{draft['id']}/commit", {"message": "QGIS"}).json()
+    assert version["changes"]["topology"] == draft["changes"]["topology"]
+    assert gis.drafts() == []
+    assert gis.item("nodes", "shed")["geometry"]["coordinates"] == pytest.approx([20, 5])
+
+
+def test_methods_are_told_as_programs_ask_for_them(api: Api, gis: Gis) -> None:
+    assert "POST" in api("OPTIONS", f"{gis.at}/collections/edges/items", 204).headers["allow"]
+    methods = api("OPTIONS", f"{gis.at}/collections/edges/items/unknown_id", 204).headers["allow"]
+    assert {"PUT", "PATCH", "DELETE"} <= set(methods.split(", "))
+    classes = api.get(f"{gis.at}/conformance").json()["conformsTo"]
+    assert any("features-4" in one and one.endswith("/create-replace-delete") for one in classes)
+    described = api.get(f"{gis.at}/api").json()["paths"]
+    assert set(described["/collections/edges/items"]) == {"get", "post"}
+    assert set(described["/collections/edges/items/{featureId}"]) == {"get", "put", "patch", "delete"}
+    for fixed in (f"/ogc/{gis.env}", f"/ogc/{gis.env}/versions/3"):
+        assert "POST" not in api("OPTIONS", f"{fixed}/collections/edges/items", 204).headers["allow"]
+        assert not any("features-4" in one for one in api.get(f"{fixed}/conformance").json()["conformsTo"])
+        for method, rest in (("POST", ""), ("PUT", "/barn"), ("PATCH", "/barn"), ("DELETE", "/barn")):
+            refused = api(method, f"{fixed}/collections/nodes/items{rest}", 405, json={})
+            assert "drafts/mine" in refused.json()["detail"]
+            assert "GET" in refused.headers["allow"]
+    assert gis.drafts() == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"geometry": line((0, 0), (13, 0))}, "the end of the edge is at no node"),
+        ({"geometry": line((0, 0), (10, 8)), "properties": {"target": "gate"}}, "m from its node 'gate'"),
+        ({"properties": {"target": "nowhere"}}, "'nowhere' is not a node"),
+        ({"geometry": point(0, 0)}, "LineString"),
+        ({"geometry": {"type": "LineString", "coordinates": [[0, 0]]}}, "geometry"),
+        ({"geometry": None}, "LineString"),
+        ({"properties": {"level": "roof"}}, "keeps its level"),
+        ({}, "nothing to change"),
+        ({"crs": "x", "properties": {}}, "unknown member 'crs'"),
+    ],
+)
+def test_edge_that_would_leave_its_nodes_is_refused(gis: Gis, change: Json, words: str) -> None:
+    assert words in gis.patch("edges", "gate_barn", 400, **change).json()["detail"]
+    assert all(not draft["changes"] for draft in gis.drafts())
+
+
+def test_moved_end_takes_the_node_at_that_place(gis: Gis) -> None:
+    gis.patch("edges", "gate_barn", geometry=line((0, 0), (5, 5), (9.9, 8.1)))
+    edge = gis.item("edges", "gate_barn")
+    assert edge["properties"]["target"] == "field"
+    assert path(edge) == [[0, 0], [5, 5], [10, 8]]
+    gis.patch("edges", "gate_barn", properties={"target": "barn"})
+    assert path(gis.item("edges", "gate_barn")) == [[0, 0], [5, 5], [10, 0]]
+
+
+def test_deleted_node_with_edges_is_refused(api: Api, gis: Gis) -> None:
+    refused = api("DELETE", f"{gis.at}/collections/nodes/items/barn", 400).json()
+    assert "delete the edge" in refused["detail"]
+
+
+def test_coordinates_in_other_systems(api: Api, gis: Gis) -> None:
+    """A node is where it was after a round trip in each system."""
+    at = f"{gis.at}/collections/nodes/items/field"
+    for crs in api.get(f"{gis.at}/collections/nodes").json()["crs"]:
+        shown = api.get(f"{at}?crs={crs}").json()["geometry"]
+        far = {
+            **shown,
+            "coordinates": [v + (1e-4 if abs(v) < 180 and "local" not in crs else 5) for v in shown["coordinates"]],
+        }
+        headers = {**MERGE, "content-crs": f"<{crs}>"}
+        api("PATCH", at, 204, json={"geometry": far}, headers=headers)
+        api("PATCH", at, 204, json={"geometry": shown}, headers=headers)
+        assert gis.item("nodes", "field")["geometry"]["coordinates"] == pytest.approx([10, 8], abs=1e-6), crs
+    refused = api("PATCH", at, 400, json={"geometry": point(0, 0)}, headers={**MERGE, "content-crs": "<urn:x>"})
+    assert "Content-Crs" in refused.json()["detail"]
+
+
+def test_put_replaces_and_patch_merges(gis: Gis) -> None:
+    at = f"{gis.at}/collections/nodes/items/barn"
+    gis.patch("nodes", "barn", properties={"colour": "red", "doors": 2})
+    gis.patch("nodes", "barn", properties={"colour": None, "doors": 2.0})
+    properties = gis.item("nodes", "barn")["properties"]
+    assert properties["doors"] == 2
+    assert "colour" not in properties
+    body = {"type": "Feature", "geometry": point(10, 1), "properties": {"name": "old barn", "note": None}}
+    gis.api("PUT", at, 204, json=body, headers={**GEOJSON, **gis.local})
+    item = gis.item("nodes", "barn")
+    assert item["properties"]["name"] == "old barn"
+    assert {"doors", "note"} & set(item["properties"]) == set()
+    assert item["geometry"]["coordinates"] == pytest.approx([10, 1])
+    gis.api("PUT", f"{at}x", 404, json=body, headers={**GEOJSON, **gis.local})
+
+
+def test_types_are_those_of_the_schema(gis: Gis) -> None:
+    wrong = gis.patch("nodes", "barn", 400, properties={"name": 5}).json()
+    assert "must be string, as the schema of nodes says" in wrong["detail"]
+
+
+def test_if_match_names_the_feature(gis: Gis) -> None:
+    at = f"{gis.at}/collections/nodes/items/barn"
+    tag = gis.api.get(at).headers["etag"]
+    gis.patch("nodes", "barn", headers={"if-match": tag}, properties={"a": 1})
+    refused = gis.patch("nodes", "barn", 412, headers={"if-match": tag}, properties={"a": 2})
+    assert "read it again" in refused.json()["detail"]
+    assert gis.item("nodes", "barn")["properties"]["a"] == 1
+
+
+def test_drafts_of_others_are_read_and_not_written(api: Api, farm: str) -> None:
+    ann, bob, viewer = api.token_for("editor"), api.token_for("editor"), api.token_for("viewer")
+    Gis(ann, farm).patch("nodes", "barn", properties={"colour": "red"})
+    (draft,) = Gis(ann, farm).drafts()
+    theirs = Gis(bob, farm, draft["id"])
+    assert theirs.item("nodes", "barn")["properties"]["colour"] == "red"
+    assert "belongs to" in theirs.patch("nodes", "barn", 403, properties={"colour": "blue"}).json()["detail"]
+    assert "colour" not in Gis(bob, farm).item("nodes", "barn")["properties"], "each has an own one"
+    viewer.get(f"/ogc/{farm}/drafts/mine/collections", 403)
+    api.get(f"/ogc/{farm}/drafts/{'0' * 16}/", 404)
+
+
+def test_given_ids_are_kept_once(gis: Gis) -> None:
+    location = gis.add("nodes", point(1, 1), id="a/b c").headers["location"]
+    assert location.endswith("/items/a%2Fb%20c")
+    assert gis.api.get(location.removeprefix(gis.api.url)).json()["id"] == "a/b c"
+    assert "already" in gis.add("nodes", point(2, 2), 409, id="a/b c").json()["detail"]
+    made = {gis.add("nodes", point(k, 3), name="barn").headers["location"] for k in range(2)}
+    assert len(made) == 2, "a name that is taken is no id"
