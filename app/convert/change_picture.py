@@ -143,7 +143,7 @@ class ChangePicture:
         reader = self._tiles.header(shown)
         size, transform = Size(reader.width, reader.height), place_raster(reader, None).transform
         self._draw_cells(canvas, shown, size, transform)
-        changes = self._store.content.cell_changes(old and old.hash, new and new.hash)
+        changes = self._store.content.cell_changes(*(entry.hash if entry else None for entry in (old, new)))
         cell = math.hypot(transform[0], transform[3])
         k = min(max(0, math.floor(math.log2(canvas.frame.scale / cell))), size.reduction(SIDE) + 1)
         small, window = size.reduced(k), reduced_transform(transform, k)

@@ -310,6 +310,18 @@ class Version:
             out[layer] = next((kind for kind in order if kind in kinds), "missing")
         return out
 
+    def _describe_stale(self, key: PartKey, changed: tuple[str, ...]) -> dict[str, Any]:
+        entry = self.part(key)
+        last = entry.provenance.steps[-1] if entry is not None and entry.provenance.steps else {}
+        return {
+            "layer": key.layer,
+            "level": key.level,
+            "name": key.name,
+            "changed": list(changed),
+            "method": last.get("step"),
+            "parameters": last.get("parameters", {}),
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Return the version as JSON; of a dry run or draft without number and time, but with ``id`` and expiry."""
         pending = self.pending
@@ -325,10 +337,7 @@ class Version:
             "sources": [source.as_dict() for source in self.sources],
             "warnings": [warning.as_dict() for warning in self.warnings],
             "information": self.information,
-            "stale": [
-                {"layer": k.layer, "level": k.level, "name": k.name, "changed": list(changed)}
-                for k, changed in self.stale.items()
-            ],
+            "stale": [self._describe_stale(key, changed) for key, changed in self.stale.items()],
             **({} if pending is None else {"id": self.ref, "expires": rfc3339(pending.expires)}),
         }
 

@@ -124,8 +124,8 @@ ROWS = [
         f"DELETE {E}/templates, PUT {E}/templates/{{format}}, DELETE {E}/templates/{{format}}, POST {E}/alignments, "
         f"POST {E}/overlays/{{id}}/accept, POST {E}/overlays/{{id}}/reject, POST {E}/overlays/{{id}}/end, "
         f"POST {E}/overlays/{{id}}/keep, PATCH {E}/overlays/{{id}}, GET {E}/drafts, POST {E}/drafts, "
-        f"GET {E}/drafts/{{draft}}, DELETE {E}/drafts/{{draft}}, POST {E}/drafts/{{draft}}/edits, POST {E}/drafts/{{draft}}/rebase, "
-        f"POST {E}/drafts/{{draft}}/commit",
+        f"GET {E}/drafts/{{draft}}, DELETE {E}/drafts/{{draft}}, POST {E}/drafts/{{draft}}/edits, "
+        f"POST {E}/drafts/{{draft}}/rebase, POST {E}/drafts/{{draft}}/commit",
         admin=f"DELETE {E}, POST {E}/restore, POST {E}/purge",
     ),
 ]

@@ -80,6 +80,10 @@ def test_derivation_with_equal_result_clears_stale(api: Api, env: str) -> None:
     api.upload(env, named)
     stale = api.get(f"environments/{env}/versions/latest").json()
     assert [s["changed"] for s in stale["stale"]] == [["objects ground/kml"]]
+    assert [s["method"] for s in stale["stale"]] == ["objects_to_topology"]
+    assert set(stale["stale"][0]["parameters"]) == {
+        p["name"] for d in api.get("derivations").json() if d["id"] == "objects_to_topology" for p in d["parameters"]
+    }
     version = derive(api, env, parameters={"join": 0.5})
     assert (version["version"], version["root"], version["stale"]) == (5, stale["root"], [])
     assert version["changes"] == {"renewed": [{"layer": "topology", "level": "ground", "name": "network"}]}

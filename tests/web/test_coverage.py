@@ -195,6 +195,7 @@ def test_derivation_is_tried_then_saved_then_out_of_date(open_page: Open, server
     expect(note).to_contain_text("Topology")
     note.get_by_role("button", name="Derive again").click()
     expect(page.get_by_role("heading", name="Topology from occupancy")).to_be_visible()
+    expect(page.get_by_text("With the parameters of last time")).to_be_visible()
 
 
 class TileHandler(http.server.BaseHTTPRequestHandler):

@@ -59,9 +59,9 @@ def test_site_of_a_purged_name_gets_its_own_tiles(open_page: Open, server: WebSe
 
     def hash_shown() -> str:
         own = str(server.get(f"{site}/versions/1/tiles/occupancy/map")["hash"])
-        page.goto("/?site=again")
-        with page.expect_request(lambda request: f"hash={own}" in request.url and "map/" in request.url):
-            wait_until_drawn(page)
+        with page.expect_response(lambda answer: f"hash={own}" in answer.url and "occupancy/map/" in answer.url) as got:
+            page.goto("/?site=again")
+        assert got.value.ok
         return own
 
     hashes = []

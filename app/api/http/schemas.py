@@ -91,6 +91,17 @@ class SourceOut(BaseModel):
     used: bool
 
 
+class StaleOut(BaseModel):
+    """Derived part whose inputs have changed since."""
+
+    layer: str
+    level: str
+    name: str
+    changed: list[str] = Field(description="Inputs that have changed.")
+    method: str | None = Field(description="Derivation that computed it, or null.")
+    parameters: dict[str, Any] = Field(description="Parameters that it was computed with.")
+
+
 class VersionContentOut(BaseModel):
     """What versions and dry runs have in common."""
 
@@ -102,7 +113,7 @@ class VersionContentOut(BaseModel):
     sources: list[SourceOut]
     warnings: list[ProblemItem]
     information: dict[str, str]
-    stale: list[dict[str, Any]] = Field(
+    stale: list[StaleOut] = Field(
         description="Derived parts whose inputs have changed since, with the changed inputs. Maps derive them again."
     )
 

@@ -70,3 +70,14 @@ export function setValues(parameters: readonly Parameter[], values: Values): Rec
   }
   return out;
 }
+
+/** The inverse of `setValues`: values as a form holds them, without those that equal the default. */
+export function textsOf(parameters: readonly Parameter[], given: Record<string, unknown>): Values {
+  const out: Values = {};
+  for (const { name, default: usual } of parameters) {
+    const value = given[name];
+    if (value === undefined || defaultText(value) === defaultText(usual)) continue;
+    out[name] = typeof value === "boolean" ? String(value) : defaultText(value);
+  }
+  return out;
+}

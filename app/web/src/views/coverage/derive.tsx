@@ -1,13 +1,13 @@
 /** Compute a layer from others, or make up a site: choose, set parameters, try, save. */
 import { ChevronLeft } from "lucide-preact";
 import { useRef, useState } from "preact/hooks";
-import { go } from "../../address";
+import { go, param } from "../../address";
 import { type ApiError, apiPath, asApiError, type DryRun, isAbort, requestJson, type Version } from "../../api/client";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { Button } from "../../ui/button";
 import { SchemaForm } from "../../ui/schema-form";
-import { isValid, setValues, type Values } from "../../ui/schema-values";
+import { isValid, setValues, textsOf, type Values } from "../../ui/schema-values";
 import { Problem } from "../../ui/states";
 import { type Derivation, lacking } from "./derivations";
 import { DryRunResult } from "./dry-run";
@@ -31,7 +31,7 @@ export function DeriveView({ site, map, derivations, method, information }: Prop
           quiet
           icon={ChevronLeft}
           label={chosen ? "All derivations" : "Coverage"}
-          onClick={() => go({ derive: chosen ? "any" : null })}
+          onClick={() => go({ derive: chosen ? "any" : null, again: null })}
         />
         <div class="grow">
           <h2>{chosen ? givesText(chosen) : "Derive a layer"}</h2>
@@ -102,7 +102,8 @@ interface FormProps {
 }
 
 function DeriveForm({ site, map, derivation, information }: FormProps) {
-  const [values, setForm] = useState<Values>({});
+  const [used] = useState(() => usedParameters(site, derivation));
+  const [values, setForm] = useState<Values>(used ?? {});
   const [seed, setSeed] = useState(0);
   const [replace, setReplace] = useState(false);
   const [busy, setBusy] = useState(false);
@@ -169,8 +170,12 @@ function DeriveForm({ site, map, derivation, information }: FormProps) {
           />
         </label>
       )}
+      {used && <p class="muted">With the parameters of last time.</p>}
       {parameters.length > 0 && (
-        <details class="part" open={parameters.length <= 4 || Boolean(problem?.problem.errors?.length)}>
+        <details
+          class="part"
+          open={parameters.length <= 4 || Object.keys(values).length > 0 || Boolean(problem?.problem.errors?.length)}
+        >
           <summary>Parameters ({parameters.length}); all have defaults</summary>
           <SchemaForm parameters={parameters} values={values} onChange={change} problems={problemsOf(problem)} />
         </details>
@@ -206,13 +211,22 @@ function DeriveForm({ site, map, derivation, information }: FormProps) {
           onDrop={() => setDry(null)}
           onSaved={() => {
             setDry(null);
-            go({ derive: null, version: "latest" }, { replace: true });
+            go({ derive: null, again: null, version: "latest" }, { replace: true });
             void site.refresh();
           }}
         />
       )}
     </>
   );
+}
+
+/** The parameters that a part which is to be derived again had, as text; null: another derivation is made. */
+function usedParameters(site: Site, { id, parameters }: Derivation): Values | null {
+  const again = param("again");
+  const part = site.version
+    .peek()
+    ?.stale.find(({ method, level, name }) => method === id && `${level}/${name}` === again);
+  return part ? textsOf(parameters, part.parameters) : null;
 }
 
 function layerText(layer: string): string {

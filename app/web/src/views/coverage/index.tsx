@@ -13,7 +13,7 @@ import { Empty, Show } from "../../ui/states";
 import { count } from "../../ui/text";
 import type { ViewProps } from "../registry";
 import "./coverage.css";
-import { type Derivation, loadDerivations } from "./derivations";
+import { loadDerivations } from "./derivations";
 import { DeriveView } from "./derive";
 import { FormatCard } from "./format-card";
 import { FullTable } from "./full-table";
@@ -55,7 +55,7 @@ export default function CoverageView({ site, map }: ViewProps) {
           }
         </Show>
       ) : (
-        <Overview site={site} rows={rows} shown={shown} information={information} derivations={derivations.data} />
+        <Overview site={site} rows={rows} shown={shown} information={information} />
       )}
     </>
   );
@@ -84,10 +84,9 @@ interface OverviewProps {
   rows: Loaded<TableRow[]>;
   shown: TableRow[];
   information: Record<string, string>;
-  derivations: Derivation[] | undefined;
 }
 
-function Overview({ site, rows, shown, information, derivations }: OverviewProps) {
+function Overview({ site, rows, shown, information }: OverviewProps) {
   const isEmpty = site.version.value !== null && !INFORMATION.some((layer) => has(information, layer));
   return (
     <div class="stack">
@@ -114,7 +113,7 @@ function Overview({ site, rows, shown, information, derivations }: OverviewProps
                 ))}
               </dl>
             </section>
-            <StaleNote site={site} derivations={derivations} />
+            <StaleNote site={site} />
             {isEmpty && (
               <Empty title="This version has no map yet">
                 <p>Upload a file, or derive a made-up site: then most formats become available.</p>

@@ -52,6 +52,7 @@ function Note({ store, fleetMap, name, time }: NoteProps) {
         {data?.report && `: v${data.report.version}, ${closuresText(data.closures)}`}
         {data && !data.report && ": it had reported no map by then"}
         {problem && `: ${problem.message}`}
+        <small>Where robots were then is not kept.</small>
       </span>
       <Button onClick={() => go({ time: null, version: null })}>Back to now</Button>
     </div>,

@@ -92,6 +92,7 @@ function Held({ site, robot }: { site: Site; robot: string }) {
                 <>{robot} had not reported a map by then.</>
               )}
             </p>
+            <p class="muted">Where robots were is not kept: only their last place is known, see Fleet.</p>
             <Reports history={history} time={time} />
           </div>
         )}
