@@ -66,7 +66,10 @@ def duplicate_edges(site: Site, fixer: Fixer) -> Iterator[Finding]:
     """Several edges from one node to another along the same line, with the same action."""
     network = site.network
     by_ends: dict[tuple[int, int, str, int | None], list[int]] = defaultdict(list)
-    for k in np.flatnonzero(network.is_whole).tolist():
+    whole = np.flatnonzero(network.is_whole)
+    ends = network.source[whole] * len(network.nodes) + network.target[whole]
+    _, group, counts = np.unique(ends, return_inverse=True, return_counts=True)
+    for k in whole[counts[group] > 1].tolist():
         p = network.edges[k].properties
         by_ends[int(network.source[k]), int(network.target[k]), str(p.get("action")), graph_index(p)].append(k)
     for members in by_ends.values():

@@ -45,10 +45,11 @@ class LevelNetwork:
         self.edges: list[int] = []
         self.twins: dict[int, list[int]] = {}
         firsts: dict[tuple[int, int], list[int]] = {}
-        lengths = shapely.length(network.lines)
+        source, target = network.source.tolist(), network.target.tolist()  # plain numbers are faster one by one
+        lengths = shapely.length(network.lines).tolist()
         for k in np.flatnonzero(network.is_flat & (network.edge_levels == level)).tolist():
-            ends = sorted((int(network.source[k]), int(network.target[k])))
-            parallel = firsts.setdefault((ends[0], ends[1]), [])
+            a, b = source[k], target[k]
+            parallel = firsts.setdefault((a, b) if a < b else (b, a), [])
             twin = next((j for j in parallel if abs(lengths[j] - lengths[k]) < ON_METRES), None)
             if twin is None and len(parallel) < BLOCK:
                 parallel.append(k)
@@ -56,15 +57,13 @@ class LevelNetwork:
             self.twins.setdefault(k if twin is None else twin, []).append(k)
         self.lines = network.lines[self.edges]
         self.tree = shapely.STRtree(self.lines)
-        lengths = lengths[self.edges]
-        typical = float(np.median(lengths)) if len(lengths) else 0.0
+        typical = float(np.median([lengths[k] for k in self.edges])) if self.edges else 0.0
         self.near = min(NEAR_METRES, NEAR_SHARE * typical)
         self._network = network
         self.neighbours: dict[int, set[int]] = defaultdict(set)
         for k in np.flatnonzero(network.is_whole).tolist():
-            a, b = int(network.source[k]), int(network.target[k])
-            self.neighbours[a].add(b)
-            self.neighbours[b].add(a)
+            self.neighbours[source[k]].add(target[k])
+            self.neighbours[target[k]].add(source[k])
 
     @cached_property
     def ways(self) -> Ways:

@@ -213,6 +213,42 @@ def test_two_editors_lose_nothing(server: WebServer, edit: Edit) -> None:
     }
 
 
+def test_changes_of_one_node_by_two_are_joined(server: WebServer, edit: Edit) -> None:
+    site = make_network(server, "joined", a=(10, 10), b=(20, 10), c=(15, 15))
+    anna, ben = edit(site), edit(site)
+    anna.select("Node c")
+    anna.page.get_by_label("name", exact=True).fill("Gate")
+    anna.page.get_by_label("name", exact=True).press("Enter")
+    ben.drag((15, 15), (17, 15))
+    anna.save("c is the gate", 2)
+    ben.save("c is further east", 3)
+    expect(ben.page.get_by_text("has the changes of both")).to_be_visible()
+    gate = features(server, site)["c"]
+    assert gate["properties"]["name"] == "Gate"
+    assert at(gate) == pytest.approx((17, 15), abs=RESOLUTION)
+
+
+def test_a_node_dropped_onto_a_lane_joins_it(server: WebServer, edit: Edit) -> None:
+    site = make_network(server, "dropped", a=(10, 10), b=(20, 10), c=(15, 15), d=(15, 6))
+    editing = edit(site)
+    page = editing.page
+    editing.drag((15, 15), (14, 10.1))
+    editing.changes("4 changes")  # the node, the old street, two new ones
+    page.keyboard.press("Control+z")
+    editing.changes("No changes")
+    page.keyboard.press("Control+y")
+    editing.click(12, 20)
+    page.keyboard.down("Alt")
+    editing.drag((15, 6), (17, 9.9))
+    page.keyboard.up("Alt")
+    editing.save("c is on the lane", 2)
+    found = features(server, site)
+    assert at(found["c"]) == pytest.approx((14, 10), abs=RESOLUTION)
+    assert at(found["d"]) == pytest.approx((17, 9.9), abs=RESOLUTION)
+    edges = {(p["source"], p["target"]) for p in (one["properties"] for one in found.values()) if p["kind"] == "edge"}
+    assert edges == {("a", "c"), ("c", "a"), ("c", "b"), ("b", "c")}
+
+
 def test_moving_by_touch(server: WebServer, edit: Edit) -> None:
     site = make_network(server, "touched", a=(15, 12), b=(22, 12))
     editing = edit(site, size=TABLET, has_touch=True)

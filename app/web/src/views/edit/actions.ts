@@ -141,7 +141,10 @@ export const ACTIONS: Action[] = [
     id: "square",
     title: "Square up",
     key: "Q",
-    fits: (editor) => editor.selected.value.some(({ geometry }) => geometry.type === "Polygon"),
+    fits: (editor) =>
+      editor.selected.value.some(
+        ({ geometry }) => geometry.type === "Polygon" && (geometry.coordinates[0]?.length ?? 0) > 4,
+      ),
     run: (editor) => editor.run(operations.squareUp(editor.draft, editor.selected.peek())),
   },
   {

@@ -135,7 +135,7 @@ export class Editor {
   /** Does an operation, or says why it cannot be done. Selects what is given, or keeps what is left. */
   run(outcome: Outcome, select?: string[]): boolean {
     if (typeof outcome === "string") {
-      notify(outcome, { kind: "failed" });
+      notify(outcome);
       return false;
     }
     if (!this.draft.execute(outcome)) return false;
@@ -160,11 +160,12 @@ export class Editor {
   private afterStep(command: Command, text: string): void {
     this.keep(null);
     this.lastStep.value = text;
+    this.changed();
+    if (this.selection.peek().size) return; // what was selected is worked on further
     // Lanes that only follow their nodes are not selected.
     const edits = command.edits.filter(({ from, to }) => !same(core(from), core(to)));
-    const keys = edits.map(({ key }) => key).filter((key) => this.draft.get(key));
-    this.select(keys.slice(0, 50));
-    this.changed();
+    const features = edits.map(({ key }) => this.draft.get(key)).filter((feature) => feature !== undefined);
+    this.select(features.slice(0, 50).flatMap((feature) => this.wholeOf(feature)));
   }
 
   private changed(): void {

@@ -91,6 +91,7 @@ function Status({ desk }: { desk: Desk }) {
           {total > 0 && ` · ${stored[editor.stored.value]}`}
           {!online.value && " · offline"}
         </small>
+        <span class="visually-hidden">{editor.lastStep.value}</span>
       </p>
       <Button quiet icon={Undo2} label="Undo" disabled={position === 0} onClick={() => editor.undo()} />
       <Button quiet icon={Redo2} label="Redo" disabled={position === log.length} onClick={() => editor.redo()} />

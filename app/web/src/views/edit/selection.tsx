@@ -42,6 +42,8 @@ export function Selection({ editor }: { editor: Editor }) {
 function titleOf(editor: Editor, features: Feature[]): string {
   const [first, second] = features;
   if (!first) return "";
+  if (features.length === 1 && isEdge(first) && editor.draft.twinOf(first))
+    return `One direction, ${String(first.properties.source)} → ${String(first.properties.target)}`;
   if (features.length === 1) return first.layer === "location" ? "Fence" : `${kindOf(first)} ${nameOf(first)}`;
   if (features.length === 2 && isEdge(first) && second && editor.draft.twinOf(first) === second)
     return `Two-way street ${String(first.properties.source)} – ${String(first.properties.target)}`;
