@@ -68,7 +68,7 @@ export function Review({ desk }: { desk: Desk }) {
           <Button onClick={close}>Go on editing</Button>
           <Button
             busy={busy}
-            disabled={total === 0 || !online.value || expired.value || editor.isBehind}
+            disabled={total === 0 || !online.value || expired.value || editor.head.isBehind}
             onClick={() => void keep()}
           >
             Keep as a draft
