@@ -57,8 +57,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run one worker more than there are processors: some tests wait for agents, routers and timeouts."""
-    return len(os.sched_getaffinity(0)) + 1
+    """Run two workers more than there are processors: many tests wait for agents, routers, browsers and timeouts."""
+    return len(os.sched_getaffinity(0)) + 2
 
 
 def pytest_collection_finish() -> None:

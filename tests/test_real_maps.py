@@ -159,7 +159,9 @@ TEMPLATES = [
 ]
 
 
-@pytest.mark.parametrize("name", TEMPLATES)
+@pytest.mark.parametrize(
+    ("api", "name"), [("postgres", TEMPLATES[1]), *(("sqlite", name) for name in TEMPLATES)], indirect=["api"]
+)
 def test_template_folder_is_one_version(api: Api, shared: Path, same: Same, name: str) -> None:
     root = shared / "data" / "environment_template" / name
     files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
@@ -207,6 +209,7 @@ def test_template_is_exported_as_a_package(api: Api, shared: Path, same: Same, n
     assert {line["layer"] for line in report["layers"]} >= layers - {"resources"}
 
 
+@pytest.mark.parametrize("api", ["sqlite"], indirect=True)
 def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[str, Any]) -> None:
     """Compare OSM nodes in the local frame of a tmap2 with PROJ's own transverse Mercator."""
     name = "osm/urban-usa-mn-minnesota-zoo/osm.xml"

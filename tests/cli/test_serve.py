@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.certificates import Authority
-from tests.cli.conftest import TOKEN, Fleetmap, ServerProcess
+from tests.cli.conftest import Fleetmap, ServerProcess
 from tests.events.conftest import eventually
 
 
@@ -44,29 +44,6 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
         assert not any(token in line for line in again.lines)
     finally:
         assert again.stop(signal.SIGINT) == 0
-
-
-def test_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetmap) -> None:
-    process = start(tmp_path, FLEETMAP_ADMIN_TOKEN="given-by-the-operator")
-    try:
-        process.ready()
-        result = offline("token", "list", "--server", process.address, "--token", "given-by-the-operator")
-        assert result.status == 0
-        assert "given-by-the-operator" not in result.out
-    finally:
-        process.stop()
-    assert not any("given-by-the-operator" in line for line in process.lines)
-
-
-def test_mounted_secret_is_read_as_setting(tmp_path: Path, offline: Fleetmap) -> None:
-    (tmp_path / "secrets").mkdir()
-    (tmp_path / "secrets" / "fleetmap_admin_token").write_text("mounted-as-a-secret\n")
-    process = start(tmp_path, FLEETMAP_SECRETS_DIR=str(tmp_path / "secrets"))
-    try:
-        process.ready()
-        assert offline("token", "list", "--server", process.address, "--token", "mounted-as-a-secret").status == 0
-    finally:
-        process.stop()
 
 
 def test_serve_demo_prints_working_commands_at_every_start(tmp_path: Path) -> None:
@@ -118,12 +95,14 @@ def test_unusable_settings_are_usage_errors(
     assert named in " ".join(result.err.split())
 
 
-def test_serve_uses_https_with_certificate_and_key(tmp_path: Path) -> None:
+def test_serve_uses_https_and_reads_a_mounted_secret(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     certificate, key = authority.sign("server")
     trusting = ssl.create_default_context(cafile=authority.pem)
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / "secrets" / "fleetmap_admin_token").write_text("mounted-as-a-secret\n")
     files = ("--tls-certificate", str(certificate), "--tls-key", str(key))
-    process = start(tmp_path, *files, FLEETMAP_ADMIN_TOKEN=TOKEN)
+    process = start(tmp_path, *files, FLEETMAP_SECRETS_DIR=str(tmp_path / "secrets"))
     try:
         address = process.wait_for(r"Fleet Map Server: (https://\S+)")[1]
 
@@ -138,6 +117,10 @@ def test_serve_uses_https_with_certificate_and_key(tmp_path: Path) -> None:
                 return False
 
         eventually(answers, 60)
+        headers = {"Authorization": "Bearer mounted-as-a-secret"}
+        request = urllib.request.Request(f"{address}/api/v1/tokens", headers=headers)
+        with urllib.request.urlopen(request, timeout=60, context=trusting) as answer:
+            assert [token["role"] for token in json.load(answer)] == ["admin"]
         with pytest.raises(urllib.error.URLError, match="CERTIFICATE_VERIFY_FAILED"):
             urllib.request.urlopen(f"{address}/healthz", timeout=60)
     finally:
@@ -168,15 +151,20 @@ def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pyt
         assert (f"--{name.replace('_', '-')} " in output) == (name not in ("admin_token", "zenoh_password")), name
 
 
-def test_workers_stop_with_parent_process(tmp_path: Path) -> None:
-    process = start(tmp_path, "--workers", "2")
-    address = process.ready()
-    process.process.kill()
-    process.process.wait(10)
-    process._reader.join(60)  # its output ends when the last worker has closed it
-    ended = not process._reader.is_alive()
-    process.stop()
-    assert ended
+def test_given_token_is_never_printed_and_workers_stop_with_parent_process(tmp_path: Path, offline: Fleetmap) -> None:
+    process = start(tmp_path, "--workers", "2", FLEETMAP_ADMIN_TOKEN="given-by-the-operator")
+    try:
+        address = process.ready()
+        result = offline("token", "list", "--server", address, "--token", "given-by-the-operator")
+        assert result.status == 0
+        assert "given-by-the-operator" not in result.out
+        process.process.kill()
+        process.process.wait(10)
+        process._reader.join(60)  # its output ends when the last worker has closed it
+        assert not process._reader.is_alive()
+    finally:
+        process.stop()
+    assert not any("given-by-the-operator" in line for line in process.lines)
     port = int(address.rpartition(":")[2])
     with socket.create_server(("127.0.0.1", port)):
         pass

@@ -147,16 +147,27 @@ def clear_of_obstacles(layers: Layers, fmt: formats.Format, files: dict[str, byt
         for key, part in read.vector("topology").items():
             grid = grids.get(key.level) or next(iter(grids.values()))
             at = dict(zip(part.ids, part.in_local(layers.frame), strict=True))
+            lines: dict[str, Any] = {}
             for i, p in zip(part.ids, part.properties, strict=True):
                 if p["kind"] != "edge" or len(read.vector("topology")) < len(grids):  # levels are joined
                     continue
                 if not {p["source"], p["target"]} <= at.keys():  # from one level to another
                     continue
-                line = at[i] if shaped else shapely.LineString([at[p["source"]], at[p["target"]]])
-                steps = np.arange(0.0, line.length, grid.resolution / 2)
-                xy = shapely.get_coordinates(shapely.line_interpolate_point(line, steps))
-                column, row = ((xy - grid.origin[:2]) / grid.resolution).astype(int).T
-                assert not (grid.cells[row, column] == OCCUPIED).any(), (fmt.name, i)
+                lines[i] = at[i] if shaped else shapely.LineString([at[p["source"]], at[p["target"]]])
+            assert not occupied_lines(grid, lines), fmt.name
+
+
+def occupied_lines(grid: OccupancyGrid, lines: dict[str, Any]) -> set[str]:
+    """Return the names of lines that touch an occupied cell, looked up every half cell."""
+    step = grid.resolution / 2
+    geometry = np.array(list(lines.values()), object)
+    count = np.ceil(shapely.length(geometry) / step).astype(np.intp)
+    owner = np.repeat(np.arange(len(lines)), count)
+    at = (np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)) * step
+    xy = shapely.get_coordinates(shapely.line_interpolate_point(geometry[owner], at))
+    column, row = ((xy - grid.origin[:2]) / grid.resolution).astype(int).T
+    names = list(lines)
+    return {names[k] for k in np.unique(owner[grid.cells[row, column] == OCCUPIED]).tolist()}
 
 
 def over_http(api: Api, name: str, formats_: tuple[str, ...], **values: Any) -> dict[str, Any]:

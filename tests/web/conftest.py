@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 import pytest
@@ -20,6 +20,9 @@ SECONDS = 60.0
 
 DESKTOP = {"width": 1280, "height": 800}
 TABLET = {"width": 800, "height": 1280}
+THEME = "document.documentElement.dataset.theme"
+COLOUR_RULES = ("color-contrast", "link-in-text-block")
+"""The rules of axe on colours, of those that it enables."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +57,9 @@ class WebServer:
         return created
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebServer]:
+@pytest.fixture(scope="package")
+def running_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebServer]:
+    """Start the server of all modules."""
     folder = tmp_path_factory.mktemp("web")
     environment = {"FLEETMAP_DATA_DIR": str(folder / "data"), "FLEETMAP_ADMIN_TOKEN": TOKEN}
     process = ServerProcess(environment=environment, folder=folder)
@@ -69,8 +73,17 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebServer]:
 
 
 @pytest.fixture(scope="module")
+def server(running_server: WebServer) -> Iterator[WebServer]:
+    """Return the server without the sites of other modules."""
+    yield running_server
+    for environment in running_server.get("environments"):
+        running_server.call("DELETE", f"environments/{environment['name']}")
+        running_server.call("POST", f"environments/{environment['name']}/purge")
+
+
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
-    """Start a browser for a module: while it runs, no other test could start an event loop."""
+    """Start the browser of all modules. While it runs, no test outside of this folder could start an event loop."""
     program = shutil.which("chromium")
     assert program, "chromium is not installed (Debian: apt install chromium)"
     with sync_playwright() as playwright:
@@ -142,13 +155,27 @@ def wait_until(page: Page, expression: str, argument: Any = None) -> None:
         page.wait_for_timeout(250)
 
 
-def check_accessibility(page: Page, axe: str) -> None:
-    """Assert that axe finds nothing serious on the page as it is shown."""
-    page.evaluate(axe)
-    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+def check_accessibility(page: Page, axe: str, rules: Sequence[str] = ()) -> None:
+    """Assert that axe finds nothing serious on the page as it is shown. rules: default: all that axe enables."""
+    if not page.evaluate("'axe' in window"):
+        page.evaluate(axe)
+    options = {"resultTypes": ["violations"]} | ({"runOnly": {"type": "rule", "values": list(rules)}} if rules else {})
+    found = page.evaluate("options => axe.run(document, options)", options)
     serious = [
         f"{one['id']}: {one['help']}: {[node['html'][:120] for node in one['nodes'][:3]]}"
         for one in found["violations"]
         if one["impact"] in ("serious", "critical")
     ]
     assert not serious, "\n".join(serious)
+
+
+def check_themes(page: Page, axe: str) -> None:
+    """Check the accessibility of the page as it is shown, then its colours in the other theme, which changes no more.
+
+    The page stays in that theme.
+    """
+    check_accessibility(page, axe)
+    theme: Literal["light", "dark"] = "light" if page.evaluate(THEME) == "dark" else "dark"
+    page.emulate_media(color_scheme=theme)
+    wait_until(page, f"theme => {THEME} === theme", theme)
+    check_accessibility(page, axe, COLOUR_RULES)

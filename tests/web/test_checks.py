@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import expect
 
-from tests.web.conftest import Open, WebServer, check_accessibility
+from tests.web.conftest import Open, WebServer, check_themes
 
 
 def node(name: str, x: float, y: float) -> dict[str, Any]:
@@ -59,16 +59,15 @@ def near_misses(server: WebServer) -> int:
     return sum(item["rule"] == "near-miss" for item in items)
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_mistakes_are_listed_shown_and_accessible(open_page: Open, axe: str, theme: str) -> None:
-    page = open_page("/?site=yard", color_scheme=theme)
+def test_mistakes_are_listed_shown_and_accessible(open_page: Open, axe: str) -> None:
+    page = open_page("/?site=yard")
     checks = page.get_by_role("link", name="Checks", exact=True)
     expect(checks).to_have_attribute("title", "Checks (7): 1 error")
     checks.click()
     page.get_by_role("button", name="cross shed").click()
     expect(page.get_by_text("c_d, d_c", exact=True)).to_be_visible()
     assert "check=edge-through-obstacle" in page.url
-    check_accessibility(page, axe)
+    check_themes(page, axe)
     page.get_by_role("button", name="1 error").click()
     expect(page.get_by_role("button", name="cross shed")).to_have_count(0)
     expect(page.get_by_role("button", name="near is 0.10 m", exact=False)).to_be_visible()

@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.api import samples
 from tests.cli.conftest import TOKEN, ServerProcess
-from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility, wait_until
+from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_themes, wait_until
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 COLUMNS = ("location", "objects", "occupancy", "topology", "zones", "imagery", "voxels")
@@ -293,15 +293,14 @@ def covers(paths: list[str], latitude: float, longitude: float) -> bool:
     return False
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_accessible(open_page: Open, axe: str, theme: str) -> None:
-    page = open_page("/?site=clinic&view=coverage&full=1", size=DESKTOP, color_scheme=theme)
+def test_accessible(open_page: Open, axe: str) -> None:
+    page = open_page("/?site=clinic&view=coverage&full=1", size=DESKTOP)
     expect(page.get_by_role("table")).to_be_visible()
-    check_accessibility(page, axe)
+    check_themes(page, axe)
     page.set_viewport_size(TABLET)  # type: ignore[arg-type]
     for query in ("format=kml", "format=tmap2&losses=1", "derive=any", "derive=occupancy_to_topology"):
         page.goto(f"/?site=clinic&view=coverage&{query}")
         expect(page.get_by_role("article")).to_be_visible()
         expect(page.locator(".panel [aria-busy=true]")).to_have_count(0)
-        check_accessibility(page, axe)
+        check_themes(page, axe)
         assert page.evaluate("document.documentElement.scrollWidth") <= TABLET["width"]

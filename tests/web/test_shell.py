@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_accessibility, wait_until
+from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_themes, wait_until
 
 VIEWS = ("Layers", "History", "Upload", "Edit", "Coverage", "Fleet", "Checks")
 
@@ -144,17 +144,16 @@ def test_markup_in_names_is_text(open_page: Open, server: WebServer) -> None:
     assert page.locator("#page img[src=x]").count() == 0
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESKTOP, TABLET, {"width": 360, "height": 740}], ids=["desktop", "tablet", "phone"])
-def test_accessible(open_page: Open, axe: str, theme: str, size: dict[str, int]) -> None:
-    page = open_page("/", size=size, color_scheme=theme)
+def test_accessible(open_page: Open, axe: str, size: dict[str, int]) -> None:
+    page = open_page("/", size=size)
     expect(page.get_by_role("link", name="Orchard")).to_be_visible()
-    check_accessibility(page, axe)
+    check_themes(page, axe)
     page.goto("/?site=orchard")
     for view in VIEWS:
         if view != "Layers":  # which is open at first
             page.get_by_role("link", name=view, exact=True).click()
         expect(page.get_by_role("region", name=view)).to_be_visible()
         expect(page.locator(".panel [aria-busy=true]")).to_have_count(0)
-        check_accessibility(page, axe)
+        check_themes(page, axe)
     assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
