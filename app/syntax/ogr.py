@@ -103,8 +103,8 @@ def read_layers(
 def _errors(pyogrio: Any) -> tuple[type[Exception], ...]:
     """Return what pyogrio raises for damaged files: its own errors, and NameError for a CRS that is no text."""
     names = ("DataSourceError", "DataLayerError", "CRSError", "FeatureError", "FieldError", "GeometryError")
-    own = [getattr(pyogrio.errors, name) for name in names]
-    return (*own, ValueError, TypeError, LookupError, ArithmeticError, OSError, NameError)
+    classes = [getattr(pyogrio.errors, name) for name in names]
+    return (*classes, ValueError, TypeError, LookupError, ArithmeticError, OSError, NameError)
 
 
 def _raise_unreadable(reason: str) -> Any:
@@ -126,13 +126,12 @@ def _read(
 ) -> Iterator[VectorLayer]:
     left = limits.features
     for name in names:
-        meta, _, geometry, values = pyogrio.raw.read(
-            data, layer=name, max_features=left + 1, datetime_as_string=True, **options
-        )
-        count = len(geometry) if geometry is not None else len(values[0]) if values else 0
-        left -= count
+        # Counted first: pyogrio allocates memory for as many features as it may read.
+        left -= pyogrio.read_info(data, layer=name, force_feature_count=True, **options)["features"]
         if left < 0:
             raise TooLarge(f"the file has more than {limits.features} features: split it")
+        meta, _, geometry, values = pyogrio.raw.read(data, layer=name, datetime_as_string=True, **options)
+        count = len(geometry) if geometry is not None else len(values[0]) if values else 0
         columns = {
             str(field): _plain_values(column, kind, subtype)
             for field, column, kind, subtype in zip(
