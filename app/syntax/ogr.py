@@ -83,15 +83,6 @@ def read_layers(
     """
     pyogrio = _pyogrio()
     pyogrio.set_gdal_config_options({"DXF_ENCODING": encoding})
-    errors: tuple[type[Exception], ...] = (
-        *_errors(pyogrio),
-        ValueError,
-        TypeError,
-        LookupError,
-        ArithmeticError,
-        OSError,
-        NameError,
-    )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -104,15 +95,16 @@ def read_layers(
             if len(names) > MAX_LAYERS:
                 raise TooLarge(f"the file has {len(names)} layers; the limit is {MAX_LAYERS}")
             layers = list(_read(pyogrio, data, names, limits, options))
-        except errors as error:
+        except _errors(pyogrio) as error:
             _raise_unreadable(_shorten(str(error)))
     return layers, list(dict.fromkeys(_shorten(str(w.message)) for w in caught))[:MAX_REPORTED]
 
 
 def _errors(pyogrio: Any) -> tuple[type[Exception], ...]:
-    errors = pyogrio.errors
-    return (errors.DataSourceError, errors.DataLayerError, errors.CRSError, errors.FeatureError, errors.FieldError,
-            errors.GeometryError)  # fmt: skip
+    """Return what pyogrio raises for damaged files: its own errors, and NameError for a CRS that is no text."""
+    names = ("DataSourceError", "DataLayerError", "CRSError", "FeatureError", "FieldError", "GeometryError")
+    classes = [getattr(pyogrio.errors, name) for name in names]
+    return (*classes, ValueError, TypeError, LookupError, ArithmeticError, OSError, NameError)
 
 
 def _raise_unreadable(reason: str) -> Any:
@@ -134,13 +126,12 @@ def _read(
 ) -> Iterator[VectorLayer]:
     left = limits.features
     for name in names:
-        meta, _, geometry, values = pyogrio.raw.read(
-            data, layer=name, max_features=left + 1, datetime_as_string=True, **options
-        )
-        count = len(geometry) if geometry is not None else len(values[0]) if values else 0
-        left -= count
+        # Counted first: pyogrio allocates memory for as many features as it may read.
+        left -= pyogrio.read_info(data, layer=name, force_feature_count=True, **options)["features"]
         if left < 0:
             raise TooLarge(f"the file has more than {limits.features} features: split it")
+        meta, _, geometry, values = pyogrio.raw.read(data, layer=name, datetime_as_string=True, **options)
+        count = len(geometry) if geometry is not None else len(values[0]) if values else 0
         columns = {
             str(field): _plain_values(column, kind, subtype)
             for field, column, kind, subtype in zip(

@@ -114,14 +114,14 @@ def check_blocks(data: bytes, limit: int) -> None:
 
     Raises TooLarge beyond the limit, UnreadableFile for blocks that contain themselves.
     """
-    own, references = _blocks(data)
+    sizes, references = _blocks(data)
 
     @cache
     def size(block: bytes, depth: int) -> int:
         if depth > MAX_DEPTH:
             raise_unreadable(f"blocks are nested deeper than {MAX_DEPTH} levels", block.decode("latin-1")[:80])
         inner = sum(n * size(child, depth + 1) for child, n in references.get(block, {}).items())
-        return own.get(block, 0) + inner
+        return sizes.get(block, 0) + inner
 
     count = size(b"", 0)
     if count > limit:
@@ -131,7 +131,7 @@ def check_blocks(data: bytes, limit: int) -> None:
 
 def _blocks(data: bytes) -> tuple[Counter[bytes], dict[bytes, Counter[bytes]]]:
     """Return by block the number of entities and the blocks that it inserts; the model space has no name."""
-    own: Counter[bytes] = Counter()
+    sizes: Counter[bytes] = Counter()
     references: dict[bytes, Counter[bytes]] = {}
     block = b""
     starts = list(_ENTITY.finditer(data))
@@ -150,8 +150,8 @@ def _blocks(data: bytes) -> tuple[Counter[bytes], dict[bytes, Counter[bytes]]]:
                 copies = _number(codes.get(b"70")) * _number(codes.get(b"71"))
                 references.setdefault(block, Counter())[name] += copies
         else:
-            own[block] += 1
-    return own, references
+            sizes[block] += 1
+    return sizes, references
 
 
 def _number(text: bytes | None) -> int:

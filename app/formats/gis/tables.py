@@ -92,8 +92,8 @@ def to_parts(tables: Sequence[Table], context: ReadContext, family: str) -> dict
                 item = _foreign(properties, geometry[k], f"{table.name}/{k + 1}")
                 rows.setdefault(home, []).append((*item, local))
             else:
-                row_id, own_properties = _own(properties, f"{table.name}/{k + 1}", table)
-                rows.setdefault(cast(PartKey, marks[k]), []).append((row_id, geometry[k], own_properties, local))
+                row_id, stored_properties = _marked(properties, f"{table.name}/{k + 1}", table)
+                rows.setdefault(cast(PartKey, marks[k]), []).append((row_id, geometry[k], stored_properties, local))
     return {key: _features(items, context) for key, items in rows.items()}
 
 
@@ -157,7 +157,7 @@ def _foreign(row: dict[str, Any], shape: Any, default: str) -> tuple[str, Any, P
     return text, shape, row
 
 
-def _own(row: dict[str, Any], default: str, table: Table) -> tuple[str, Properties]:
+def _marked(row: dict[str, Any], default: str, table: Table) -> tuple[str, Properties]:
     """Return id and properties of a row of ours, with those in ``more`` unless their column was edited."""
     identifier = row.pop("id", None)
     text = str(identifier) if identifier is not None and _is_id(str(identifier)) else default

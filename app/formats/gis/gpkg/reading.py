@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from app.errors import TooLarge
 from app.formats import Files, ReadContext
-from app.formats.gis.gpkg.words import CARTESIAN, DEGREES, DOCUMENT, ENVELOPES, LOCAL_SRS, OWN
+from app.formats.gis.gpkg.words import CARTESIAN, DEGREES, DOCUMENT, ENVELOPES, LOCAL_SRS, ORGANIZATION
 from app.formats.gis.shapes import parse_shapes, raise_unreadable, transformed
 from app.formats.gis.tables import LOCAL, Table, to_parts
 from app.model.features import Features
@@ -182,7 +182,7 @@ class _Reader:
         if srs_id not in systems:
             raise_unreadable(f"unknown srs_id {srs_id!r:.40}: it is not in gpkg_spatial_ref_sys", name)
         organization, crs = systems[srs_id]
-        if organization == OWN and srs_id == LOCAL_SRS and self.datum is not None:
+        if organization == ORGANIZATION and srs_id == LOCAL_SRS and self.datum is not None:
             return LOCAL, True
         return crs, False
 

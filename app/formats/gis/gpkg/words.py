@@ -14,7 +14,7 @@ CARTESIAN = -1
 DEGREES = 4326
 """srs_id of WGS 84."""
 
-OWN = "fleet_map"
+ORGANIZATION = "fleet_map"
 """Organization of our local frame in ``gpkg_spatial_ref_sys``."""
 LOCAL_SRS = 300000
 """srs_id of the local frame without its heading: transverse Mercator centred on the datum."""

@@ -24,7 +24,7 @@ from app.formats.gis.gpkg.words import (
     DOCUMENT,
     GEOMETRY_TYPES,
     LOCAL_SRS,
-    OWN,
+    ORGANIZATION,
     USER_VERSION,
 )
 from app.formats.gis.shapes import transformed
@@ -231,7 +231,7 @@ def _write_systems(database: sqlite3.Connection, frame: LocalFrame | None) -> No
     ]
     if frame is not None:
         description = "transverse Mercator centred on the environment's datum"
-        rows.append(("Local frame", LOCAL_SRS, OWN, LOCAL_SRS, frame.wkt, description))
+        rows.append(("Local frame", LOCAL_SRS, ORGANIZATION, LOCAL_SRS, frame.wkt, description))
     database.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
