@@ -140,6 +140,7 @@ export class Editor {
     }
     if (!this.draft.execute(outcome)) return false;
     this.keep(this.draft.position - 1);
+    this.lastStep.value = "";
     if (select) this.select(select);
     this.changed();
     return true;
@@ -155,6 +156,7 @@ export class Editor {
     if (command) this.afterStep(command, `Done again: ${command.title}`);
   }
 
+  /** What was undone or done again last, for those who hear the page. */
   readonly lastStep = signal("");
 
   private afterStep(command: Command, text: string): void {
