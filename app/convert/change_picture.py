@@ -88,11 +88,11 @@ class ChangePicture:
         groups: dict[str, list[Features]] = {"deleted": [], "before": [], "after": [], "added": []}
         for changed in self._delta.features:
             was = _select(self._store, self._old, changed.key, changed.put.ids)
-            known = set(was.ids)
+            old_ids = set(was.ids)
             groups["deleted"].append(_select(self._store, self._old, changed.key, changed.deleted))
             groups["before"].append(was)
-            groups["after"].append(changed.put.select([k for k, i in enumerate(changed.put.ids) if i in known]))
-            groups["added"].append(changed.put.select([k for k, i in enumerate(changed.put.ids) if i not in known]))
+            groups["after"].append(changed.put.select([k for k, i in enumerate(changed.put.ids) if i in old_ids]))
+            groups["added"].append(changed.put.select([k for k, i in enumerate(changed.put.ids) if i not in old_ids]))
         return groups
 
     def _choose_frame(self) -> LocalFrame | None:
@@ -107,9 +107,9 @@ class ChangePicture:
 
     def _shapes(self, parts: Sequence[Features]) -> NDArray[np.object_]:
         """Return geometries in metres; without a frame only those that are."""
-        own = self._local
-        found = [part.geometry[part.local] if own is None else part.in_local(own) for part in parts]
-        return np.concatenate([np.empty(0, object), *found])
+        frame = self._local
+        shapes = [part.geometry[part.local] if frame is None else part.in_local(frame) for part in parts]
+        return np.concatenate([np.empty(0, object), *shapes])
 
     def _load_around(self, frame: Frame) -> list[Features]:
         """Load what the picture shows of the layers that differ, whether it changed or not."""
@@ -152,7 +152,7 @@ class ChangePicture:
             return
         table = np.zeros((256, 4), np.uint8)
         for value, colour in CELLS.items():
-            table[value] = (*colour, 235)
+            table[value] = (*colour, 255)
         a, b, c, d, e, f = window
         seen = (a, b, c + a * left + b * top, d, e, f + d * left + e * top)
         canvas.raster(table[changes.reduce(k, top, left, bottom - top, right - left)], seen)

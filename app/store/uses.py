@@ -29,9 +29,9 @@ class Uses:
         """Note a use, if the last one is long ago; returns the last use that is stored or will be."""
         now = self._database.now()
         with self._lock:
-            known = [time for time in (stored, self._noted.get(name)) if time is not None]
-            if known and now - max(known) < self._interval:
-                return max(known)
+            times = [time for time in (stored, self._noted.get(name)) if time is not None]
+            if times and now - max(times) < self._interval:
+                return max(times)
             self._noted[name] = now
         return now
 

@@ -297,9 +297,9 @@ def test_diff_counts_cells_and_draws_an_image(api: Api, farm: str) -> None:
     assert body["layers"]["topology"]["added"] == ["new"]
     answer = api.get(f"environments/{farm}/diff?from=3&to=4&render=png")
     assert answer.headers["content-type"] == "image/png"
-    assert colours(answer.content, blocked := (207, 53, 65), (0, 140, 60)), "blocked cells, and the added node"
+    assert colours(answer.content, blocked := (203, 36, 49), (0, 140, 60)), "blocked cells, and the added node"
     back = api.get(f"environments/{farm}/diff?from=4&to=3&render=png").content
-    assert colours(back, freed := (40, 123, 217), (200, 30, 30)), "freed cells, and the deleted node"
+    assert colours(back, freed := (22, 112, 214), (200, 30, 30)), "freed cells, and the deleted node"
     assert not colours(answer.content, freed)
     assert not colours(back, blocked)
     for query in ("from=3&to=3", "from=0&to=1", "from=1&to=2", "from=2&to=3"):

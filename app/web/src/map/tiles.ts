@@ -89,6 +89,14 @@ export class Tiles {
     }
   }
 
+  /** Requests again what could not be fetched. */
+  retry(): void {
+    if (!this.failures) return;
+    this.failures = 0;
+    for (const [key, entry] of this.cache) if (entry === -1) this.cache.delete(key);
+    this.onTile();
+  }
+
   clear(): void {
     this.round += 1;
     this.cancelExcept(new Set());

@@ -3,7 +3,7 @@ import { ChevronLeft, ExternalLink, KeyRound, LogOut, WifiOff } from "lucide-pre
 import { Suspense } from "preact/compat";
 import { useCallback, useEffect, useRef, useState } from "preact/hooks";
 import { go, link, param, visit } from "../address";
-import { online } from "../api/client";
+import { ApiError, online } from "../api/client";
 import { live } from "../api/events";
 import { useChecking } from "../checks";
 import { useFileDrop } from "../dropped";
@@ -15,9 +15,12 @@ import { Bars, Problem } from "../ui/states";
 import { count } from "../ui/text";
 import { Access } from "./access";
 import { MapControls } from "./map-controls";
-import { VIEWS } from "./registry";
+import { loadViews, VIEWS } from "./registry";
 import { ThemeButton } from "./shell";
 import { open } from "./sites";
+
+/** Milliseconds after the map is there, until the code of the other views is loaded. */
+const QUIET = 4000;
 
 export function SiteView({ site }: { site: Site }) {
   const target = useRef<HTMLDivElement>(null);
@@ -45,6 +48,12 @@ export function SiteView({ site }: { site: Site }) {
     addEventListener("keydown", press);
     return () => removeEventListener("keydown", press);
   }, [views, view]);
+  const isQuiet = map !== null && !site.loading.value && online.value;
+  useEffect(() => {
+    if (!isQuiet) return;
+    const timer = setTimeout(() => void loadViews(VIEWS.filter(({ role }) => can(role))), QUIET);
+    return () => clearTimeout(timer);
+  }, [isQuiet]);
   const errors = useChecking(site).errors();
   const isOver = useFileDrop(
     can("editor"),
@@ -116,7 +125,7 @@ export function SiteView({ site }: { site: Site }) {
         <section class="panel" aria-label={view.title}>
           {site.problem.value && <Problem error={site.problem.value} retry={() => void site.refresh()} />}
           {map && View && (
-            <Suspense fallback={<Bars />}>
+            <Suspense fallback={online.value ? <Bars /> : <Problem error={ApiError.offline()} />}>
               <View site={site} map={map} />
             </Suspense>
           )}

@@ -33,7 +33,11 @@ export function TimeLine({ site, versions }: { site: Site; versions: Versions })
         {(page) =>
           head === 0 ? (
             <Empty title="No version yet">
-              <p>Open Upload and drop a map in: each upload and each edit becomes a version here.</p>
+              <p>
+                {can("editor")
+                  ? "Open Upload and drop a map in: each upload and each edit becomes a version here."
+                  : "An editor uploads the first map."}
+              </p>
             </Empty>
           ) : (
             <ol class="time-line" aria-label="Versions, newest first">

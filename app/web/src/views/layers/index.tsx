@@ -4,6 +4,7 @@ import type { LayerPart } from "../../api/client";
 import { baseMap, isBaseMapShown, showBaseMap } from "../../map/base-map";
 import { cssOf } from "../../map/palette";
 import { isHidden, isMask, rasterKey, toggleHidden } from "../../map/site-map";
+import { can } from "../../session";
 import { palette, theme } from "../../theme";
 import { Button } from "../../ui/button";
 import { Empty } from "../../ui/states";
@@ -41,7 +42,11 @@ export default function LayersView({ site, map }: ViewProps) {
   if (!site.loading.value && site.version.value && rows.length === 0) {
     return (
       <Empty title="This version has no map yet">
-        <p>Open Upload and drop files: a map.yaml with its image, OSM, KML, a building.yaml, a Gazebo world …</p>
+        <p>
+          {can("editor")
+            ? "Open Upload and drop files: a map.yaml with its image, OSM, KML, a building.yaml, a Gazebo world …"
+            : "An editor uploads the first one."}
+        </p>
       </Empty>
     );
   }
