@@ -21,7 +21,7 @@ from tests.api.ogc_sites import ON_EARTH, create_sites
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 QGIS = """
-import json, sys
+import json, os, sys
 from qgis.core import QgsApplication, QgsVectorLayer
 application = QgsApplication([], False)
 application.initQgis()
@@ -38,8 +38,8 @@ for name in names:
     points = [[vertex.x(), vertex.y()] for f in features for vertex in f.geometry().vertices()]
     levels = sorted({str(f.attributes()[index]) for f in features})
     out[name] = {"count": len(features), "crs": layer.crs().authid(), "levels": levels, "points": sorted(points)}
-print(json.dumps(out))
-application.exitQgis()
+print(json.dumps(out), flush=True)
+os._exit(0)  # QGIS crashes when it is torn down after its layers
 """
 
 
