@@ -40,6 +40,12 @@ class ItemQuery:
     crs: ReferenceSystem | None = None
     filters: tuple[tuple[str, str], ...] = ()
 
+    @property
+    def is_plain(self) -> bool:
+        """Return whether the page is a slice of the collection in CRS84, of no more than the default size."""
+        unconverted = self.crs is None or self.crs.kind == "crs84"
+        return self.box is None and not self.filters and unconverted and self.limit <= DEFAULT_LIMIT
+
 
 def invalid(parameter: str, reason: str, detail: str | None = None) -> Invalid:
     """Build the error for a parameter."""

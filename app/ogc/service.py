@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import re
+import time
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, urlencode
 
 from fastapi import Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
@@ -22,6 +25,11 @@ from app.ogc.negotiation import HTML, PAGES, choose
 from app.store.values import LATEST, Environment, Version
 
 PRODUCTION = "production"
+
+FRESH_SECONDS = 0.1
+"""Seconds for which a resolved address is cached: commits of other servers are visible within that time."""
+
+MAX_RESOLVED = 256
 
 _AUTHORITY = re.compile(r"[A-Za-z0-9._-]{1,255}(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]{2,60}\](:[0-9]{1,5})?")
 
@@ -123,23 +131,82 @@ def origin(request: Request, public_url: str | None) -> str:
     return f"{request.url.scheme}://{host}"
 
 
-def current_service(env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer) -> Service:
+async def current_service(env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer) -> Service:
     """Return the service of the channel ``production`` if it exists, else of the head."""
-    try:
-        return service_at(request, services, env, PRODUCTION, f"/ogc/{env}")
-    except NotFound:
-        return service_at(request, services, env, LATEST, f"/ogc/{env}")
+    return await _service(request, services, env, None, f"/ogc/{env}")
 
 
-def version_service(
+async def version_service(
     env: EnvironmentPath, v: VersionPath, request: Request, services: ServicesDep, _: Viewer
 ) -> Service:
     """Return the service of a version."""
-    return service_at(request, services, env, parse_version_ref(v), f"/ogc/{env}/versions/{quote(v, safe=':')}")
+    path = f"/ogc/{env}/versions/{quote(v, safe=':')}"
+    return await _service(request, services, env, parse_version_ref(v), path)
+
+
+async def _service(request: Request, services: Services, env: str, ref: str | int | None, path: str) -> Service:
+    cache = getattr(request.app.state, "ogc_versions", None)
+    if cache is None:
+        cache = request.app.state.ogc_versions = ResolvedVersions()
+    resolved = cache.get(services, env, ref)
+    if resolved is None:
+        generation = services.response_cache.generation()
+        resolved = await run_in_threadpool(_resolve, services, env, ref)
+        cache.put(env, ref, generation, resolved)
+    return _service_of(request, services, resolved, path)
 
 
 def service_at(request: Request, services: Services, env: str, ref: str | int, path: str) -> Service:
-    """Return the service of a version at a path."""
-    version = services.store.versions.get(env, ref)
-    environment = services.store.environments.get(env)
-    return Service(services, request, environment, version, ref, origin(request, services.options.public_url) + path)
+    """Return the service of a version that may change at any request, such as a draft, at a path."""
+    return _service_of(request, services, _resolve(services, env, ref), path)
+
+
+def _service_of(request: Request, services: Services, resolved: Resolved, path: str) -> Service:
+    address = origin(request, services.options.public_url) + path
+    return Service(services, request, resolved.environment, resolved.version, resolved.ref, address)
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """What an address means at the moment."""
+
+    environment: Environment
+    version: Version
+    ref: str | int
+
+
+def _resolve(services: Services, env: str, ref: str | int | None) -> Resolved:
+    """Read environment and version. Raises NotFound."""
+    versions = services.store.versions
+    if ref is None:
+        try:
+            version, ref = versions.get(env, PRODUCTION), PRODUCTION
+        except NotFound:
+            version, ref = versions.get(env, LATEST), LATEST
+    else:
+        version = versions.get(env, ref)
+    return Resolved(services.store.environments.get(env), version, ref)
+
+
+class ResolvedVersions:
+    """Resolved addresses, valid until the next commit of this process and for FRESH_SECONDS.
+
+    Clients request pages in rows, which then need no database. Used by the event loop only.
+    """
+
+    def __init__(self) -> None:
+        self._entries: OrderedDict[tuple[str, str | int | None], tuple[int, float, Resolved]] = OrderedDict()
+
+    def get(self, services: Services, env: str, ref: str | int | None) -> Resolved | None:
+        """Return what an address means; None if it has to be read."""
+        entry = self._entries.get((env, ref))
+        if entry is None or entry[0] != services.response_cache.generation() or entry[1] < time.monotonic():
+            return None
+        return entry[2]
+
+    def put(self, env: str, ref: str | int | None, generation: int, resolved: Resolved) -> None:
+        """Cache what an address means. generation: from before the store was read."""
+        self._entries[env, ref] = generation, time.monotonic() + FRESH_SECONDS, resolved
+        self._entries.move_to_end((env, ref))
+        while len(self._entries) > MAX_RESOLVED:
+            self._entries.popitem(last=False)
