@@ -26,8 +26,11 @@ from app.syntax.geotiff import crs_to_wkt
 
 QLR = "application/x-qgis-layer-definition"
 THEME = THEMES["light"]
-ARROW_SCALE = 3000
+ARROW_SCALE = 300
 """Scale denominator up to which arrows are drawn: beyond it they would hide the network."""
+
+OVER_IMAGE = "0.35"
+"""Opacity of a grid above an image."""
 
 GEOMETRY = {
     "nodes": "Point",
@@ -112,7 +115,8 @@ def _style_edges(layer: etree._Element) -> None:
     _symbol(symbols, "0", "line", _line(THEME.edge, "0.5"))
     places = {"placement": "centralpoint", "placements": "CentralPoint", "rotate": "1", "ring_filter": "0"}
     arrows = _symbol(symbols, "1", "line", ("MarkerLine", places))
-    _symbol(arrows, "@1@0", "marker", _marker("filled_arrowhead", THEME.edge, "2.6", "1.2,0"))
+    kind, values = _marker("filled_arrowhead", THEME.node, "2.6", "1.9,0")
+    _symbol(arrows, "@1@0", "marker", (kind, {**values, "outline_style": "no"}))
 
 
 def _style_zones(layer: etree._Element) -> None:
@@ -176,7 +180,9 @@ def definition_file(service: Service, collections: list[Collection]) -> bytes:
             _style(layer, name)
         else:
             pipe = etree.SubElement(layer, "pipe")
-            etree.SubElement(pipe, "rasterrenderer", type="singlebandcolordata", band="1", opacity="1")
+            over = name.startswith("grid-") and any(other.startswith("image-") for other in rasters)
+            opacity = OVER_IMAGE if over else "1"
+            etree.SubElement(pipe, "rasterrenderer", type="singlebandcolordata", band="1", opacity=opacity)
     return bytes(etree.tostring(root, encoding="utf-8", xml_declaration=True, pretty_print=True,
                                 doctype="<!DOCTYPE qgis-layer-definition>"))  # fmt: skip
 
