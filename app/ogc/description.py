@@ -39,8 +39,7 @@ PARAMETERS: Mapping[str, Mapping[str, object]] = {
         "description": "Only features that intersect this box: minimum x, minimum y, maximum x, maximum y in "
         "`bbox-crs`, by default degrees as west, south, east, north; west > east crosses the antimeridian. With six "
         "numbers the third and the sixth are heights in metres; features without heights match all heights.",
-        "schema": {"type": "array", "oneOf": [{"minItems": 4, "maxItems": 4}, {"minItems": 6, "maxItems": 6}],
-                   "items": {"type": "number"}},
+        "schema": {"type": "array", "minItems": 4, "maxItems": 6, "items": {"type": "number"}},
         "style": "form",
         "explode": False,
     },
