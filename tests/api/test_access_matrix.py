@@ -60,7 +60,11 @@ STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]
 NAMED = "environment={env}"
 OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
              "/collections/{collection}/schema", "/collections/{collection}/queryables",
-             "/collections/{collection}/items", "/collections/{collection}/items/{feature}")  # fmt: skip
+             "/collections/{collection}/items", "/collections/{collection}/items/{feature}",
+             "/tileMatrixSets", "/tileMatrixSets/{tms}", "/wmts/1.0.0/WMTSCapabilities.xml", "/layers.qlr",
+             *(f"{of}{path}" for of in ("", "/collections/{collection}") for path in (
+                 "/map", "/tiles", "/tiles/{tms}", "/tiles/{tms}/{z}/{row}/{col}",
+                 "/map/tiles", "/map/tiles/{tms}", "/map/tiles/{tms}/{z}/{row}/{col}")))  # fmt: skip
 ROWS = [
     *(
         Row(f"GET /ogc/{{env}}{start}{path}", "viewer", "environment")
