@@ -16,7 +16,7 @@ import re
 import sys
 import tempfile
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -482,13 +482,20 @@ def _roles() -> dict[tuple[str, str], str]:
             if hasattr(route, "original_router"):
                 routers.append(route.original_router)
                 continue
-            for dependency in route.dependant.dependencies:
+            for dependency in _dependencies(route.dependant):
                 if isinstance(dependency.call, RequireRole):
                     least = code(dependency.call.need)
                     role = f"{least}, in all environments" if dependency.call.everywhere else least
                     for method, prefix in itertools.product(route.methods, ("", API)):
                         out[method.lower(), prefix + route.path] = role
     return out
+
+
+def _dependencies(dependant: Any) -> Iterator[Any]:
+    """Yield the dependencies of a route, and theirs."""
+    for dependency in dependant.dependencies:
+        yield dependency
+        yield from _dependencies(dependency)
 
 
 def _operation(method: str, path: str, operation: Mapping[str, Any], role: str) -> str:

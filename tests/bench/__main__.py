@@ -21,7 +21,7 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.upload_reader import UploadHints
-from tests.bench import closures, derived, events, floors, generate, http, large, networks
+from tests.bench import closures, derived, events, floors, generate, http, large, networks, ogc
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -229,7 +229,7 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument(
         "--only",
-        choices=["conversions", "serving", "networks", "large", "events", "closures", "generate", "derived"],
+        choices=["conversions", "serving", "networks", "large", "events", "closures", "generate", "derived", "ogc"],
         help="one of the tables",
     )
     arguments = parser.parse_args()
@@ -242,11 +242,12 @@ def main() -> int:
     big = memory() if arguments.only in (None, "large") else []
     event_rows = events.rows() if arguments.only in (None, "events") else []
     closed = closures.rows() if arguments.only in (None, "closures") else []
+    ogc_rows = ogc.rows(arguments.tries * 3) if arguments.only in (None, "ogc") else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
-        tables |= {"closures": closed, "generate": generation_rows, "derived": huge}
+        tables |= {"closures": closed, "ogc": ogc_rows, "generate": generation_rows, "derived": huge}
         print(json.dumps(tables, indent=2))
     else:
         console = Console(width=110)
@@ -269,6 +270,7 @@ def main() -> int:
             "grid → network": paths,
             "events": event_rows,
             "closures": closed,
+            "OGC API": ogc_rows,
             "generated": generation_rows,
         }
         for title, rows in ratios.items():
@@ -307,7 +309,10 @@ def main() -> int:
             console.print(table)
     return (
         0
-        if all(r["holds"] for r in [*converted, *served, *paths, *big, *event_rows, *closed, *generation_rows, *huge])
+        if all(
+            r["holds"]
+            for r in [*converted, *served, *paths, *big, *event_rows, *closed, *generation_rows, *huge, *ogc_rows]
+        )
         else 1
     )
 

@@ -1,0 +1,172 @@
+"""OGC API in independent clients: GDAL of pyogrio, GDAL's command line tools, QGIS. Counts, positions, attributes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyogrio
+import pyproj
+import pytest
+import shapely
+
+from tests.api.conftest import ADMIN, Api, running, settings_for
+from tests.api.ogc_sites import ON_EARTH, create_sites
+
+SYSTEM_PYTHON = "/usr/bin/python3"
+QGIS = """
+import json, sys
+from qgis.core import QgsApplication, QgsVectorLayer
+application = QgsApplication([], False)
+application.initQgis()
+url, password, names = sys.argv[1], sys.argv[2], sys.argv[3].split(",")
+out = {}
+for name in names:
+    source = f"url='{url}' typename='{name}' username='any' password='{password}'"
+    layer = QgsVectorLayer(source, name, "OAPIF")
+    if not layer.isValid():
+        out[name] = "invalid"
+        continue
+    features = list(layer.getFeatures())
+    index = layer.fields().indexOf("level")
+    points = [[vertex.x(), vertex.y()] for f in features for vertex in f.geometry().vertices()]
+    levels = sorted({str(f.attributes()[index]) for f in features})
+    out[name] = {"count": len(features), "crs": layer.crs().authid(), "levels": levels, "points": sorted(points)}
+print(json.dumps(out))
+application.exitQgis()
+"""
+
+
+def require(command: str, works: bool) -> None:
+    """Skip a test whose program is missing; fail in CI, which installs it."""
+    if not works:
+        if os.environ.get("CI"):
+            pytest.fail(f"{command} is missing")
+        pytest.skip(f"{command} is missing")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory, shared: Path) -> Iterator[Api]:
+    with running(settings_for(tmp_path_factory.mktemp("clients"))) as api:
+        create_sites(api, shared)
+        yield api
+
+
+@pytest.fixture(scope="module", params=ON_EARTH)
+def site(server: Api, request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def layer_features(api: Api, site: str, collection: str) -> list[dict[str, Any]]:
+    """Return the features of a collection by the API of layers, which shares no code with the OGC API's pages."""
+    layer = {"nodes": "topology", "edges": "topology", "zones": "zones", "fence": "location"}.get(collection, "objects")
+    listed = api.get(f"environments/{site}/versions/latest/layers/{layer}").json()["features"]
+    families = {
+        "objects-points": ("Point", "MultiPoint"),
+        "objects-lines": ("LineString", "MultiLineString"),
+        "objects-polygons": ("Polygon", "MultiPolygon"),
+    }
+    kind = {"nodes": "node", "edges": "edge"}.get(collection)
+    out = []
+    for feature in listed:
+        shape = (feature["geometry"] or {}).get("type")
+        if kind is not None:
+            fits = feature["properties"]["kind"] == kind
+        elif layer == "objects":
+            others = [name for family in families.values() for name in family]
+            fits = shape in families[collection] if collection in families else shape not in others
+        else:
+            fits = True
+        out += [feature] if fits else []
+    return out
+
+
+def coordinates(features: list[dict[str, Any]]) -> Any:
+    shapes = [shapely.geometry.shape(f["geometry"]) for f in features if f["geometry"]]
+    return np.array(sorted(map(tuple, shapely.get_coordinates(shapes).tolist())))
+
+
+def metres_apart(first: Any, second: Any) -> float:
+    """Return the maximum distance of two sorted lists of positions in degrees."""
+    assert first.shape == second.shape
+    if not len(first):
+        return 0.0
+    return float(np.max(pyproj.Geod(ellps="WGS84").inv(first[:, 0], first[:, 1], second[:, 0], second[:, 1])[2]))
+
+
+def names_of(api: Api, site: str) -> list[str]:
+    names = [one["id"] for one in api.get(f"/ogc/{site}/collections").json()["collections"]]
+    assert {"nodes", "edges"} <= set(names)
+    return names
+
+
+def test_gdal_opens_every_collection(server: Api, site: str) -> None:
+    url = f"OAPIF:{server.url}/ogc/{site}"
+    pyogrio.set_gdal_config_options({"GDAL_HTTP_USERPWD": f"any:{ADMIN}"})
+    try:
+        names = names_of(server, site)
+        assert pyogrio.list_layers(url)[:, 0].tolist() == names
+        for name in names:
+            expected = layer_features(server, site, name)
+            meta, _, geometry, fields = pyogrio.raw.read(url, layer=name)
+            assert len(geometry) == len(expected) > 0, name
+            shapes = [shape for shape in shapely.from_wkb(geometry) if shape is not None]
+            points = np.array(sorted(map(tuple, shapely.get_coordinates(shapes).tolist())))
+            assert metres_apart(points, coordinates(expected)) < 1e-3, name
+            levels = fields[meta["fields"].tolist().index("level")]
+            assert sorted(levels.tolist()) == sorted(f["level"] for f in expected)
+            utm = [uri for uri in server.get(f"/ogc/{site}/collections/{name}").json()["crs"] if "EPSG/0/326" in uri]
+            meta, _, geometry, _ = pyogrio.raw.read(url, layer=name, CRS=utm[0])
+            shapes = [shape for shape in shapely.from_wkb(geometry) if shape is not None]
+            code = f"EPSG:{utm[0].rpartition('/')[2]}"
+            transformer = pyproj.Transformer.from_crs(code, "OGC:CRS84", always_xy=True)
+            flat = shapely.get_coordinates(shapes)
+            back = np.column_stack(transformer.transform(flat[:, 0], flat[:, 1])) if len(flat) else flat
+            sums = np.abs(back.sum(axis=0) - points.sum(axis=0)).max() if len(flat) else 0.0
+            assert sums / max(1, len(flat)) < 1e-9, name
+    finally:
+        pyogrio.set_gdal_config_options({"GDAL_HTTP_USERPWD": None})
+
+
+def test_ogrinfo_counts_every_collection(server: Api, site: str) -> None:
+    require("ogrinfo", shutil.which("ogrinfo") is not None)
+    env = {**os.environ, "GDAL_HTTP_USERPWD": f"any:{ADMIN}"}
+    command = ["ogrinfo", "-so", "-al", f"OAPIF:{server.url}/ogc/{site}/"]
+    text = subprocess.run(command, env=env, capture_output=True, text=True, check=True, timeout=120).stdout
+    counts: dict[str, int] = {}
+    name = ""
+    for line in text.splitlines():
+        key, _, value = line.partition(": ")
+        if key == "Layer name":
+            name = value
+        elif key == "Feature Count":
+            counts[name] = int(value)
+    assert counts == {name: len(layer_features(server, site, name)) for name in names_of(server, site)}
+
+
+def test_qgis_opens_every_collection(server: Api, site: str, tmp_path: Path) -> None:
+    probe = [SYSTEM_PYTHON, "-c", "import qgis.core"]
+    works = Path(SYSTEM_PYTHON).exists() and subprocess.run(probe, capture_output=True, check=False).returncode == 0
+    require("python3-qgis", works)
+    script = tmp_path / "open_layers.py"
+    script.write_text(QGIS)
+    names = [name for name in names_of(server, site) if name != "objects-other"]
+    env = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path)}
+    env.pop("PYTHONPATH", None)
+    command = [SYSTEM_PYTHON, str(script), f"{server.url}/ogc/{site}/", ADMIN, ",".join(names)]
+    result = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=240)
+    assert result.returncode == 0, result.stderr[-2000:]
+    opened = json.loads(result.stdout.splitlines()[-1])
+    for name in names:
+        expected = layer_features(server, site, name)
+        assert opened[name] != "invalid", name
+        assert opened[name]["count"] == len(expected), name
+        assert opened[name]["crs"] in ("EPSG:4326", "OGC:CRS84")
+        assert opened[name]["levels"] == sorted({f["level"] for f in expected})
+        assert metres_apart(np.array(opened[name]["points"]), coordinates(expected)) < 1e-3, name

@@ -1,0 +1,81 @@
+"""OGC API - Features: a box and a page of 100 000 features over HTTP, beside the store's query and orjson's dump."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+
+from app.model.frame import Datum
+from app.model.geodesy import local_frame
+from app.model.layers import PartKey
+from app.store.changes import Replace
+from tests.api.conftest import Api, running, settings_for
+from tests.store.bench_layout import network
+from tests.store.samples import save
+
+FEATURES = 100_000
+PAGE = 1000
+SIDE_METRES = 2000.0
+DATUM = Datum(53.2, -0.5, 0.0, 30.0)
+KEY = PartKey("topology", "ground", "network")
+BOX_MS, BOX_RATIO, PAGE_RATIO = 30.0, 1.5, 2.0
+
+
+def rows(tries: int) -> list[dict[str, Any]]:
+    """Measure a box of 1 % and a page of 1000; the peer runs in turns with ours."""
+    with tempfile.TemporaryDirectory() as folder, running(settings_for(Path(folder))) as api:
+        store = api.app.state.services.store
+        store.environments.create("large", datum=DATUM)
+        version = save(store, "large", Replace(KEY, network(2 * FEATURES).select(np.arange(FEATURES))))
+        side = SIDE_METRES / 10
+        corners = np.array([[x, y] for x in (900.0, 900.0 + side) for y in (900.0, 900.0 + side)])
+        degrees = local_frame(DATUM).to_wgs84(corners)
+        box = (*degrees.min(axis=0).tolist(), *degrees.max(axis=0).tolist())
+        url = "/ogc/large/collections/nodes/items"
+        started = time.perf_counter()
+        _get(api, f"{url}?limit=1")
+        first = (time.perf_counter() - started) * 1e3
+        asked = f"{url}?limit=10000&bbox={','.join(map(repr, box))}"
+        matched = orjson.loads(_get(api, asked))["numberMatched"]
+        theirs, ours = _in_turns(
+            lambda: store.content.features(version, KEY, bbox=box, crs="wgs84"), lambda: _get(api, asked), tries
+        )
+        page_url = f"{url}?limit={PAGE}"
+        page = orjson.loads(_get(api, page_url))
+        dump, paged = _in_turns(lambda: orjson.dumps(page), lambda: _get(api, page_url), tries)
+    return [
+        _row(f"bbox of 1 % ({matched} of {FEATURES}), HTTP; peer: the store's box", theirs, ours, BOX_RATIO, BOX_MS),
+        _row(f"page of {PAGE}, HTTP; peer: orjson.dumps of it", dump, paged, PAGE_RATIO, None),
+        {"what": "first request after a commit", "peer": None, "ours": first, "unit": "ms", "ratio": None,
+         "bound": "–", "holds": True},
+    ]  # fmt: skip
+
+
+def _row(what: str, peer: float, ours: float, ratio: float, limit: float | None) -> dict[str, Any]:
+    bound = f"≤ {ratio:g} ×" + ("" if limit is None else f", ≤ {limit:g} ms")
+    holds = ours <= ratio * peer and (limit is None or ours <= limit)
+    return {"what": what, "peer": peer, "ours": ours, "unit": "ms", "ratio": ours / peer, "bound": bound,
+            "holds": holds}  # fmt: skip
+
+
+def _get(api: Api, path: str) -> bytes:
+    answer = api.http.get(path, headers={"accept-encoding": "identity"})
+    assert answer.status_code == 200, answer.text[:500]
+    return answer.content
+
+
+def _in_turns(peer: Callable[[], Any], ours: Callable[[], Any], tries: int) -> tuple[float, float]:
+    """Return the fastest of several runs of each in milliseconds, after a warm-up."""
+    best = [float("inf"), float("inf")]
+    for _ in range(tries + 1):
+        for k, work in enumerate((peer, ours)):
+            started = time.perf_counter()
+            work()
+            best[k] = min(best[k], (time.perf_counter() - started) * 1e3)
+    return best[0], best[1]
