@@ -21,6 +21,7 @@ from app.ogc.collections import notice
 from app.ogc.extensions import Collection, Extension, all_collections
 from app.ogc.routing import both, ogc_router
 from app.ogc.service import Link, Service, link
+from app.ogc.tiles import PNG
 from app.ogc.vector import TITLES
 from app.syntax.geotiff import crs_to_wkt
 
@@ -151,7 +152,7 @@ def _feature_source(service: Service, name: str) -> str:
 
 
 def _raster_source(service: Service, name: str) -> str:
-    values = {"crs": "EPSG:3857", "format": wmts.PNG, "layers": name, "styles": "default",
+    values = {"crs": "EPSG:3857", "format": PNG, "layers": name, "styles": "default",
               "tileMatrixSet": wmts.SET.id, "url": wmts.url(service)}  # fmt: skip
     return urlencode(values)
 

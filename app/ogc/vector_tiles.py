@@ -71,6 +71,9 @@ class _Source:
 _SOURCES: RecentlyUsed[_Source] = RecentlyUsed(MAX_SOURCE_BYTES, lambda source: source.size)
 """Sources of this process: they depend on content only, so that all stores can share them."""
 
+TILES: RecentlyUsed[bytes] = RecentlyUsed(32 * 2**20, len)
+"""Tiles of this process by ETag."""
+
 _KINDS = np.array([1, 2, 2, 3, 1, 2, 3, 0])
 """Vector tiles' type of each of shapely's, 0 for none."""
 

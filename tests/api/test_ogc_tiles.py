@@ -325,7 +325,7 @@ def test_gdal_opens_the_wmts_document(open_site: tuple[Api, str], monkeypatch: p
     assert np.abs(extent.min(axis=0) - corners.min(axis=0)).max() < 1e-6
     assert np.abs(extent.max(axis=0) - corners.max(axis=0)).max() < 1e-6
     x, y = mercator(20.5, 10.5)
-    values = program("gdallocationinfo", "-xml", "-geoloc", f"WMTS:{url},layer=grid-map", repr(x), repr(y))
+    values = program("gdallocationinfo", "-xml", "-geoloc", f"WMTS:{url},layer=grid-map", f"{x:.3f}", f"{y:.3f}")
     shades = [int(value.text) for value in etree.fromstring(values).iter("Value")]
     assert len(shades) == 4
     assert max(shades[:3]) < 110, "the wall is dark where geodesy says"
@@ -357,9 +357,9 @@ def test_qgis_opens_the_layer_definition(open_site: tuple[Api, str], tmp_path: P
     there = QGIS.exists() and subprocess.run([QGIS, "-c", "import qgis.core"], env=environment, capture_output=True)
     if not there or there.returncode:
         pytest.skip("python3-qgis is not installed")
-    answer = api.get(f"/ogc/{site}/versions/2/layers.qlr")
+    answer = api.get(f"/ogc/{site}/versions/3/layers.qlr")
     assert answer.headers["content-type"] == "application/x-qgis-layer-definition"
-    assert answer.content.count(f"/ogc/{site}/versions/2/".encode()) >= 3
+    assert answer.content.count(f"/ogc/{site}/versions/3/".encode()) >= 3
     assert api.token is not None
     assert api.token.encode() not in answer.content
     (tmp_path / "site.qlr").write_bytes(answer.content)
