@@ -141,9 +141,9 @@ class Views:
 
     def _convert(self, version: Version, datum: Datum, entry: PartEntry, crs: str) -> _Converted:
         key = (entry.hash, datum, crs)
-        found = self._converted.get(key)
-        if found is not None:
-            return found
+        cached = self._converted.get(key)
+        if cached is not None:
+            return cached
         part = self._store.content.load(version, [entry.key]).parts[entry.key]
         assert isinstance(part, Features)
         frame = local_frame(datum)
@@ -210,18 +210,18 @@ class _Drawing:
         image = reader.kind != "grid"
         crs = str(reader.header["crs"]) if image else LOCAL
         transform = image_transform(reader.header) if image else place_raster(reader, None).transform
-        found = self._place(transform, crs, Size(reader.width, reader.height))
-        if found is None:
+        place = self._place(transform, crs, Size(reader.width, reader.height))
+        if place is None:
             return
-        (top, left, bottom, right), k, fitted = found
+        (top, left, bottom, right), k, fitted = place
         pixels = self._tiles.window(entry, k, (top, left, bottom, right))
         self._canvas.raster(colour(pixels), _part_transform(fitted, k, top, left))
 
     def _columns(self, entry: PartEntry) -> None:
         columns = self._tiles.columns(self._version, entry.key)
-        found = self._place(place_columns(columns).transform, LOCAL, Size(columns.width, columns.height))
-        if found is not None:
-            (top, left, bottom, right), k, fitted = found
+        place = self._place(place_columns(columns).transform, LOCAL, Size(columns.width, columns.height))
+        if place is not None:
+            (top, left, bottom, right), k, fitted = place
             cells = cells_of_columns(columns, k)[top:bottom, left:right]
             self._canvas.raster(self._painter.cells(cells, over=False), _part_transform(fitted, k, top, left))
 

@@ -168,8 +168,8 @@ def _background(wanted: _Wanted) -> Colour | None:
     """Return the colour of the background; None for a transparent one. Raises Invalid for an unknown colour."""
     colour: Colour = (255, 255, 255)
     if wanted.bgcolor is not None:
-        found = _HEX.fullmatch(wanted.bgcolor)
-        name = wanted.bgcolor.lower() if found is None else f"#{found[2]}"
+        match = _HEX.fullmatch(wanted.bgcolor)
+        name = wanted.bgcolor.lower() if match is None else f"#{match[2]}"
         if not name.startswith("#") and name not in ImageColor.colormap:
             problem = Problem("must be 0xRRGGBB or a name of a web colour", where="bgcolor")
             raise Invalid(f"unknown bgcolor {wanted.bgcolor!r}: use 0xRRGGBB or a name such as white", [problem])

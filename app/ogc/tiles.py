@@ -209,7 +209,7 @@ async def _tileset(service: Service, kind: Kind, collection: str | None, tms: st
     root, body = page(document["title"], [(service.title, service.landing_url)])
     line = add(body, "p", "Address of a tile: ")
     add(line, "code", tile_template(service, kind, collection, tms))
-    link_list(body, [found for found in document["links"] if "templated" not in found])
+    link_list(body, [one_link for one_link in document["links"] if "templated" not in one_link])
     representations(body, alternates)
     return respond_page(service, root)
 
@@ -263,8 +263,8 @@ async def _vector_tile(
     if data is None:
         chosen: dict[str, tuple[TableKey, Table]] = {}
         for name, key in keys.items():
-            held = await layer_tables(service, name)
-            chosen |= {one: (key, rows) for one, rows in held.items() if collection in (None, one)}
+            by_id = await layer_tables(service, name)
+            chosen |= {one: (key, rows) for one, rows in by_id.items() if collection in (None, one)}
         join = service.services.response_cache.join
         data = TILES.put(etag, await join(("mvt", etag), vector_tile, chosen, tiling, *address))
     response = service.respond(data, MVT, etag=etag)

@@ -107,9 +107,9 @@ def vector_tile(
 
 
 def _source(name: str, key: TableKey, table: Table, one: TileMatrixSet) -> _Source:
-    found = _SOURCES.get((name, key, one.id))
-    if found is not None:
-        return found
+    cached = _SOURCES.get((name, key, one.id))
+    if cached is not None:
+        return cached
     rows = np.arange(len(table))
     if one.code == LOCAL:
         geometry = shapely.force_2d(table.in_crs(rows, ReferenceSystem("", "local")))

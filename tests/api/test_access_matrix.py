@@ -126,7 +126,7 @@ NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
           "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
-          "collection": "nodes", "feature": "gate", "z": "0", "row": "0", "col": "0"}  # fmt: skip
+          "collection": "nodes", "feature": "gate", "tms": "local", "z": "0", "row": "0", "col": "0"}  # fmt: skip
 
 
 @dataclass
