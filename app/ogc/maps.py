@@ -184,7 +184,7 @@ async def _extent(service: Service, collection: str | None) -> Box:
     box = site_box(service)
     if collection is not None:
         (entry,) = [one for one in await all_collections(service) if one.id == collection]
-        box = entry.bbox
+        box = entry.bbox or box
     if box is None or box[0] > box[2]:
         raise NotFound(f"{collection or service.environment.name} has no box to draw by default: give a bbox")
     x, y = max((box[2] - box[0]) * 0.02, 1e-6), max((box[3] - box[1]) * 0.02, 1e-6)
