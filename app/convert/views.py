@@ -41,6 +41,7 @@ WRITER = 1
 MAX_SIDE = 2048
 """Maximum width and height of a picture in pixels."""
 
+MAX_PICTURE_BYTES = 48 * 2**20
 MAX_SHAPE_BYTES = 128 * 2**20
 SHAPE_BYTES = 400
 """Estimated size of a converted feature besides its coordinates."""
@@ -117,10 +118,15 @@ class Views:
     def __init__(self, store: Store, tiles: Tiles) -> None:
         self._store, self._tiles = store, tiles
         self._converted: RecentlyUsed[_Converted] = RecentlyUsed(MAX_SHAPE_BYTES, lambda one: one.size)
+        self._pictures: RecentlyUsed[bytes] = RecentlyUsed(MAX_PICTURE_BYTES, len)
 
     def png(self, version: Version, content: ViewContent, view: View, background: Colour | None) -> bytes:
         """Draw a picture of a version with a datum, as PNG; transparent without a background."""
         assert version.datum is not None
+        key = view_key(version, content, view, background)
+        cached = self._pictures.get(key)
+        if cached is not None:
+            return cached
         canvas = Canvas(Frame(view.width, view.height, 0.0, float(view.height), 1.0), background)
         painter = Painter("light", {e.key.layer for e in content.parts})
         drawing = _Drawing(self._tiles, version, view, canvas, painter)
@@ -131,13 +137,13 @@ class Views:
                 converted = self._convert(version, version.datum, entry, view.crs)
                 parts[entry.key] = _visible(converted, view, content.shape_types)
         painter.features(canvas, parts, 1.0)
-        return images.encode_png(canvas.finish())
+        return self._pictures.put(key, images.encode_png(canvas.finish()))
 
     def _convert(self, version: Version, datum: Datum, entry: PartEntry, crs: str) -> _Converted:
         key = (entry.hash, datum, crs)
-        found = self._converted.get(key)
-        if found is not None:
-            return found
+        cached = self._converted.get(key)
+        if cached is not None:
+            return cached
         part = self._store.content.load(version, [entry.key]).parts[entry.key]
         assert isinstance(part, Features)
         frame = local_frame(datum)
@@ -204,18 +210,18 @@ class _Drawing:
         image = reader.kind != "grid"
         crs = str(reader.header["crs"]) if image else LOCAL
         transform = image_transform(reader.header) if image else place_raster(reader, None).transform
-        found = self._place(transform, crs, Size(reader.width, reader.height))
-        if found is None:
+        place = self._place(transform, crs, Size(reader.width, reader.height))
+        if place is None:
             return
-        (top, left, bottom, right), k, fitted = found
+        (top, left, bottom, right), k, fitted = place
         pixels = self._tiles.window(entry, k, (top, left, bottom, right))
         self._canvas.raster(colour(pixels), _part_transform(fitted, k, top, left))
 
     def _columns(self, entry: PartEntry) -> None:
         columns = self._tiles.columns(self._version, entry.key)
-        found = self._place(place_columns(columns).transform, LOCAL, Size(columns.width, columns.height))
-        if found is not None:
-            (top, left, bottom, right), k, fitted = found
+        place = self._place(place_columns(columns).transform, LOCAL, Size(columns.width, columns.height))
+        if place is not None:
+            (top, left, bottom, right), k, fitted = place
             cells = cells_of_columns(columns, k)[top:bottom, left:right]
             self._canvas.raster(self._painter.cells(cells, over=False), _part_transform(fitted, k, top, left))
 

@@ -21,13 +21,17 @@ from app.ogc.collections import notice
 from app.ogc.extensions import Collection, Extension, all_collections
 from app.ogc.routing import both, ogc_router
 from app.ogc.service import Link, Service, link
+from app.ogc.tiles import PNG
 from app.ogc.vector import TITLES
 from app.syntax.geotiff import crs_to_wkt
 
 QLR = "application/x-qgis-layer-definition"
 THEME = THEMES["light"]
-ARROW_SCALE = 3000
+ARROW_SCALE = 300
 """Scale denominator up to which arrows are drawn: beyond it they would hide the network."""
+
+OVER_IMAGE = "0.35"
+"""Opacity of a grid above an image."""
 
 GEOMETRY = {
     "nodes": "Point",
@@ -112,7 +116,8 @@ def _style_edges(layer: etree._Element) -> None:
     _symbol(symbols, "0", "line", _line(THEME.edge, "0.5"))
     places = {"placement": "centralpoint", "placements": "CentralPoint", "rotate": "1", "ring_filter": "0"}
     arrows = _symbol(symbols, "1", "line", ("MarkerLine", places))
-    _symbol(arrows, "@1@0", "marker", _marker("filled_arrowhead", THEME.edge, "2.6", "1.2,0"))
+    kind, values = _marker("filled_arrowhead", THEME.node, "2.6", "1.9,0")
+    _symbol(arrows, "@1@0", "marker", (kind, {**values, "outline_style": "no"}))
 
 
 def _style_zones(layer: etree._Element) -> None:
@@ -147,7 +152,7 @@ def _feature_source(service: Service, name: str) -> str:
 
 
 def _raster_source(service: Service, name: str) -> str:
-    values = {"crs": "EPSG:3857", "format": wmts.PNG, "layers": name, "styles": "default",
+    values = {"crs": "EPSG:3857", "format": PNG, "layers": name, "styles": "default",
               "tileMatrixSet": wmts.SET.id, "url": wmts.url(service)}  # fmt: skip
     return urlencode(values)
 
@@ -176,7 +181,9 @@ def definition_file(service: Service, collections: list[Collection]) -> bytes:
             _style(layer, name)
         else:
             pipe = etree.SubElement(layer, "pipe")
-            etree.SubElement(pipe, "rasterrenderer", type="singlebandcolordata", band="1", opacity="1")
+            over = name.startswith("grid-") and any(other.startswith("image-") for other in rasters)
+            opacity = OVER_IMAGE if over else "1"
+            etree.SubElement(pipe, "rasterrenderer", type="singlebandcolordata", band="1", opacity=opacity)
     return bytes(etree.tostring(root, encoding="utf-8", xml_declaration=True, pretty_print=True,
                                 doctype="<!DOCTYPE qgis-layer-definition>"))  # fmt: skip
 

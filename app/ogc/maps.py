@@ -168,8 +168,8 @@ def _background(wanted: _Wanted) -> Colour | None:
     """Return the colour of the background; None for a transparent one. Raises Invalid for an unknown colour."""
     colour: Colour = (255, 255, 255)
     if wanted.bgcolor is not None:
-        found = _HEX.fullmatch(wanted.bgcolor)
-        name = wanted.bgcolor.lower() if found is None else f"#{found[2]}"
+        match = _HEX.fullmatch(wanted.bgcolor)
+        name = wanted.bgcolor.lower() if match is None else f"#{match[2]}"
         if not name.startswith("#") and name not in ImageColor.colormap:
             problem = Problem("must be 0xRRGGBB or a name of a web colour", where="bgcolor")
             raise Invalid(f"unknown bgcolor {wanted.bgcolor!r}: use 0xRRGGBB or a name such as white", [problem])
@@ -184,7 +184,7 @@ async def _extent(service: Service, collection: str | None) -> Box:
     box = site_box(service)
     if collection is not None:
         (entry,) = [one for one in await all_collections(service) if one.id == collection]
-        box = entry.bbox
+        box = entry.bbox or box
     if box is None or box[0] > box[2]:
         raise NotFound(f"{collection or service.environment.name} has no box to draw by default: give a bbox")
     x, y = max((box[2] - box[0]) * 0.02, 1e-6), max((box[3] - box[1]) * 0.02, 1e-6)

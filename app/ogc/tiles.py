@@ -31,7 +31,7 @@ from app.ogc.service import Link, Service, link
 from app.ogc.tables import VECTOR_LAYERS, Table, TableKey, table_key
 from app.ogc.tile_matrix_sets import TILE, SetPath, TileMatrixSet, available_sets, find_set, uri_of
 from app.ogc.vector import TITLES, layer_tables
-from app.ogc.vector_tiles import tile_etag, vector_tile
+from app.ogc.vector_tiles import TILES, tile_etag, vector_tile
 from app.store.values import Box
 
 MVT = "application/vnd.mapbox-vector-tile"
@@ -209,7 +209,7 @@ async def _tileset(service: Service, kind: Kind, collection: str | None, tms: st
     root, body = page(document["title"], [(service.title, service.landing_url)])
     line = add(body, "p", "Address of a tile: ")
     add(line, "code", tile_template(service, kind, collection, tms))
-    link_list(body, [found for found in document["links"] if "templated" not in found])
+    link_list(body, [one_link for one_link in document["links"] if "templated" not in one_link])
     representations(body, alternates)
     return respond_page(service, root)
 
@@ -250,23 +250,23 @@ async def _map_tile(
 
 
 async def _vector_tile(
-    service: Service, collection: str | None, one: TileMatrixSet, address: tuple[int, int, int]
+    service: Service, collection: str | None, tiling: TileMatrixSet, address: tuple[int, int, int]
 ) -> Response:
     if collection is not None and collection not in TITLES:
         raise _no_features_error(collection)
     layers = VECTOR_LAYERS if collection is None else (TITLES[collection][0],)
     keys = {name: key for name in layers if (key := table_key(service.version, name)) is not None}
-    etag = tile_etag(keys, collection, one, address)
+    etag = tile_etag(keys, collection, tiling, address)
     if none_match(service.request.headers.get("if-none-match"), etag):
         return service.respond(b"", MVT, etag=etag)
-    chosen: dict[str, tuple[TableKey, Table]] = {}
-    for name, key in keys.items():
-        chosen |= {
-            held: (key, rows)
-            for held, rows in (await layer_tables(service, name)).items()
-            if collection in (None, held)
-        }
-    data = await service.services.response_cache.join(("mvt", etag), vector_tile, chosen, one, *address)
+    data = TILES.get(etag)
+    if data is None:
+        chosen: dict[str, tuple[TableKey, Table]] = {}
+        for name, key in keys.items():
+            by_id = await layer_tables(service, name)
+            chosen |= {one: (key, rows) for one, rows in by_id.items() if collection in (None, one)}
+        join = service.services.response_cache.join
+        data = TILES.put(etag, await join(("mvt", etag), vector_tile, chosen, tiling, *address))
     response = service.respond(data, MVT, etag=etag)
     if not data:
         response.status_code = 204

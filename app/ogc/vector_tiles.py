@@ -71,6 +71,9 @@ class _Source:
 _SOURCES: RecentlyUsed[_Source] = RecentlyUsed(MAX_SOURCE_BYTES, lambda source: source.size)
 """Sources of this process: they depend on content only, so that all stores can share them."""
 
+TILES: RecentlyUsed[bytes] = RecentlyUsed(32 * 2**20, len)
+"""Tiles of this process by ETag."""
+
 _KINDS = np.array([1, 2, 2, 3, 1, 2, 3, 0])
 """Vector tiles' type of each of shapely's, 0 for none."""
 
@@ -104,9 +107,9 @@ def vector_tile(
 
 
 def _source(name: str, key: TableKey, table: Table, one: TileMatrixSet) -> _Source:
-    found = _SOURCES.get((name, key, one.id))
-    if found is not None:
-        return found
+    cached = _SOURCES.get((name, key, one.id))
+    if cached is not None:
+        return cached
     rows = np.arange(len(table))
     if one.code == LOCAL:
         geometry = shapely.force_2d(table.in_crs(rows, ReferenceSystem("", "local")))

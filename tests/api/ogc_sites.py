@@ -80,8 +80,9 @@ class Ogc:
         return body
 
     def collections(self) -> list[dict[str, Any]]:
+        """Return the collections with items; grids and images have maps only."""
         listed: list[dict[str, Any]] = self.get(link(self.landing(), "data")).json()["collections"]
-        return listed
+        return [one for one in listed if "itemType" in one]
 
     def items_url(self, collection: dict[str, Any]) -> str:
         return link(collection, "items", "application/geo+json")

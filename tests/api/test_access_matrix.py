@@ -60,7 +60,11 @@ STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]
 NAMED = "environment={env}"
 OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
              "/collections/{collection}/schema", "/collections/{collection}/queryables",
-             "/collections/{collection}/items", "/collections/{collection}/items/{feature}")  # fmt: skip
+             "/collections/{collection}/items", "/collections/{collection}/items/{feature}",
+             "/tileMatrixSets", "/tileMatrixSets/{tms}", "/wmts/1.0.0/WMTSCapabilities.xml", "/layers.qlr",
+             *(f"{of}{path}" for of in ("", "/collections/{collection}") for path in (
+                 "/map", "/tiles", "/tiles/{tms}", "/tiles/{tms}/{z}/{row}/{col}",
+                 "/map/tiles", "/map/tiles/{tms}", "/map/tiles/{tms}/{z}/{row}/{col}")))  # fmt: skip
 OGC_ITEMS = "/ogc/{env}/drafts/{draft}/collections/{collection}/items"
 ITEM_METHODS = ("OPTIONS", "PUT", "PATCH", "DELETE")
 ROWS = [
@@ -134,7 +138,8 @@ NO_TOKEN = ("none", "garbage", "expired", "revoked")
 LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
           "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
-          "collection": "nodes", "feature": "gate", "z": "0", "row": "0", "col": "0", "draft": "0" * 16}  # fmt: skip
+          "collection": "nodes", "feature": "gate", "tms": "local", "z": "0", "row": "0", "col": "0",
+          "draft": "0" * 16}  # fmt: skip
 
 
 @dataclass

@@ -76,7 +76,11 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
     }  # fmt: skip
     ogc = ("/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
            "/collections/{collection}/items", "/collections/{collection}/items/{feature}",
-           "/collections/{collection}/schema", "/collections/{collection}/queryables")  # fmt: skip
+           "/collections/{collection}/schema", "/collections/{collection}/queryables",
+           "/tileMatrixSets", "/tileMatrixSets/{tms}", "/wmts/1.0.0/WMTSCapabilities.xml", "/layers.qlr",
+           *(f"{of}{path}" for of in ("", "/collections/{collection}") for path in (
+               "/map", "/tiles", "/tiles/{tms}", "/tiles/{tms}/{z}/{row}/{col}",
+               "/map/tiles", "/map/tiles/{tms}", "/map/tiles/{tms}/{z}/{row}/{col}")))  # fmt: skip
     wanted |= {start + path: "get" for start in ("/ogc/{env}", "/ogc/{env}/versions/{v}") for path in ogc}
     by_format = {f"/maps/{{env}}/{fmt.name}" for fmt in all_formats().values() if fmt.write}
     assert by_format < set(schema["paths"])

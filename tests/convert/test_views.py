@@ -104,8 +104,9 @@ def test_a_cell_of_a_turned_grid_is_where_it_is_on_earth(site: Site, crs: str, m
 
 @pytest.mark.parametrize("crs", CRSS)
 def test_a_node_is_where_it_is_on_earth(site: Site, crs: str) -> None:
-    geometry = [shapely.Point(120, 75), shapely.Point(190, 75), shapely.LineString([(120, 75), (190, 75)])]
-    part = features(["a", "b", "e"], geometry, [{"kind": "node"}] * 2 + [{"kind": "edge"}], local=True)
+    nodes = [(name, shapely.Point(x, 75), {"kind": "node"}) for name, x in (("a", 120), ("b", 190))]
+    edge = ("e", shapely.LineString([(120, 75), (190, 75)]), {"kind": "edge"})
+    part = features([*nodes, edge], "local")
     version = site.version({NETWORK: part})
     view = view_around(crs, (125.0, 70.0), 40.0)
     pixels = site.draw(version, view, types=frozenset({0}))
@@ -142,8 +143,8 @@ def test_an_image_in_utm_is_placed_in_the_local_frame(site: Site) -> None:
 def test_neighbouring_tiles_join(site: Site) -> None:
     """Two halves drawn alone are the whole picture: width of lines and cells do not depend on the box."""
     cells = (np.random.default_rng(3).random((400, 400)) < 0.1).astype(np.uint8) * 100
-    geometry = [shapely.LineString([(k, 0), (k + 9, 40)]) for k in range(0, 30, 3)]
-    part = features([str(k) for k in range(10)], geometry, [{"kind": "edge"}] * 10, local=True)
+    edges = [(str(k), shapely.LineString([(k, 0), (k + 9, 40)]), {"kind": "edge"}) for k in range(0, 30, 3)]
+    part = features(edges, "local")
     version = site.version({GRID: OccupancyGrid(cells, 0.1, (0, 0, 0.3)), NETWORK: part})
     whole = site.draw(version, View("local", (0, 0, 40, 40), 512, 512))
     left = site.draw(version, View("local", (0, 0, 20, 40), 256, 512))
@@ -159,7 +160,7 @@ def test_a_huge_grid_is_read_in_pieces(site: Site) -> None:
     for metres in (1.0, 450.0, 4000.0):
         view = View("local", (225 - metres / 2, 225.025 - metres / 2, 225 + metres / 2, 225.025 + metres / 2), 256, 256)
         pixels = site.draw(version, view)
-        assert occupied(pixels).any() or metres > 1000, "a wall one cell wide stays visible"
+        assert pixels[..., :3].min() < 180, "a wall one cell wide stays visible"
         assert (pixels[..., 3] > 0).any()
     far = site.draw(version, View("EPSG:3857", (-2e7, -2e7, 2e7, 2e7), MAX_SIDE, 16))
     assert far.shape == (16, MAX_SIDE, 4)

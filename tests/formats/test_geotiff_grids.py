@@ -189,6 +189,10 @@ def test_png_with_world_file_is_one_grid_and_no_image() -> None:
     assert sorted(written(grid(), None, file_type="png", world_file=True)) == ["map.pgw", "map.png", "map.yaml"]
     bundle = read_upload(files, UploadHints(), EnvironmentContext(), Limits())
     assert {key.layer for key in bundle.layers(HERE).parts} == {"occupancy"}
+    for name in ("map.pgw", "map.png.aux.xml"):
+        options = FORMAT.selection.from_filename(name)
+        assert options == {"grid": "map", "file_type": "png", "world_file": "true"}
+    assert FORMAT.selection.from_filename("map.tif") == {"grid": "map", "file_type": "tif"}
     for kind in (None, "pgm", "tif"):
         with pytest.raises(Invalid, match="file_type=png"):
             written(grid(), HERE, file_type=kind, world_file=True)

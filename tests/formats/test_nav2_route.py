@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
+from app.model.geodesy import local_frame
 from app.model.layers import Layers, PartKey
 
 FORMAT = get_format("nav2_route")
@@ -523,3 +526,21 @@ def test_invalid_property_values_are_written_safely() -> None:
         for document in ({"members": value, "ignored": value, "dangling": value}, value):
             served, _ = write(features(rows, "local", {"nav2_route": document}))
             assert len(json.loads(served)["features"]) >= 4
+
+
+@pytest.mark.parametrize("heading", [0.0, 30.0])
+def test_gdal_shows_the_metres_where_they_are_on_earth(heading: float, tmp_path: Path) -> None:
+    program = shutil.which("ogr2ogr")
+    if program is None:
+        pytest.skip("ogr2ogr is not installed")
+    datum = Datum(53.2686, -0.5245, heading=heading)
+    nodes = [(name, shapely.Point(x, y), {"kind": "node"}) for name, x, y in (("1", 100.0, 50.0), ("2", -20.0, 7.0))]
+    edge = ("3", shapely.LineString([(100.0, 50.0), (-20.0, 7.0)]), {"kind": "edge", "source": "1", "target": "2"})
+    layers = Layers({PartKey("topology", name="network"): features([*nodes, edge], "local")}, datum)
+    files = formats.write(get_format("nav2_route"), layers, WriteContext())
+    (tmp_path / "graph.geojson").write_bytes(files["graph.geojson"])
+    arguments = ["-f", "GeoJSON", "-lco", "COORDINATE_PRECISION=12", "-t_srs", "EPSG:4326", "/vsistdout/"]
+    done = subprocess.run([program, *arguments, tmp_path / "graph.geojson"], capture_output=True, check=True)
+    rows = [row["geometry"] for row in json.loads(done.stdout)["features"] if row["geometry"]["type"] == "Point"]
+    metres = local_frame(datum).to_local(np.array([row["coordinates"][:2] for row in rows]))
+    assert np.abs(metres - [[100.0, 50.0], [-20.0, 7.0]]).max() < 1e-3

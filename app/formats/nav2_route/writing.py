@@ -36,6 +36,7 @@ from app.formats.nav2_route.vocabulary import (
     NUMBERS,
 )
 from app.model.features import Properties
+from app.model.geodesy import local_crs_wkt
 from app.model.layers import Layers
 from app.parameters import parameter
 from app.syntax import json
@@ -50,8 +51,8 @@ class WriteOptions:
     frame_id: str = parameter(FRAME, "frame of nodes whose source has none")
 
 
-CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
-"""CRS in Nav2's own graphs, with which QGIS shows their metres; the route server ignores it."""
+NO_PLACE = "urn:ogc:def:crs:EPSG::3857"
+"""CRS in Nav2's own graphs, with which QGIS shows metres that have no place on earth; the route server ignores it."""
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
@@ -76,6 +77,7 @@ def _dump(value: Any) -> bytes:
 class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.context = context
+        self.datum = layers.datum
         self.document = source_document(layers, NAME)
         self.net: MergedNetwork = merge_networks(layers, context)
         if not self.net.nodes or not self.net.edges:
@@ -134,9 +136,11 @@ class _Writer:
         head = {w: v for w, v in members.items() if w not in ("type", "features")} if isinstance(members, dict) else {}
         if not self.document:
             title = self.options.graph_name or self.context.title
-            head = {"name": title, "crs": CRS}
+            # GDAL and QGIS take WKT as a name, and so show the metres where they are on earth.
+            crs = NO_PLACE if self.datum is None else local_crs_wkt(self.datum)
+            head = {"name": title, "crs": {"type": "name", "properties": {"name": crs}}}
             self.context.fill("name", title, "no source specifies it", "graph_name")
-            self.context.fill("crs", CRS["properties"], "QGIS displays metres with it; the route server ignores it")
+            self.context.fill("crs", {"name": crs}, "QGIS displays metres with it; the route server ignores it")
         if self.context.attribution and not head.keys() & {"attribution", "license", "copyright"}:
             head["attribution"] = "; ".join(self.context.attribution)
         return head

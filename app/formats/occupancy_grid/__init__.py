@@ -77,6 +77,9 @@ def options_from_filename(name: str) -> dict[str, str]:
 
     ``keepout.png`` also selects PNG, ``keepout.tif`` GeoTIFF.
     """
+    for end in (".pgw", ".png.aux.xml"):
+        if name.endswith(end) and len(name) > len(end):
+            return {"grid": name.removesuffix(end), "file_type": "png", "world_file": "true"}
     stem, _, end = name.rpartition(".")
     if f".{end}" in YAML_ENDS:
         stem = stem.removesuffix(_masks.SUFFIX)
