@@ -48,6 +48,14 @@ IfItemMatch = Annotated[
     Header(alias="If-Match", max_length=2000, description="`ETag` of the feature, as `GET` returned it."),
 ]
 
+class SpelledName(bytes):
+    """Name of a header that is sent as it is spelled: uvicorn lowers names, and QGIS 3.40 knows only ``Location``."""
+
+    def lower(self) -> bytes:
+        """Return the name itself."""
+        return self
+
+
 Edit = Callable[[FeatureEditor], Mapping[str, Any]]
 
 
@@ -174,7 +182,9 @@ async def create_item(
 
     after = await _write(service, principal, collection, content_crs, edit)
     location = after.url("collections", collection, "items", created[0])
-    return Response(status_code=201, headers={"location": location})
+    response = Response(status_code=201)
+    response.raw_headers.append((SpelledName(b"Location"), location.encode()))
+    return response
 
 
 @router.put(
