@@ -48,6 +48,7 @@ IfItemMatch = Annotated[
     Header(alias="If-Match", max_length=2000, description="`ETag` of the feature, as `GET` returned it."),
 ]
 
+
 class SpelledName(bytes):
     """Name of a header that is sent as it is spelled: uvicorn lowers names, and QGIS 3.40 knows only ``Location``."""
 
@@ -306,10 +307,10 @@ def _conformance(service: Service) -> tuple[str, ...]:
     return tuple(f"{PART4}/{name}" for name in names) if service.draft is not None else ()
 
 
-async def _paths(service: Service) -> Mapping[str, Mapping[str, object]]:
+async def _paths(service: Service) -> Mapping[str, object]:
     if service.draft is None:
         return {}
-    out: dict[str, Mapping[str, object]] = {}
+    out: dict[str, object] = {}
     for name in await tables(service):
         suffix = name.title().replace("-", "")
         title = TITLES[name][1]
