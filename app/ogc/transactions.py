@@ -135,7 +135,20 @@ async def _check_item(service: Service, collection: str, feature: str, if_match:
 _BODY: Mapping[str, Any] = {
     "requestBody": {
         "required": True,
-        "content": {"application/geo+json": {"schema": {"type": "object", "description": "GeoJSON Feature."}}},
+        "content": {
+            "application/geo+json": {
+                "schema": {"type": "object", "description": "GeoJSON Feature."},
+                "examples": {
+                    "node": {
+                        "value": {
+                            "type": "Feature",
+                            "geometry": {"type": "Point", "coordinates": [5.6135, 52.4206]},
+                            "properties": {"name": "well"},
+                        }
+                    }
+                },
+            }
+        },
     }
 }
 _PATCH_BODY: Mapping[str, Any] = {
@@ -143,7 +156,8 @@ _PATCH_BODY: Mapping[str, Any] = {
         "required": True,
         "content": {
             MERGE_PATCH: {
-                "schema": {"type": "object", "description": "`geometry` and `properties` to change (RFC 7396)."}
+                "schema": {"type": "object", "description": "`geometry` and `properties` to change (RFC 7396)."},
+                "examples": {"name": {"value": {"properties": {"name": "north gate"}}}},
             }
         },
     }
