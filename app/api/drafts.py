@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import orjson
 from fastapi import Path
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Editor, Principal
@@ -21,6 +21,7 @@ from app.api.http.schemas import (
     ProblemOut,
     RequestModel,
     VersionOut,
+    component_schemas,
     problem_responses,
 )
 from app.api.versions import Change
@@ -32,6 +33,8 @@ from app.store.values import Draft
 class DraftCreateBody(RequestModel):
     """New draft with the content of the head."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"name": "new lanes"}]})
+
     name: str | None = Field(
         None, min_length=1, max_length=MAX_NAME, description="Name, unique among yours. Default: `draft 1`, `draft 2` …"
     )
@@ -40,11 +43,34 @@ class DraftCreateBody(RequestModel):
 class DraftEditsBody(RequestModel):
     """Changes to a draft that are made together, or not at all, as in `POST …/edits`."""
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "changes": [
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "well",
+                                "geometry": {"type": "Point", "coordinates": [5.6135, 52.4207]},
+                                "properties": {"kind": "node", "name": "well"},
+                            },
+                        }
+                    ]
+                }
+            ]
+        },
+    )
+
     changes: list[Change] = Field(min_length=1, max_length=100_000)
 
 
 class RebaseBody(RequestModel):
     """How to put a draft on top of the head."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"prefer": "draft"}]})
 
     prefer: Literal["draft", "head"] | None = Field(
         None, description="Side that wins where both changed the same. Default: such places are conflicts."
@@ -53,6 +79,8 @@ class RebaseBody(RequestModel):
 
 class DraftCommitBody(RequestModel):
     """Reason of the new version."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"message": "lanes of the new shed"}]})
 
     message: str = Field("", max_length=MAX_TEXT, description="Default: the name of the draft.")
 
@@ -100,9 +128,7 @@ class RebaseConflictsOut(ProblemOut):
 
 MAX_CONFLICTS = 1000
 
-DraftPath = Annotated[
-    str, Path(pattern=r"^[0-9a-f]{16}$", description="Id of the draft.", examples=["0123456789abcdef"])
-]
+DraftPath = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", description="Id of the draft.")]
 
 router = api_router("drafts", "/environments/{env}/drafts")
 
@@ -166,11 +192,9 @@ def edit_draft(
 
 @router.post(
     "/{draft}/rebase",
-    responses={
-        **problem_responses(DraftOut, 400, 404, 412, 415),
-        409: {"model": RebaseConflictsOut, "description": "The draft and the head changed the same differently."},
-    },
+    responses=problem_responses(DraftOut, 400, 404, 409, 412, 415),
     summary="Rebase a draft",
+    openapi_extra=component_schemas(RebaseConflictsOut),
 )
 def rebase_draft(
     env: EnvironmentPath,
@@ -182,8 +206,8 @@ def rebase_draft(
 ) -> Response:
     """Put a draft's changes on top of the head, by a merge of single properties, shapes and cells.
 
-    What both changed differently since the draft's base is a conflict, and nothing changes: edit these places of the
-    draft, or give `prefer`. Edges that would lose a node are conflicts in any case.
+    What both changed differently since the draft's base is a conflict (409, as `RebaseConflictsOut`), and nothing
+    changes: edit these places of the draft, or give `prefer`. Edges that would lose a node are conflicts in any case.
     """
     result = services.ingest.drafts.rebase(env, draft, principal.as_writer(), if_match, body.prefer)
     return _conflicts(result) if result.conflicts else _response(result.draft, principal)

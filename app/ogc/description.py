@@ -98,7 +98,7 @@ def operation(
     media_types: Iterable[str],
     parameters: Sequence[str] = ("f",),
     further: Sequence[Mapping[str, object]] = (),
-) -> Mapping[str, object]:
+) -> dict[str, object]:
     """Build the path item of a ``GET``. parameters: names in PARAMETERS; further: parameters of this path only."""
     problem = {"description": "Error", "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}}
     content = {media: {"schema": {"type": "string"} if media == HTML else {"type": "object"}} for media in media_types}
@@ -118,7 +118,7 @@ def operation(
 
 async def openapi_document(service: Service) -> dict[str, Any]:
     """Build the OpenAPI document of a service."""
-    paths: dict[str, Mapping[str, object]] = {
+    paths: dict[str, object] = {
         "/": operation("getLandingPage", "Landing page", (JSON, HTML)),
         "/conformance": operation("getConformance", "Conformance classes", (JSON, HTML)),
         "/api": operation("getApi", "This document", (OPENAPI, HTML)),
@@ -126,7 +126,8 @@ async def openapi_document(service: Service) -> dict[str, Any]:
     }
     for one in extensions():
         for path, item in (await one.paths(service)).items():
-            paths[path] = {**paths.get(path, {}), **item}
+            before = paths.get(path)  # another module has other methods of the same path
+            paths[path] = {**before, **item} if isinstance(before, Mapping) and isinstance(item, Mapping) else item
     text = {"type": "string"}
     problem = {
         "type": "object",

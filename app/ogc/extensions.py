@@ -45,7 +45,7 @@ def _no_conformance(_: Service) -> Sequence[str]:
     return ()
 
 
-async def _no_paths(_: Service) -> Mapping[str, Mapping[str, object]]:
+async def _no_paths(_: Service) -> Mapping[str, object]:
     return {}
 
 
@@ -66,7 +66,7 @@ class Extension:
     collections: Callable[[Service], Awaitable[Sequence[Collection]]] = _no_collections
     landing_links: Callable[[Service], Sequence[Link]] = _no_links
     collection_links: Callable[[Service, str], Sequence[Link]] = _no_collection_links
-    paths: Callable[[Service], Awaitable[Mapping[str, Mapping[str, object]]]] = _no_paths
+    paths: Callable[[Service], Awaitable[Mapping[str, object]]] = _no_paths
 
 
 @cache

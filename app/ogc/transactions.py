@@ -48,6 +48,15 @@ IfItemMatch = Annotated[
     Header(alias="If-Match", max_length=2000, description="`ETag` of the feature, as `GET` returned it."),
 ]
 
+
+class SpelledName(bytes):
+    """Name of a header that is sent as it is spelled: uvicorn lowers names, and QGIS 3.40 knows only ``Location``."""
+
+    def lower(self) -> bytes:
+        """Return the name itself."""
+        return self
+
+
 Edit = Callable[[FeatureEditor], Mapping[str, Any]]
 
 
@@ -126,7 +135,20 @@ async def _check_item(service: Service, collection: str, feature: str, if_match:
 _BODY: Mapping[str, Any] = {
     "requestBody": {
         "required": True,
-        "content": {"application/geo+json": {"schema": {"type": "object", "description": "GeoJSON Feature."}}},
+        "content": {
+            "application/geo+json": {
+                "schema": {"type": "object", "description": "GeoJSON Feature."},
+                "examples": {
+                    "node": {
+                        "value": {
+                            "type": "Feature",
+                            "geometry": {"type": "Point", "coordinates": [5.6135, 52.4206]},
+                            "properties": {"name": "well"},
+                        }
+                    }
+                },
+            }
+        },
     }
 }
 _PATCH_BODY: Mapping[str, Any] = {
@@ -134,7 +156,8 @@ _PATCH_BODY: Mapping[str, Any] = {
         "required": True,
         "content": {
             MERGE_PATCH: {
-                "schema": {"type": "object", "description": "`geometry` and `properties` to change (RFC 7396)."}
+                "schema": {"type": "object", "description": "`geometry` and `properties` to change (RFC 7396)."},
+                "examples": {"name": {"value": {"properties": {"name": "north gate"}}}},
             }
         },
     }
@@ -174,7 +197,9 @@ async def create_item(
 
     after = await _write(service, principal, collection, content_crs, edit)
     location = after.url("collections", collection, "items", created[0])
-    return Response(status_code=201, headers={"location": location})
+    response = Response(status_code=201)
+    response.raw_headers.append((SpelledName(b"Location"), location.encode()))
+    return response
 
 
 @router.put(
@@ -296,10 +321,10 @@ def _conformance(service: Service) -> tuple[str, ...]:
     return tuple(f"{PART4}/{name}" for name in names) if service.draft is not None else ()
 
 
-async def _paths(service: Service) -> Mapping[str, Mapping[str, object]]:
+async def _paths(service: Service) -> Mapping[str, object]:
     if service.draft is None:
         return {}
-    out: dict[str, Mapping[str, object]] = {}
+    out: dict[str, object] = {}
     for name in await tables(service):
         suffix = name.title().replace("-", "")
         title = TITLES[name][1]

@@ -86,8 +86,8 @@ async def _collections(service: Service) -> Sequence[Collection]:
 ITEMS_PARAMETERS = ("limit", "bbox", "datetime", "bbox-crs", "crs", "cursor", "f")
 
 
-async def _paths(service: Service) -> Mapping[str, Mapping[str, object]]:
-    out: dict[str, Mapping[str, object]] = {}
+async def _paths(service: Service) -> Mapping[str, object]:
+    out: dict[str, object] = {}
     for name, table in (await tables(service)).items():
         base, title = f"/collections/{name}", TITLES[name][1]
         suffix = name.title().replace("-", "")

@@ -46,12 +46,14 @@ def prepare_further(
 ) -> Prepared:
     """Prepare changes on top of an uncommitted version, as a change of the version that it is based on."""
     with gc_paused():
-        made = _prepare(draft, current, changes, is_intact)
-        before, after = ({entry.key: entry for entry in parts} for parts in (base.parts, made.parts))
+        prepared = _prepare(draft, current, changes, is_intact)
+        before, after = ({entry.key: entry for entry in parts} for parts in (base.parts, prepared.parts))
         summary, _ = summarise(draft, before, after)
-    summary |= frame_changes(base.datum, made.datum, base.levels, made.levels)
-    summary |= template_changes(base.templates, made.templates)
-    return replace(made, base=base.number, changes=summary, changed=made.root != base.root, index=None, area=None)
+    summary |= frame_changes(base.datum, prepared.datum, base.levels, prepared.levels)
+    summary |= template_changes(base.templates, prepared.templates)
+    return replace(
+        prepared, base=base.number, changes=summary, changed=prepared.root != base.root, index=None, area=None
+    )
 
 
 def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:

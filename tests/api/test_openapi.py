@@ -81,7 +81,12 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
            *(f"{of}{path}" for of in ("", "/collections/{collection}") for path in (
                "/map", "/tiles", "/tiles/{tms}", "/tiles/{tms}/{z}/{row}/{col}",
                "/map/tiles", "/map/tiles/{tms}", "/map/tiles/{tms}/{z}/{row}/{col}")))  # fmt: skip
-    wanted |= {start + path: "get" for start in ("/ogc/{env}", "/ogc/{env}/versions/{v}") for path in ogc}
+    draft = "/ogc/{env}/drafts/{draft}"
+    wanted |= {start + path: "get" for start in ("/ogc/{env}", "/ogc/{env}/versions/{v}", draft) for path in ogc}
+    wanted[f"{draft}/collections/{{collection}}/items"] = "get post"
+    wanted[f"{draft}/collections/{{collection}}/items/{{feature}}"] = "get put patch delete"
+    wanted |= {f"{e}/drafts": "get post", f"{e}/drafts/{{draft}}": "get delete"}
+    wanted |= {f"{e}/drafts/{{draft}}/{work}": "post" for work in ("edits", "rebase", "commit")}
     by_format = {f"/maps/{{env}}/{fmt.name}" for fmt in all_formats().values() if fmt.write}
     assert by_format < set(schema["paths"])
     assert {path: " ".join(sorted(item, key=["get", "post", "put", "patch", "delete"].index))
@@ -191,6 +196,15 @@ def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]
     return out or [{}]
 
 
+def draft_of(api: Api) -> str:
+    """Create a draft with a change."""
+    made: str = api.post("environments/orchard/drafts", {}).json()["id"]
+    feature = {"type": "Feature", "id": made, "geometry": {"type": "Point", "coordinates": [5.6135, 52.4206]}}
+    changes = [{"op": "put", "layer": "objects", "feature": {**feature, "properties": {"kind": "pole"}}}]
+    api.post(f"environments/orchard/drafts/{made}/edits", {"changes": changes}, 200)
+    return made
+
+
 def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path) -> None:
     resource_ids: dict[str, str] = {}
     job = api.app.state.services.store.jobs.create(owner="", detail="an example")
@@ -210,6 +224,8 @@ def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path)
             if path.endswith(("/end", "/keep")):
                 blocked["state"] = "accepted"
             resource_ids[path] = api("POST", "environments/orchard/overlays", None, json=blocked).json()["id"]
+        if path.startswith("/api/v1/environments/{env}/drafts/{draft}"):
+            resource_ids[path] = draft_of(api)
         if path.endswith("/sources/{name}"):
             api.upload("orchard", UPLOADED)
         if path == "/api/v1/environments/{env}/derivations":
@@ -226,6 +242,8 @@ def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path)
                 target = target.replace("{" + parameter["name"] + "}", str(value))
             elif parameter["in"] == "query" and value is not None:
                 query[parameter["name"]] = value
+        if method == "delete" and path.startswith("/ogc/"):
+            target = re.sub("/nodes/items/.*", "/edges/items/Dock1_Yard1", target)  # nodes with edges stay
         if path == "/api/v1/events":
             query["follow"] = "false"  # otherwise it would not end
         for body in bodies_of(schema, op):

@@ -78,11 +78,7 @@ function Row({ site, draft, drafts, onDelete }: RowProps) {
         <small>{changes.length ? changes.join("; ") : "No changes yet"}</small>
       </div>
       <div class="actions">
-        {changes.length > 0 && (
-          <Button onClick={() => go({ from: draft.base, to: draft.version })} label={`Review ${draft.name}`}>
-            Review
-          </Button>
-        )}
+        {changes.length > 0 && <Button onClick={() => go({ from: draft.base, to: draft.version })}>Review</Button>}
         {mayWrite && draft.behind && (
           <Button icon={GitMerge} busy={busy} disabled={!online.value} onClick={() => void run(rebase)}>
             Merge with v{draft.head}
