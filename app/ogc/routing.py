@@ -109,7 +109,7 @@ def both(
     return register
 
 
-def _with_service(handler: Handler, dependency: Callable[..., Awaitable[Service]], suffix: str) -> Handler:
+def _with_service(handler: Handler, dependency: Callable[..., Service | Awaitable[Service]], suffix: str) -> Handler:
     """Return a handler whose parameter of type Service is injected by a dependency."""
     hints = get_type_hints(handler, include_extras=True)
 

@@ -85,7 +85,7 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
     wanted |= {start + path: "get" for start in ("/ogc/{env}", "/ogc/{env}/versions/{v}", draft) for path in ogc}
     wanted[f"{draft}/collections/{{collection}}/items"] = "get post"
     wanted[f"{draft}/collections/{{collection}}/items/{{feature}}"] = "get put patch delete"
-    wanted |= {f"{e}/drafts": "get post", f"{e}/drafts/{{draft}}": "get delete"}
+    wanted |= {f"{e}/overlays/{{id}}": "patch", f"{e}/drafts": "get post", f"{e}/drafts/{{draft}}": "get delete"}
     wanted |= {f"{e}/drafts/{{draft}}/{work}": "post" for work in ("edits", "rebase", "commit")}
     by_format = {f"/maps/{{env}}/{fmt.name}" for fmt in all_formats().values() if fmt.write}
     assert by_format < set(schema["paths"])
@@ -218,10 +218,10 @@ def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path)
         if path == "/api/v1/environments/{env}/channels/{channel}/planned":
             body = {"version": 1, "activate_at": "2099-01-01T00:00:00Z"}
             api("PUT", "environments/orchard/channels/production", 200, json=body)
-        if "/overlays/{id}/" in path:
+        if "/overlays/{id}" in path:
             ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
             blocked = {"kind": "blocked", "crs": "local", "polygon": {"type": "Polygon", "coordinates": [ring]}}
-            if path.endswith(("/end", "/keep")):
+            if path.endswith(("/{id}", "/end", "/keep")):
                 blocked["state"] = "accepted"
             resource_ids[path] = api("POST", "environments/orchard/overlays", None, json=blocked).json()["id"]
         if path.startswith("/api/v1/environments/{env}/drafts/{draft}"):
