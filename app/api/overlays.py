@@ -41,6 +41,8 @@ MAX_SECONDS = 2_592_000.0
 class EndBody(RequestModel):
     """End of a closure: from now, or a time."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"ttl_seconds": 7200}]})
+
     ttl_seconds: float | None = Field(
         None,
         ge=1,
