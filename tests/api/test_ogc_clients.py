@@ -46,9 +46,11 @@ os._exit(0)  # QGIS crashes when it is torn down after its layers
 GDAL = """
 import json, sys
 import pyogrio, shapely
-url, utm = sys.argv[1:]
+url, utm, wanted = sys.argv[1:]
 out = {}
 for name in pyogrio.list_layers(url)[:, 0].tolist():
+    if name not in wanted.split(","):
+        continue
     meta, _, geometry, fields = pyogrio.raw.read(url, layer=name)
     levels = fields[meta["fields"].tolist().index("level")].tolist()
     points, projected = (
@@ -129,7 +131,7 @@ def test_gdal_opens_every_collection(server: Api, site: str) -> None:
     names = names_of(server, site)
     crs = server.get(f"/ogc/{site}/collections/nodes").json()["crs"]
     utm = next(uri for uri in crs if "/EPSG/0/32" in uri)
-    command = [sys.executable, "-W", "ignore", "-c", GDAL, f"OAPIF:{server.url}/ogc/{site}", utm]
+    command = [sys.executable, "-W", "ignore", "-c", GDAL, f"OAPIF:{server.url}/ogc/{site}", utm, ",".join(names)]
     env = {**os.environ, "GDAL_HTTP_USERPWD": f"any:{ADMIN}"}
     result = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=240)
     assert result.returncode == 0, result.stderr[-2000:]
@@ -163,7 +165,9 @@ def test_ogrinfo_counts_every_collection(server: Api, site: str) -> None:
             name = value
         elif key == "Feature Count":
             counts[name] = int(value)
-    assert counts == {name: len(layer_features(server, site, name)) for name in names_of(server, site)}
+    names = names_of(server, site)
+    counts = {name: count for name, count in counts.items() if name in names}
+    assert counts == {name: len(layer_features(server, site, name)) for name in names}
 
 
 def test_qgis_opens_every_collection(server: Api, site: str, tmp_path: Path) -> None:
