@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from tests.web.conftest import Open, WebServer, check_accessibility
+from tests.web.conftest import TABLET, Open, WebServer, check_accessibility, wait_until
 
 RESOLUTION = 0.02
 """Metres per pixel of the map in the tests that point at it."""
@@ -181,6 +181,22 @@ def test_streets_and_areas_are_closed_on_the_map(server: WebServer, site: str, o
     viewer = open_page(f"/?site={site}&view=fleet&fleet=closures", token=server.make_token("viewer")["token"])
     expect(viewer.get_by_text("Ended in the last 30 days")).to_be_visible()
     expect(viewer.get_by_role("button", name="Close a street")).to_have_count(0)
+
+
+def test_a_long_press_starts_closing_a_street(server: WebServer, site: str, open_page: Open) -> None:
+    edge, back, (x, y) = two_way_street(server, site)
+    page = open_page(f"/?site={site}&view=fleet&at={x},{y},{RESOLUTION}", size=TABLET, has_touch=True)
+    page.get_by_role("tab", name="Closures").wait_for()
+    wait_until(page, "document.querySelectorAll('.painted-layer:not([hidden])').length > 2")
+    box = page.get_by_role("application").bounding_box()
+    assert box is not None
+    centre = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    session = page.context.new_cdp_session(page)
+    session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [centre]})
+    form = page.get_by_role("form", name="Close a street")
+    expect(form).to_be_visible()
+    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    expect(form.get_by_role("combobox").first).to_have_value(re.compile(f"{edge['id']}|{back['id']}"))
 
 
 def test_the_map_as_a_robot_held_it(server: WebServer, site: str, open_page: Open) -> None:

@@ -148,7 +148,7 @@ function FormatList({ all, shown }: { all: TableRow[]; shown: TableRow[] }) {
           Full table
         </Button>
       </header>
-      <div class="filters">
+      <div class="find">
         <input
           type="search"
           aria-label="Search formats"

@@ -3,6 +3,7 @@ import { computed, effect, type Signal, signal } from "@preact/signals";
 import { go, param } from "../../address";
 import type { FeatureLayer } from "../../map/feature-layer";
 import { type Feature, FeatureIndex, linesOf, type Position } from "../../map/features";
+import { MenuPress } from "../../map/menu-press";
 import type { SiteMap } from "../../map/site-map";
 import { can } from "../../session";
 import { colour, theme } from "../../theme";
@@ -34,6 +35,7 @@ export class FleetMap {
   private readonly route: FeatureLayer;
   private readonly closures: FeatureLayer;
   private readonly drawn: FeatureLayer;
+  private readonly menu: MenuPress;
   private readonly stops: (() => void)[];
 
   constructor(
@@ -46,11 +48,9 @@ export class FleetMap {
     this.robots = new RobotLayer({ zIndex: 23 });
     map.map.addLayer(this.robots);
     map.onPick = (feature, point, event) => this.pick(feature, point, event);
-    const viewport = map.map.getViewport();
-    const menu = (event: MouseEvent) => this.closeStreet(event);
-    viewport?.addEventListener("contextmenu", menu);
+    this.menu = new MenuPress(map.map.getViewport() as HTMLElement, (event) => this.closeStreet(event));
     this.stops = [
-      () => viewport?.removeEventListener("contextmenu", menu),
+      () => this.menu.close(),
       effect(() => this.showRobots()),
       effect(() => this.showClosures()),
       effect(() => this.showRoute()),
@@ -94,6 +94,7 @@ export class FleetMap {
   }
 
   private pick(feature: Feature | null, point: Position, event: MouseEvent | PointerEvent): boolean {
+    if (this.menu.isOpened) return true;
     if (this.onTap) {
       this.onTap(feature, point);
       return true;

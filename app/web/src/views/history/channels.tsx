@@ -69,7 +69,7 @@ function ChannelRow({ site, channel }: { site: Site; channel: Channel }) {
   const { robots, version, channel: name } = channel;
   const isBack = typeof earlier === "number" && version !== null && earlier < version;
   return (
-    <li class="channel" aria-label={`Channel ${name}`}>
+    <li class="channel-row" aria-label={`Channel ${name}`}>
       <div class="channel-head">
         <span class="grow">
           <b>{name}</b>{" "}

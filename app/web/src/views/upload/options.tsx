@@ -60,7 +60,7 @@ export function Options({ desk, site, formats, dry }: Props) {
             ))}
           </select>
         </label>
-        <fieldset class="modes">
+        <fieldset class="how">
           <legend>What these files do</legend>
           {(
             [
