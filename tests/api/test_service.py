@@ -79,7 +79,7 @@ def test_formats_lists_options(api: Api) -> None:
     assert formats["kml"]["information"]["occupancy"] == "derived", "a KML places a grid, but does not contain it"
     assert formats["kml"]["information"]["topology"] in ("raw", "derived")
     option = next(o for o in grid["options"] if o["name"] == "file_type")
-    assert option["schema"]["enum"] == ["pgm", "png"]
+    assert option["schema"]["enum"] == ["pgm", "png", "tif"]
     assert "default" in option
     assert option["for"] == "write"
     assert option["description"]

@@ -397,8 +397,9 @@ def test_invalid_networks_are_refused(tmp_path: Path, networks: str) -> None:
     ],
 )
 def test_cookie_header_is_parsed(cookie: bytes, session: bytes | None) -> None:
-    assert Credentials.from_headers(None, cookie, {"type": "http"}).session == session
-    assert Credentials.from_headers(b"Bearer x", cookie, {"type": "http"}).session is None
+    scope = {"type": "http", "path": f"{API}/formats"}
+    assert Credentials.from_headers(None, cookie, scope).session == session
+    assert Credentials.from_headers(b"Bearer x", cookie, scope).session is None
 
 
 def test_many_requests_of_one_session_look_it_up_once(api: Api, browser: Browser, monkeypatch: Any) -> None:
