@@ -39,7 +39,7 @@ _ZIP64, _UNICODE_PATH = 0x0001, 0x7075
 _CHUNK = 2**20
 
 _TEXTS = (
-    *(".kml", ".xml", ".osm", ".sdf", ".world", ".dae"),
+    *(".kml", ".xml", ".osm", ".sdf", ".world", ".dae", ".gml", ".dxf"),
     *(".yaml", ".yml", ".json", ".geojson", ".ron", ".lif", ".tmap2", ".tmap", ".csv"),
 )
 _TEXT_COST = 2

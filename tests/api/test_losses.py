@@ -133,7 +133,9 @@ def test_long_comparison_is_a_job(tmp_path: Path) -> None:
             time.sleep(0.05)
             answer = api.get(path, None)
         assert answer.json()["features"] == []
-        done = api.get(f"jobs/{job['id']}").json()
+        while (done := api.get(f"jobs/{job['id']}").json())["state"] == "running":
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
         assert (done["state"], done["result"]["location"]) == ("done", f"/api/v1/{path}")
 
 

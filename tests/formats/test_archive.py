@@ -244,7 +244,7 @@ def test_large_members_round_trip():
     assert archives.unpack(archives.pack(files), Limits()) == files
 
 
-BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", ".pcd", ".ply")
+BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", ".pcd", ".ply", ".shp", ".gpkg", ".fgb")
 
 
 def test_text_limits_apply_to_files_of_all_formats():
