@@ -66,7 +66,8 @@ async def get_landing_page(service: Service, f: Representation = None) -> Respon
     if used == "json":
         return service.respond_json({**document, "links": links})
     root, body = page(service.title)
-    add(body, "p", service.environment.description or service.description)
+    if service.environment.description:
+        add(body, "p", service.environment.description)
     add(body, "p", service.description, class_="soft")
     if credits_:
         add(body, "p", credits_, class_="soft")
