@@ -54,10 +54,10 @@ def rows(tries: int) -> list[dict[str, Any]]:
         started = time.process_time()
         connection.get(f"{url}?limit=1")
         first = (time.process_time() - started) * 1e3
-        asked = f"{url}?limit=10000&bbox={','.join(map(repr, box))}"
-        matched = orjson.loads(connection.get(asked))["numberMatched"]
+        box_url = f"{url}?limit=10000&bbox={','.join(map(repr, box))}"
+        matched = orjson.loads(connection.get(box_url))["numberMatched"]
         theirs, ours = _in_turns(
-            lambda: store.content.features(version, KEY, bbox=box, crs="wgs84"), lambda: connection.get(asked), tries
+            lambda: store.content.features(version, KEY, bbox=box, crs="wgs84"), lambda: connection.get(box_url), tries
         )
         page_url = f"{url}?limit={PAGE}"
         page = orjson.loads(connection.get(page_url))
