@@ -154,7 +154,7 @@ def _feature_source(service: Service, name: str) -> str:
 def _raster_source(service: Service, name: str) -> str:
     values = {"crs": "EPSG:3857", "format": PNG, "layers": name, "styles": "default",
               "tileMatrixSet": wmts.SET.id, "url": wmts.url(service)}  # fmt: skip
-    return urlencode(values)
+    return urlencode(values, safe=":/@")  # QGIS 3.40 takes these as they are, and does not decode them
 
 
 def definition_file(service: Service, collections: list[Collection]) -> bytes:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from PIL import Image
 
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
+from tests import qgis
 from tests.api.conftest import Api, running, settings_for
 from tests.api.samples import NODES, tmap2
 
@@ -331,12 +331,7 @@ def test_gdal_opens_the_wmts_document(open_site: tuple[Api, str], monkeypatch: p
     assert max(shades[:3]) < 110, "the wall is dark where geodesy says"
 
 
-QGIS = Path("/usr/bin/python3")
 OPEN = """
-import json, sys
-from qgis.core import *
-application = QgsApplication([], False)
-application.initQgis()
 project = QgsProject.instance()
 done, problem = QgsLayerDefinition.loadLayerDefinition(sys.argv[1], project, project.layerTreeRoot())
 rows = []
@@ -346,27 +341,19 @@ for layer in project.layerTreeRoot().layerOrder():
     rows.append({"name": layer.name(), "valid": layer.isValid(), "crs": layer.crs().isValid(),
                  "renderer": type(layer.renderer()).__name__,
                  "box": [box.xMinimum(), box.yMinimum(), box.xMaximum(), box.yMaximum()]})
-print("RESULT" + json.dumps({"done": done, "problem": problem, "rows": rows}))
+answer({"done": done, "problem": problem, "rows": rows})
 """
 
 
 def test_qgis_opens_the_layer_definition(open_site: tuple[Api, str], tmp_path: Path) -> None:
     api, site = open_site
-    environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "XDG_RUNTIME_DIR": str(tmp_path)}
-    environment.pop("PYTHONPATH", None)
-    there = QGIS.exists() and subprocess.run([QGIS, "-c", "import qgis.core"], env=environment, capture_output=True)
-    if not there or there.returncode:
-        pytest.skip("python3-qgis is not installed")
     answer = api.get(f"/ogc/{site}/versions/3/layers.qlr")
     assert answer.headers["content-type"] == "application/x-qgis-layer-definition"
     assert answer.content.count(f"/ogc/{site}/versions/3/".encode()) >= 3
     assert api.token is not None
     assert api.token.encode() not in answer.content
     (tmp_path / "site.qlr").write_bytes(answer.content)
-    command = [str(QGIS), "-c", OPEN, str(tmp_path / "site.qlr")]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    (line,) = [line for line in done.stdout.splitlines() if line.startswith("RESULT")] or [done.stderr[-2000:]]
-    result = json.loads(line.removeprefix("RESULT"))
+    result = qgis.run(OPEN, tmp_path / "site.qlr", folder=tmp_path)
     assert (result["done"], result["problem"]) == (True, "")
     assert [row["name"] for row in result["rows"]] == ["Nodes", "Edges", "Grid map"]
     assert [row["renderer"] for row in result["rows"]][:2] == ["QgsSingleSymbolRenderer", "QgsRuleBasedRenderer"]

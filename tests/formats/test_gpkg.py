@@ -25,13 +25,13 @@ from app.model.features import NO_GEOMETRY, Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import NETWORK, SITE, ZONES, Layers, PartKey
 from app.parameters import parse
+from tests import qgis
 
 FMT = formats.get_format("gpkg")
 SAMPLE = Path(__file__).parents[1] / "samples" / "gpkg" / "field.gpkg"
 HOME = PartKey("objects", "ground", "gpkg")
 TOPOLOGY = PartKey("topology", "ground", NETWORK)
 DATUM = Datum(53.2686, -0.5245, heading=30.0)
-QGIS = Path("/usr/bin/python3")
 
 
 def read(data: bytes, context: ReadContext | None = None, **options: Any) -> Layers:
@@ -162,10 +162,7 @@ def test_gdal_places_metres_within_a_millimetre(tmp_path: Path) -> None:
 
 
 _LOOK = """
-import sys
-from qgis.core import QgsApplication, QgsCoordinateReferenceSystem, QgsCoordinateTransform, QgsProject, QgsVectorLayer
-app = QgsApplication([], False)
-app.initQgis()
+rows = []
 for table in sys.argv[2:]:
     layer = QgsVectorLayer(f"{sys.argv[1]}|layername={table}", table, "ogr")
     _, ok = layer.loadDefaultStyle()
@@ -173,27 +170,22 @@ for table in sys.argv[2:]:
     to = QgsCoordinateTransform(layer.crs(), QgsCoordinateReferenceSystem("EPSG:4326"), QgsProject.instance())
     corner = next(layer.getFeatures()).geometry().vertexAt(0)
     point = to.transform(corner.x(), corner.y())
-    print(table, layer.isValid(), layer.featureCount(), ok, symbol, repr(point.x()), repr(point.y()))
+    rows.append([table, layer.isValid(), layer.featureCount(), ok, symbol, point.x(), point.y()])
+answer(rows)
 """
 
 
 def test_qgis_shows_arrows_at_the_right_place(tmp_path: Path) -> None:
-    if subprocess.run([QGIS, "-c", "import qgis.core"], capture_output=True, check=False).returncode:
-        pytest.skip("python3-qgis is missing")
     path = tmp_path / "a.gpkg"
     path.write_bytes(write(site_layers(DATUM)))
-    environment = {"QT_QPA_PLATFORM": "offscreen", "HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [QGIS, "-c", _LOOK, path, "edges", "nodes", "zones", "fence_wgs84"]
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False, timeout=120)
-    lines = [line.split() for line in run.stdout.splitlines()]
+    lines = qgis.run(_LOOK, path, "edges", "nodes", "zones", "fence_wgs84", folder=tmp_path)
     assert [line[:5] for line in lines] == [
-        ["edges", "True", "2", "True", "ArrowLine"],
-        ["nodes", "True", "2", "True", "SimpleMarker"],
-        ["zones", "True", "1", "True", "SimpleFill"],
-        ["fence_wgs84", "True", "1", "True", "SimpleFill"],
-    ], run.stderr
-    longitude, latitude = map(float, lines[1][5:])
-    assert (longitude, latitude) == pytest.approx((DATUM.longitude, DATUM.latitude), abs=1e-8)
+        ["edges", True, 2, True, "ArrowLine"],
+        ["nodes", True, 2, True, "SimpleMarker"],
+        ["zones", True, 1, True, "SimpleFill"],
+        ["fence_wgs84", True, 1, True, "SimpleFill"],
+    ]
+    assert lines[1][5:] == pytest.approx([DATUM.longitude, DATUM.latitude], abs=1e-8)
 
 
 def test_rows_added_by_gdal_belong_to_their_table(tmp_path: Path) -> None:
