@@ -44,14 +44,14 @@ def bounds_in_both_frames(entry: PartEntry, datum: Datum | None, header: Callabl
 
 
 def _raster_bounds(reader: RasterReader, frame: LocalFrame) -> Bounds:
-    local, degrees = _outline(reader.header, reader.kind, frame)
+    local, degrees = raster_outline(reader.header, reader.kind, frame)
     return {
         "local": _finite(bounding_box(local)),
         "wgs84": _finite(unwrapped_box(degrees, frame.datum.longitude)),
     }
 
 
-def _outline(
+def raster_outline(
     header: Mapping[str, Any], kind: str, frame: LocalFrame
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return points on the border of a raster in metres and in degrees."""

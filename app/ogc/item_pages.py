@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from app.ogc.pages import add, anchor, page, representations, respond_page, table
 from app.ogc.service import Link, Service
 from app.ogc.tables import Table
-from app.ogc.vector import TITLES
+from app.ogc.vector import title_of
 
 __all__ = ["item_page", "items_page", "respond_page", "schema_page"]
 
@@ -32,7 +32,7 @@ MIN_SPAN_DEGREES = 1e-5
 def _trail(service: Service, collection: str | None = None) -> list[tuple[str, str]]:
     out = [(service.title, service.landing_url), ("Collections", service.url("collections", f="html"))]
     if collection is not None:
-        out.append((TITLES[collection][1], service.url("collections", collection, f="html")))
+        out.append((title_of(service, collection), service.url("collections", collection, f="html")))
     return out
 
 
@@ -50,7 +50,7 @@ def items_page(
     service: Service, collection: str, source: Table, rows: NDArray[np.intp], matched: int, links: Sequence[Link]
 ) -> Element:
     """Build the page of a page of features."""
-    root, body = page(f"{TITLES[collection][1]}: features", _trail(service, collection))
+    root, body = page(f"{title_of(service, collection)}: features", _trail(service, collection))
     add(body, "p", f"{len(rows)} of {matched} features on this page.")
     draw_map(body, source.in_wgs84(rows))
     shown = rows[:MAX_ROWS].tolist()
@@ -88,7 +88,7 @@ def schema_page(
     service: Service, collection: str, schema: Mapping[str, Any], name: str, links: Sequence[Link]
 ) -> Element:
     """Build the page of a schema."""
-    root, body = page(f"{TITLES[collection][1]}: {name}", _trail(service, collection))
+    root, body = page(f"{title_of(service, collection)}: {name}", _trail(service, collection))
     rows = [(key, _text(one.get("type") or one.get("format"))) for key, one in schema["properties"].items()]
     table(body, ("property", "type"), rows)
     representations(body, links)

@@ -29,7 +29,7 @@ from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcFeatureOut, OgcFeaturesOut
 from app.ogc.service import Link, Service, link
 from app.ogc.tables import Table
-from app.ogc.vector import TITLES, find_table, queryables, tables
+from app.ogc.vector import find_table, queryables, tables, title_of
 
 ITEMS = {"json": GEOJSON, "jsonfg": JSONFG, "html": HTML}
 
@@ -137,7 +137,7 @@ def _page_links(service: Service, collection: str, output: Output, cursor: str |
         forward = [*((k, v) for k, v in pairs if k != "cursor"), ("cursor", cursor), ("f", output.used)]
         url = service.url("collections", collection, "items", pairs=forward)
         links.append(link(url, "next", ITEMS[output.used], "next page"))
-    title = TITLES[collection][1]
+    title = title_of(service, collection)
     links.append(link(service.url("collections", collection), "collection", PAGES["json"], title))
     return links
 
@@ -254,7 +254,9 @@ async def get_item(
     pairs = [("crs", given["crs"])] if "crs" in given else []
     url = service.url("collections", collection, "items", feature, pairs=pairs)
     links = service.alternates(url, ITEMS, output.used)
-    links.append(link(service.url("collections", collection), "collection", PAGES["json"], TITLES[collection][1]))
+    links.append(
+        link(service.url("collections", collection), "collection", PAGES["json"], title_of(service, collection))
+    )
     if output.used == "html":
         return item_pages.respond_page(service, item_pages.item_page(service, collection, table, row, links))
     (text,) = feature_texts(table, rows, output, collection)
@@ -320,7 +322,7 @@ def _schema(service: Service, collection: str, page: str, listed: dict[str, Any]
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$id": service.url("collections", collection, page),
         "type": "object",
-        "title": TITLES[collection][1],
+        "title": title_of(service, collection),
         "properties": listed,
         "additionalProperties": False,
     }

@@ -167,7 +167,7 @@ def definition_file(service: Service, collections: list[Collection]) -> bytes:
     rasters = [name for name in by_id if name not in TITLES]
     # Several grids would hide each other: only the first one is shown at the start, and so with images.
     first = {next((name for name in rasters if name.startswith(word)), "") for word in ("grid-", "image-")}
-    names += sorted(rasters, key=lambda name: (not name.startswith("grid-"), name))
+    names += sorted(rasters, key=lambda name: (not name.startswith("grid-"), name.startswith("image-"), name))
     for name in names:
         provider = "OAPIF" if name in GEOMETRY else "wms"
         source = _feature_source(service, name) if name in GEOMETRY else _raster_source(service, name)

@@ -1,23 +1,18 @@
-"""Collections of grids and images, which are served as maps and map tiles."""
+"""Collections of grids, images and voxel maps, which are served as maps and map tiles besides their outlines."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from urllib.parse import urlencode
 
-from app.api.http.responses import API
 from app.convert.preview import PreviewRequest, select_entries
 from app.convert.views import ViewContent
-from app.model.frame import GROUND
 from app.ogc.collections import unknown_collection_error
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.extensions import Collection, Extension, all_collections
-from app.ogc.extent import part_box
-from app.ogc.service import Link, Service, link, origin
-from app.ogc.vector import TITLES
+from app.ogc.footprints import WORDS, cog_url, footprint_table, raster_parts, raster_title
+from app.ogc.service import Link, Service, link
+from app.ogc.vector import TITLES, item_links
 from app.store.values import PartEntry
-
-WORDS = {"occupancy": ("grid", "Grid"), "imagery": ("image", "Image")}
 
 SHAPE_TYPES = {
     "nodes": {0, 4},
@@ -32,27 +27,10 @@ SHAPE_TYPES = {
 TIFF = "image/tiff; application=geotiff; profile=cloud-optimized"
 
 
-def raster_parts(service: Service) -> dict[str, PartEntry]:
-    """Return the grids and images of a version by id of their collection."""
-    out: dict[str, PartEntry] = {}
-    for entry in service.version.parts:
-        if entry.key.layer in WORDS and entry.count:
-            level = "" if entry.key.level == GROUND else f"@{entry.key.level}"
-            name = f"{WORDS[entry.key.layer][0]}-{entry.key.name}{level}"
-            out[name if name not in out else f"{name}#{len(out)}"] = entry
-    return out
-
-
-def cog_url(service: Service, entry: PartEntry) -> str:
-    """Return the absolute URL of a raster as cloud optimized GeoTIFF, with its place on earth."""
-    kind, option = ("occupancy_grid", "grid") if entry.key.layer == "occupancy" else ("satellite", "picture")
-    query = urlencode({option: entry.key.name, "level": entry.key.level, "file_type": "tif"})
-    server = origin(service.request, service.services.options.public_url)
-    return f"{server}{API}/environments/{service.environment.name}/versions/{service.version.ref}/maps/{kind}?{query}"
-
-
-def _links(service: Service, entry: PartEntry) -> list[Link]:
-    return [link(cog_url(service, entry), "enclosure", TIFF, "GeoTIFF with its place on earth")]
+def _links(service: Service, name: str, entry: PartEntry) -> list[Link]:
+    cog = cog_url(service, entry)
+    shown = [link(cog, "enclosure", TIFF, "GeoTIFF with its place on earth")] if cog is not None else []
+    return [*item_links(service, name), *shown]
 
 
 async def _collections(service: Service) -> Sequence[Collection]:
@@ -62,17 +40,16 @@ async def _collections(service: Service) -> Sequence[Collection]:
     crs = list(reference_systems(service, datum))
     out = []
     for name, entry in raster_parts(service).items():
-        word = WORDS[entry.key.layer][1]
-        unit = "cells" if word == "Grid" else "pixels"
-        level = "" if entry.key.level == GROUND else f", level {entry.key.level}"
+        _, word, unit = WORDS[entry.key.layer]
+        table = await footprint_table(service, name)
         out.append(
             Collection(
                 id=name,
-                title=f"{word} {entry.key.name}{level}",
-                description=f"{word} of {entry.count} {unit}, as maps and map tiles.",
-                bbox=part_box(service, entry),
-                members={"crs": crs, "storageCrs": CRS84},
-                links=_links(service, entry),
+                title=raster_title(entry),
+                description=f"{word} of {entry.count} {unit}: its outline as a feature, its content as maps and tiles.",
+                bbox=None if table is None else table.bbox,
+                members={"itemType": "feature", "crs": crs, "storageCrs": CRS84},
+                links=_links(service, name, entry),
             )
         )
     return out

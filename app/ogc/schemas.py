@@ -62,7 +62,7 @@ class OgcCollectionOut(BaseModel):
     title: str
     description: str
     extent: OgcExtentOut | SkipJsonSchema[None] = omittable("Omitted if nothing has a position.")
-    item_type: Literal["feature"] | SkipJsonSchema[None] = omittable("Only of collections with items.", "itemType")
+    item_type: Literal["feature"] = Field(alias="itemType")
     crs: list[str] | SkipJsonSchema[None] = omittable("Supported values of `crs`, the default first.")
     storage_crs: str | SkipJsonSchema[None] = omittable("CRS without conversion.", "storageCrs")
     links: list[OgcLinkOut]

@@ -251,6 +251,13 @@ def build_tables(content: ContentReader, version: Version, layer: VectorLayer) -
     return {name: one.table(version.datum) for name, one in sorted(columns.items())}
 
 
+def table_of(key: PartKey, part: Features, datum: Datum) -> Table:
+    """Build the table of all features of one part."""
+    columns = _Columns()
+    columns.add_part(key, part, np.arange(len(part)), local_frame(datum))
+    return columns.table(datum)
+
+
 def _parts(content: ContentReader, version: Version, layer: VectorLayer) -> Iterator[tuple[PartKey, Features]]:
     for entry in version.parts:
         if entry.key.layer == layer and entry.count:

@@ -22,9 +22,10 @@ from app.ogc.crs import CRS84
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension, all_collections
 from app.ogc.extent import site_box
+from app.ogc.footprints import raster_parts
 from app.ogc.negotiation import HTML, JSON, PAGES, Representation
 from app.ogc.pages import add, anchor, link_list, page, representations, respond_page, table
-from app.ogc.rasters import check_collection, content_of, raster_parts
+from app.ogc.rasters import check_collection, content_of
 from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcLinkOut
 from app.ogc.service import Link, Service, link
@@ -163,16 +164,16 @@ async def _listed(service: Service, kind: Kind, collection: str | None) -> tuple
     if collection is not None:
         (entry,) = [one for one in entries if one.id == collection]
         if kind == "vector" and collection not in TITLES:
-            raise NotFound(
-                f"collection {collection} has no features: use {service.url('collections', collection, *FOLDER['map'])}"
-            )
+            raise _no_vector_tiles_error(collection)
         return entry.title, entry.bbox, [entry]
     shown = [one for one in entries if kind == "map" or one.id in TITLES]
     return service.title, site_box(service), shown
 
 
-def _no_features_error(collection: str) -> NotFound:
-    return NotFound(f"collection {collection} has no features: use its map tiles (/collections/{collection}/map/tiles)")
+def _no_vector_tiles_error(collection: str) -> NotFound:
+    return NotFound(
+        f"collection {collection} has no vector tiles: use its map tiles (/collections/{collection}/map/tiles)"
+    )
 
 
 async def _tilesets(service: Service, kind: Kind, collection: str | None) -> Response:
@@ -253,7 +254,7 @@ async def _vector_tile(
     service: Service, collection: str | None, tiling: TileMatrixSet, address: tuple[int, int, int]
 ) -> Response:
     if collection is not None and collection not in TITLES:
-        raise _no_features_error(collection)
+        raise _no_vector_tiles_error(collection)
     layers = VECTOR_LAYERS if collection is None else (TITLES[collection][0],)
     keys = {name: key for name in layers if (key := table_key(service.version, name)) is not None}
     etag = tile_etag(keys, collection, tiling, address)

@@ -20,10 +20,11 @@ from app.ogc.crs import CRS84, parse_crs, reference_systems
 from app.ogc.drafts import DRAFT, draft_service, own_draft
 from app.ogc.extensions import Extension
 from app.ogc.feature_edits import FeatureEditor
+from app.ogc.footprints import raster_parts
 from app.ogc.items import FeaturePath, get_item
 from app.ogc.routing import LONG, SHORT, ogc_router
 from app.ogc.service import Service
-from app.ogc.vector import TITLES, find_table, tables
+from app.ogc.vector import TITLES, find_table, tables, vector_tables
 from app.store.values import DRAFT_PREFIX
 
 PART4: Final = "http://www.opengis.net/spec/ogcapi-features-4/1.0/conf"
@@ -91,6 +92,12 @@ async def _write(
 
     if_match: tag of the draft that the edit was decided for, else the edit is worked out anew when others edit.
     """
+    if collection in raster_parts(service):
+        raise HTTPException(
+            405,
+            f"{collection} is an outline, which follows its content: upload a grid, an image or a voxel map instead",
+            headers={"allow": READ_METHODS},
+        )
     if collection not in TITLES or service.version.datum is None:
         raise unknown_collection_error(service, collection, list(await tables(service)))
     services, env = service.services, service.environment.name
@@ -274,14 +281,14 @@ async def delete_item(
 # --- methods ---
 
 
-async def allow_items(_: DraftService, collection: CollectionPath) -> Response:
+async def allow_items(service: DraftService, collection: CollectionPath) -> Response:
     """Return the methods of a draft's items."""
-    return _allow(collection, ITEMS_METHODS)
+    return _allow(service, collection, ITEMS_METHODS)
 
 
-async def allow_item(_: DraftService, collection: CollectionPath) -> Response:
+async def allow_item(service: DraftService, collection: CollectionPath) -> Response:
     """Return the methods of a draft's item, whether or not it exists."""
-    return _allow(collection, ITEM_METHODS)
+    return _allow(service, collection, ITEM_METHODS)
 
 
 async def allow_reading(_: Viewer) -> Response:
@@ -298,9 +305,11 @@ async def refuse_writing(env: EnvironmentPath, _: Viewer) -> Response:
     )
 
 
-def _allow(collection: str, methods: str) -> Response:
-    if collection not in TITLES:
-        raise NotFound(f"unknown collection {collection[:80]!r}; available: {', '.join(TITLES)}")
+def _allow(service: Service, collection: str, methods: str) -> Response:
+    rasters = raster_parts(service)
+    if collection not in TITLES and collection not in rasters:
+        raise NotFound(f"unknown collection {collection[:80]!r}; available: {', '.join((*TITLES, *rasters))}")
+    methods = methods if collection in TITLES else READ_METHODS
     return Response(status_code=204, headers={"allow": methods, "cache-control": "no-store"})
 
 
@@ -325,7 +334,7 @@ async def _paths(service: Service) -> Mapping[str, object]:
     if service.draft is None:
         return {}
     out: dict[str, object] = {}
-    for name in await tables(service):
+    for name in await vector_tables(service):
         suffix = name.title().replace("-", "")
         title = TITLES[name][1]
         out[f"/collections/{name}/items"] = {

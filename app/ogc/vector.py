@@ -1,4 +1,4 @@
-"""Collections of the vector layers: nodes, edges, objects by geometry, zones, and the fence."""
+"""Collections of the vector layers: nodes, edges, objects by geometry, zones, and the fence; tables of all."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Final
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension
+from app.ogc.footprints import footprint_table, raster_parts, raster_title
 from app.ogc.negotiation import GEOJSON, HTML, JSON, JSONFG, SCHEMA
 from app.ogc.service import Link, Service, link
 from app.ogc.tables import CACHE, VECTOR_LAYERS, Table, VectorLayer, build_tables, table_key
@@ -42,18 +43,31 @@ async def layer_tables(service: Service, layer: VectorLayer) -> dict[str, Table]
 async def find_table(service: Service, name: str) -> Table | None:
     """Return the table of a collection; None if there is no such collection with items."""
     entry = TITLES.get(name)
-    return None if entry is None else (await layer_tables(service, entry[0])).get(name)
+    if entry is None:
+        return await footprint_table(service, name)
+    return (await layer_tables(service, entry[0])).get(name)
 
 
-async def tables(service: Service) -> dict[str, Table]:
-    """Return all tables, in the order of TITLES."""
+async def vector_tables(service: Service) -> dict[str, Table]:
+    """Return the tables of the vector layers, in the order of TITLES."""
     cached = {name: table for layer in VECTOR_LAYERS for name, table in (await layer_tables(service, layer)).items()}
     return {name: cached[name] for name in TITLES if name in cached}
 
 
+async def tables(service: Service) -> dict[str, Table]:
+    """Return the tables of all collections."""
+    footprints = {name: await footprint_table(service, name) for name in raster_parts(service)}
+    return await vector_tables(service) | {name: table for name, table in footprints.items() if table is not None}
+
+
+def title_of(service: Service, name: str) -> str:
+    """Return the title of a collection that exists."""
+    return TITLES[name][1] if name in TITLES else raster_title(raster_parts(service)[name])
+
+
 def item_links(service: Service, name: str) -> list[Link]:
     """Link to the items of a collection, and to what describes them."""
-    title = TITLES[name][1]
+    title = title_of(service, name)
     return [
         link(service.url("collections", name, "items", f="json"), "items", GEOJSON, f"{title} as GeoJSON"),
         link(service.url("collections", name, "items", f="jsonfg"), "items", JSONFG, f"{title} as JSON-FG"),
@@ -79,7 +93,7 @@ async def _collections(service: Service) -> Sequence[Collection]:
             members={"itemType": "feature", "crs": crs, "storageCrs": CRS84},
             links=item_links(service, name),
         )
-        for name, table in (await tables(service)).items()
+        for name, table in (await vector_tables(service)).items()
     ]
 
 
@@ -89,7 +103,7 @@ ITEMS_PARAMETERS = ("limit", "bbox", "datetime", "bbox-crs", "crs", "cursor", "f
 async def _paths(service: Service) -> Mapping[str, object]:
     out: dict[str, object] = {}
     for name, table in (await tables(service)).items():
-        base, title = f"/collections/{name}", TITLES[name][1]
+        base, title = f"/collections/{name}", title_of(service, name)
         suffix = name.title().replace("-", "")
         filters = [_filter_parameter(key, sorted(types)) for key, types in queryables(table).items()]
         item_id = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}

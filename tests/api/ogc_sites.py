@@ -1,4 +1,4 @@
-"""Sites for tests of the OGC API: the demo, real streets, a building with levels, a turned site, one nowhere."""
+"""Sites for tests of the OGC API: the demo, streets, a building with levels, a turned site, terrain, one nowhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.cli.client import Client
 from tests.api import samples
 from tests.api.conftest import ADMIN, Api
 
-ON_EARTH = ("orchard", "zoo", "hotel", "turned")
+ON_EARTH = ("orchard", "zoo", "hotel", "turned", "terrain")
 NOWHERE = "nowhere"
 TURNED_DATUM = {"latitude": 53.2686, "longitude": -0.5245, "altitude": 0.0, "heading": 30.0}
 
@@ -43,6 +43,9 @@ def create_turned(api: Api, name: str) -> None:
     api.post("environments", {"name": name, "title": "Turned <site>", "datum": TURNED_DATUM})
     api.upload(name, {"network.tmap2.yaml": samples.tmap2()})
     api.upload(name, {"things.geojson": local_geojson(SHAPES, "thing")}, layer="objects", format="geojson")
+    grid = samples.grid(width=40, height=30)
+    grid["map.yaml"] = grid["map.yaml"].replace(b"0.0]", b"0.4]")
+    api.upload(name, grid)
     zone = {"wet": SHAPES["shed"]}
     api.upload(name, {"zones.geojson": local_geojson(zone, "keepout")}, layer="zones", format="geojson", mode="merge")
 
@@ -57,6 +60,10 @@ def create_sites(api: Api, shared: Path) -> None:
     api.post("environments", {"name": "hotel", "datum": {"latitude": 1.3, "longitude": 103.85}})
     api.upload("hotel", {path.name: path.read_bytes() for path in folder.iterdir()})
     create_turned(api, "turned")
+    api.upload("turned", {"color.ot": (shared / "data/octomap/synthetic_color/color.ot").read_bytes()})
+    api.post("environments", {"name": "terrain", "datum": {"latitude": 38.81, "longitude": -77.05}})
+    api.upload("terrain", {"network.tmap2.yaml": samples.tmap2()})
+    api.upload("terrain", {"dtm.tif": (shared / "data/geotiff/opengeos_dtm/dtm.tif").read_bytes()})
     api.post("environments", {"name": NOWHERE})
     api.upload(NOWHERE, {"network.tmap2.yaml": samples.tmap2()})
 
@@ -80,9 +87,9 @@ class Ogc:
         return body
 
     def collections(self) -> list[dict[str, Any]]:
-        """Return the collections with items; grids and images have maps only."""
+        """Return the collections."""
         listed: list[dict[str, Any]] = self.get(link(self.landing(), "data")).json()["collections"]
-        return [one for one in listed if "itemType" in one]
+        return listed
 
     def items_url(self, collection: dict[str, Any]) -> str:
         return link(collection, "items", "application/geo+json")

@@ -124,10 +124,41 @@ def test_site_without_datum_has_no_collections_and_states_why(turned: Api) -> No
 
 def test_only_collections_with_content_exist(turned: Api) -> None:
     ids = [one["id"] for one in turned.get("/ogc/turned/collections").json()["collections"]]
-    assert ids == ["nodes", "edges", "objects-points", "objects-lines", "objects-polygons", "zones"]
+    assert ids == ["grid-map", "nodes", "edges", "objects-points", "objects-lines", "objects-polygons", "zones"]
     wrong = problem(turned.get("/ogc/turned/collections/node/items", 404))["detail"]
     assert "did you mean nodes?" in wrong
     problem(turned.get("/ogc/turned/collections/fence", 404))
+
+
+# --- grids ---
+
+
+def test_grid_is_an_outline_with_the_addresses_of_its_content(turned: Api) -> None:
+    (feature,) = turned.get(ITEMS.format("grid-map"), params={"level": "ground", "f": "jsonfg"}).json()["features"]
+    ring = np.array(feature["place"]["coordinates"][0])
+    across, up = 20.0 * np.array([np.cos(0.4), np.sin(0.4)]), 15.0 * np.array([-np.sin(0.4), np.cos(0.4)])
+    first = np.array([-1.0, -2.0])  # 40 by 30 cells of 0.5 m, turned by 0.4 around this corner
+    assert np.allclose(ring[[0, 9, 18, 27, 36]], [first, first + across, first + across + up, first + up, first])
+    properties = feature["properties"]
+    assert {k: properties[k] for k in ("kind", "name", "level", "resolution", "width", "height")} == {
+        "kind": "grid", "name": "map", "level": "ground", "resolution": 0.5, "width": 40, "height": 30,
+    }  # fmt: skip
+    for name, head in (("map", b"\x89PNG"), ("geotiff", b"II")):
+        assert turned.get(properties[name].removeprefix(turned.url)).content.startswith(head)
+    assert turned.get(ITEMS.format("grid-map"), params={"level": "attic"}).json()["features"] == []
+    schema = turned.get("/ogc/turned/collections/grid-map/schema").json()["properties"]
+    assert schema["geometry"]["format"] == "geometry-polygon"
+    assert set(schema) == {"id", "geometry", *properties}
+
+
+def test_grids_of_drafts_are_not_written(turned: Api) -> None:
+    at = "/ogc/turned/drafts/mine/collections/grid-map/items"
+    assert turned("OPTIONS", f"{at}/map", 204).headers["allow"] == "GET, HEAD, OPTIONS"
+    feature = {"type": "Feature", "geometry": None, "properties": {}}
+    for method, path in (("POST", at), ("PUT", f"{at}/map"), ("PATCH", f"{at}/map"), ("DELETE", f"{at}/map")):
+        refused = turned(method, path, 405, json=None if method == "DELETE" else feature)
+        assert "upload a grid" in problem(refused)["detail"]
+    assert turned.get("environments/turned/drafts").json() == []
 
 
 # --- positions ---
