@@ -325,6 +325,7 @@ class Version:
     def as_dict(self) -> dict[str, Any]:
         """Return the version as JSON; of a dry run or draft without number and time, but with ``id`` and expiry."""
         pending = self.pending
+        revision = pending.revision if pending is not None and pending.kind == "draft" else None
         return {
             "environment": self.environment,
             "version": self.number if pending is None else None,
@@ -338,7 +339,7 @@ class Version:
             "warnings": [warning.as_dict() for warning in self.warnings],
             "information": self.information,
             "stale": [self._describe_stale(key, changed) for key, changed in self.stale.items()],
-            **({} if pending is None else {"id": self.ref, "expires": rfc3339(pending.expires)}),
+            **({} if pending is None else {"id": self.ref, "expires": rfc3339(pending.expires), "revision": revision}),
         }
 
 

@@ -91,6 +91,7 @@ def test_edits_gather_in_a_draft_and_become_one_version(api: Api, desk: Desk) ->
     assert shown["layers"]["topology"]["added"] == ["barn_shed", "shed"]
     read = api.get(f"environments/{env}/versions/{desk.ref}").json()
     assert (read["version"], read["id"], read["diff"]) == (None, desk.ref, shown)
+    assert read["revision"] == 3
     assert api.get(f"environments/{env}/impact?to={desk.ref}").json()["to"] == desk.ref
     assert api.get(f"environments/{env}/versions/{desk.ref}/checks").json()["version"] == desk.ref
     version = desk.commit(headers={"If-Match": '"3"'})

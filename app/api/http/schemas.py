@@ -149,6 +149,7 @@ class DryRunOut(VersionContentOut):
         examples=["dry:0123456789abcdef0123456789abcdef"],
     )
     expires: datetime = Field(description="Time from which it returns 404.")
+    revision: int | None = Field(description="Of a draft: rises with every edit. Null for a dry run.")
     version: None
     parent: int = Field(description="Number of the head that it was made for.")
     time: None

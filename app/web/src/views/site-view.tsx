@@ -160,7 +160,10 @@ function VersionChip({ site }: { site: Site }) {
   const version = site.version.value;
   const head = site.environment.value?.version;
   if (!version) return null;
-  if (version.version === null) return <span class="chip warn">Trial: not saved</span>;
+  if (version.version === null) {
+    const isDraft = version.id.startsWith("draft:");
+    return <span class="chip warn">{isDraft ? `Draft: ${version.message}` : "Trial: not saved"}</span>;
+  }
   const channels = site.channelsAt(version.version);
   const isOld = head !== undefined && version.version < head;
   return (

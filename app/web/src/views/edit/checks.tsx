@@ -59,7 +59,7 @@ export function Checks({ editor }: { editor: Editor }) {
       {found.length > SHOWN && <p class="muted">and {found.length - SHOWN} more</p>}
       {old.length > 0 && (
         <p class="muted">
-          {count(old.length, "finding")} of v{editor.base.value} as before: see Checks.
+          {count(old.length, "finding")} of {editor.target.words(editor.base.value)} as before: see Checks.
         </p>
       )}
     </section>

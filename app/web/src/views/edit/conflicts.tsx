@@ -34,7 +34,7 @@ export function Conflicts({ editor, pending }: { editor: Editor; pending: Pendin
   return (
     <section class="edit-conflicts" aria-label="Conflicts">
       <h2>
-        {count(conflicts.length, "conflict")} with v{pending.version} by {pending.author}
+        {count(conflicts.length, "conflict")} with {editor.target.words(pending.version)} by {pending.author}
       </h2>
       <p class="muted">
         Both of you changed the same. Choose for each; all else is merged. On the map yours is orange, theirs purple.

@@ -48,8 +48,9 @@ export class Desk {
   constructor(
     readonly site: Site,
     readonly map: SiteMap,
+    ref: string,
   ) {
-    this.editor = new Editor(site, map);
+    this.editor = new Editor(site, map, ref);
     this.sketch = new Sketch(this.editor, map);
     const context: Context = { editor: this.editor, map, sketch: this.sketch };
     const take = () => true;

@@ -10,6 +10,7 @@ import { Head } from "./head";
 import type { Outcome } from "./operations";
 import { keepOptions, loadOptions, type Options, type ToolName, TOOLS } from "./options";
 import { DraftStore } from "./storage";
+import { Target } from "./target";
 import { Transaction } from "./transaction";
 import { groupsOf } from "./words";
 
@@ -23,7 +24,7 @@ export interface Note {
 
 export class Editor {
   draft = new Draft([]);
-  /** Version the draft builds on; null before it is loaded. */
+  /** Version the draft builds on, or revision of the server's draft that it adds to; null before it is loaded. */
   readonly base = signal<number | null>(null);
   /** Grows with each change of the draft. */
   readonly revision = signal(0);
@@ -59,13 +60,16 @@ export class Editor {
 
   readonly head = new Head(this);
   readonly store: DraftStore;
+  readonly target: Target;
   private readonly stops: (() => void)[] = [];
 
   constructor(
     readonly site: Site,
     readonly map: SiteMap,
+    ref: string,
   ) {
-    this.store = new DraftStore(site.name);
+    this.target = new Target(site, ref);
+    this.store = new DraftStore(this.target.draft === null ? site.name : `${site.name} ${ref}`);
     this.stops.push(
       effect(() => keepOptions(this.options.value)),
       effect(() => this.head.follow()),
@@ -228,11 +232,11 @@ export class Editor {
   /** Throws all changes away. */
   discard(): void {
     this.message.value = "";
-    this.setDraft(this.newDraft(this.site.features.peek()), this.site.number ?? 0);
+    this.setDraft(this.newDraft(this.site.features.peek()), this.target.number ?? 0);
     this.keep(0);
   }
 
-  /** The draft has become a version: what is drawn is what the server holds. */
+  /** The changes are saved: what is drawn is what the server holds. */
   saved(version: number): void {
     this.message.value = "";
     this.notes.value = this.notes.peek().filter(({ id }) => id === "merged");

@@ -51,12 +51,12 @@ let known: { key: string; items: Finding[] } | null = null;
 
 /** Returns null for a draft too large to be checked while it is drawn. Throws ApiError. */
 export async function check(editor: Editor, signal: AbortSignal): Promise<Findings | null> {
-  const version = editor.base.peek() ?? 0;
+  const version = editor.target.draft === null ? (editor.base.peek() ?? 0) : editor.target.ref;
   const level = editor.site.level.peek();
   const changes = toWire(editor.draft.changes(), editor.draft.cells());
   if (!changes.length || changes.length > MAX_CHANGES) return null;
   const path = apiPath(editor.site.path("versions", version, "checks"), { level });
-  const key = `${editor.site.name}/${version}/${level}`;
+  const key = `${editor.site.name}/${version}/${editor.base.peek()}/${level}`;
   if (known?.key !== key) known = { key, items: (await requestJson<Answer>(path, { signal })).items };
   const before = new Set(known.items.map(identity));
   const { items } = await requestJson<Answer>(path, {

@@ -1,12 +1,14 @@
 /** The version that a draft builds on: loaded, restored, and met by newer ones of others. */
-import { computed, signal } from "@preact/signals";
-import { param } from "../../address";
+import { signal } from "@preact/signals";
+import type { DryRun, Version } from "../../api/client";
 import type { Feature, LayerName } from "../../map/features";
+import { sentence } from "../../ui/states";
 import { count } from "../../ui/text";
 import { type Command, type Draft, EDITED_LAYERS, keyOf } from "./draft";
 import type { Editor } from "./editor";
 import { type Choice, type Conflict, compare, type Merge, merged, twinOf, withFreshIds } from "./merge";
 import type { StoredDraft } from "./storage";
+import { numberOf } from "./target";
 import { titleOf } from "./words";
 
 /** What was found when the site moved on, and waits for decisions. */
@@ -22,26 +24,28 @@ export interface Pending {
 
 export class Head {
   readonly pending = signal<Pending | null>(null);
-  private readonly isLatest = computed(() => param("version") === "latest");
 
   constructor(private readonly editor: Editor) {}
 
-  /** Whether the site has a newer version than the draft builds on. */
+  /** Whether there is a newer content than that which the draft builds on. */
   get isBehind(): boolean {
-    const { site, base } = this.editor;
-    return site.number !== null && base.value !== null && site.number > base.value;
+    const { target, base } = this.editor;
+    return target.number !== null && base.value !== null && target.number > base.value;
   }
 
-  /** Takes up the site's version; called again when it changes. */
+  /** Takes up what the site shows; called again when it changes. */
   follow(): void {
-    const { site, base } = this.editor;
-    const version = site.version.value;
+    const { site, target, base } = this.editor;
+    const { content } = target;
     const features = site.features.value;
-    const head = site.environment.value?.version;
-    if (!this.isLatest.value || !version || version.version === null || head === undefined) return;
-    if (version.version !== head) return; // it is being loaded
-    if (base.peek() === null) void this.start(features, version.version);
-    else this.meet(features, version.version, version.author);
+    if (!content) return; // it is being loaded
+    if (base.peek() === null) void this.start(features, numberOf(content));
+    else this.meet(features, numberOf(content), this.authorOf(content));
+  }
+
+  /** Who made what the site shows: that of a draft is its owner, not who edited it last. */
+  private authorOf(content: Version | DryRun | null): string {
+    return (content?.version !== null && content?.author) || "someone else";
   }
 
   private async start(features: Feature[], version: number): Promise<void> {
@@ -49,7 +53,7 @@ export class Head {
     editor.setDraft(editor.newDraft(features), version);
     const stored = await editor.store.load().catch(() => null);
     // The site may have moved on, and the draft have another id.
-    editor.setDraft(editor.newDraft(editor.site.features.peek()), editor.site.number ?? version);
+    editor.setDraft(editor.newDraft(editor.site.features.peek()), editor.target.number ?? version);
     if (stored && stored.head.position + stored.log.length > 0) this.restore(stored);
     editor.ready.value = true;
     editor.selectFromAddress();
@@ -58,14 +62,14 @@ export class Head {
   private restore({ head, log }: StoredDraft): void {
     const { editor } = this;
     const features = editor.site.features.peek();
-    const version = editor.site.number ?? 0;
+    const version = editor.target.number ?? 0;
     editor.message.value = head.message;
     const older = head.version === version ? features : featuresBefore(features, log);
     editor.setDraft(editor.newDraft(older, log, head.position), head.version);
     const total = editor.count.value;
-    const made = head.version === version ? "" : `, made on v${head.version}`;
+    const made = head.version === version ? "" : `, made on ${editor.target.olderWords(head.version)}`;
     if (total) editor.note("restored", `Restored ${count(total, "change")}, kept on this device${made}.`);
-    if (made) this.meet(features, version, editor.site.version.peek()?.author ?? "");
+    if (made) this.meet(features, version, this.authorOf(editor.target.content));
   }
 
   /** Meets the site's features, which may be those of a newer version. */
@@ -77,15 +81,15 @@ export class Head {
       editor.setDraft(editor.draft, base);
     } else if (!editor.draft.log.length) editor.setDraft(editor.newDraft(features), version);
     else {
-      const by = author || "someone else";
-      editor.note("moved", `v${version} was saved by ${by}. Your changes will be merged when you save.`);
+      const what = editor.target.words(version);
+      editor.note("moved", `${sentence(what)} was saved by ${author}. Your changes will be merged when you save.`);
     }
   }
 
   /** Merges the draft with the site's newest version; asks where both changed the same. Returns whether it is done. */
   merge(resume: (() => void) | null): boolean {
-    const { site, draft, base } = this.editor;
-    const version = site.number;
+    const { site, target, draft, base } = this.editor;
+    const version = target.number;
     if (version === null || version === base.peek()) return true;
     const theirs = site.features.peek().filter(({ layer }) => EDITED_LAYERS.includes(layer as LayerName));
     const byKey = new Map(theirs.map((feature) => [keyOf(feature), feature]));
@@ -94,7 +98,7 @@ export class Head {
     const fresh = withFreshIds(changes, byKey);
     const merge = compare(fresh, byKey);
     if (fresh.some((change, index) => change !== changes[index])) merge.keepsHistory = false;
-    const author = site.version.peek()?.author || "someone else";
+    const author = this.authorOf(target.content);
     const pending: Pending = { merge, version, theirs: [...byKey.values()], author, choices: new Map(), resume };
     if (merge.conflicts.length) {
       this.pending.value = pending;
@@ -117,7 +121,8 @@ export class Head {
   finish({ merge, version, theirs, choices, author }: Pending): void {
     const { editor } = this;
     const old = editor.draft;
-    const title = `Your changes, merged with v${version}`;
+    const words = editor.target.words(version);
+    const title = `Your changes, merged with ${words}`;
     let details: string[] = [];
     if (merge.keepsHistory && !merge.conflicts.length)
       editor.setDraft(editor.newDraft(theirs, old.log, old.position), version);
@@ -130,7 +135,7 @@ export class Head {
     }
     this.pending.value = null;
     editor.dismiss("moved");
-    editor.note("merged", `Merged with v${version}, saved by ${author}.`, details);
+    editor.note("merged", `Merged with ${words}, saved by ${author}.`, details);
     editor.keep(0);
   }
 }

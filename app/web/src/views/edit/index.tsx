@@ -1,7 +1,7 @@
 /** Edit: draw and repair the network, zones, objects, the fence and cells, and save it as one version.
  *
  * Address: `tool` is the tool in use, `feature` the id of the selected feature. While the view is open, `version` is
- * `latest`: edits build on the newest version. */
+ * `latest`, as edits build on the newest version; or `draft:…`, and they are saved in that draft. */
 import { Redo2, Undo2, X } from "lucide-preact";
 import { createPortal } from "preact/compat";
 import { useEffect, useState } from "preact/hooks";
@@ -22,23 +22,25 @@ import { DraftList } from "./list";
 import { Review } from "./review";
 import { Selection } from "./selection";
 import { SnapSettings } from "./snap-settings";
+import { targetOf } from "./target";
 import { ToolOptions } from "./tool-options";
 import { Toolbar } from "./toolbar";
 
 export default function EditView({ site, map }: ViewProps) {
   const [desk, setDesk] = useState<Desk | null>(null);
+  const target = targetOf(param("version"));
   useEffect(() => {
     const before = param("version");
-    if (before !== "latest") go({ version: "latest" }, { replace: true });
-    const made = new Desk(site, map);
+    if (before !== target) go({ version: target }, { replace: true });
+    const made = new Desk(site, map, target);
     setDesk(made);
     return () => {
       made.close();
       setDesk(null);
-      const left = param("version") === "latest" ? { version: before } : {};
+      const left = target === "latest" && param("version") === "latest" ? { version: before } : {};
       go({ tool: null, ...left }, { replace: true });
     };
-  }, [site, map]);
+  }, [site, map, target]);
   if (!can("editor")) {
     return (
       <Empty title="You may look at this map, not change it">
@@ -87,7 +89,7 @@ function Status({ desk }: { desk: Desk }) {
       <p class="grow" role="status">
         <b>{total ? count(total, "change") : "No changes"}</b>
         <small>
-          on v{editor.base.value}
+          {editor.target.draft === null ? "on" : "in"} {editor.target.words(editor.base.value)}
           {total > 0 && ` · ${stored[editor.stored.value]}`}
           {!online.value && " · offline"}
         </small>
@@ -97,7 +99,7 @@ function Status({ desk }: { desk: Desk }) {
       <Button quiet icon={Redo2} label="Redo" disabled={position === log.length} onClick={() => editor.redo()} />
       <Button
         main
-        disabled={total === 0}
+        disabled={total === 0 && editor.target.draft === null}
         onClick={() => {
           desk.review.value = true;
         }}

@@ -7,12 +7,13 @@ import { type Feature } from "../../map/features";
 import { expired } from "../../session";
 import { Button } from "../../ui/button";
 import { Dialog } from "../../ui/dialog";
-import { Findings, Problem } from "../../ui/states";
+import { Findings, Problem, sentence } from "../../ui/states";
 import { count } from "../../ui/text";
 import { notify } from "../../ui/toast";
 import type { Desk } from "./desk";
 import type { Editor } from "./editor";
-import { dryRun, save, saveAsDraft } from "./save";
+import { changesInWords } from "../history/words";
+import { commitDraft, dryRun, rebaseDraft, save, saveAsDraft } from "./save";
 import { type ChangeRow, cellTitle, summary } from "./words";
 
 const SHOWN = 200;
@@ -26,35 +27,47 @@ export function Review({ desk }: { desk: Desk }) {
   };
   const isOpen = desk.review.value && editor.head.pending.value === null;
   useEffect(() => setProblem(null), [isOpen]);
-  const submit = async () => {
+  const run = async (work: () => Promise<void>) => {
     setBusy(true);
     setProblem(null);
     try {
-      const result = await save(editor, () => void submit());
-      if (result !== "conflict") {
-        close();
-        const { version, warnings } = result.version;
-        notify(`Saved as v${version}${warnings?.length ? `, with ${count(warnings.length, "warning")}` : ""}`);
-      }
+      await work();
     } catch (error) {
       setProblem(asApiError(error));
     }
     setBusy(false);
   };
-  const keep = async () => {
-    setBusy(true);
-    setProblem(null);
-    try {
-      const draft = await saveAsDraft(editor, editor.message.peek().trim().slice(0, 100));
+  const submit = () =>
+    run(async () => {
+      const words = editor.target.words(null);
+      const result = await save(editor, () => void submit());
+      if (result === "conflict") return;
+      close();
+      const warnings = result.warnings ? `, with ${count(result.warnings, "warning")}` : "";
+      notify(draft === null ? `Saved as v${result.number}${warnings}` : `Saved in ${words}`);
+    });
+  const keep = () =>
+    run(async () => {
+      const kept = await saveAsDraft(editor, editor.message.peek().trim().slice(0, 100));
       editor.discard();
       close();
-      notify(`Kept as the draft ${draft.name}`, { action: { label: "Drafts", run: () => go({ view: "history" }) } });
-    } catch (error) {
-      setProblem(asApiError(error));
-    }
-    setBusy(false);
-  };
+      notify(`Kept as the draft ${kept.name}`, { action: { label: "Drafts", run: () => go({ view: "history" }) } });
+    });
+  const commit = (id: string): Promise<void> =>
+    run(async () => {
+      const message = editor.message.peek();
+      const unsaved = editor.count.peek() > 0;
+      if (unsaved && (await save(editor, () => void commit(id))) === "conflict") return;
+      editor.message.value = message; // saving has cleared it
+      const made = await commitDraft(editor, id);
+      editor.discard();
+      close();
+      notify(`Saved as v${made.version}`);
+      go({ version: "latest" }, { replace: true });
+    });
+  const { draft, olderBase } = editor.target;
   const total = editor.count.value;
+  const isCut = !online.value || expired.value;
   return (
     <Dialog
       open={isOpen}
@@ -66,20 +79,22 @@ export function Review({ desk }: { desk: Desk }) {
           <DiscardButton editor={editor} close={close} />
           <span class="spacer" />
           <Button onClick={close}>Go on editing</Button>
-          <Button
-            busy={busy}
-            disabled={total === 0 || !online.value || expired.value || editor.head.isBehind}
-            onClick={() => void keep()}
-          >
-            Keep as a draft
-          </Button>
-          <Button
-            main
-            busy={busy}
-            disabled={total === 0 || !online.value || expired.value}
-            onClick={() => void submit()}
-          >
+          {draft === null ? (
+            <Button busy={busy} disabled={total === 0 || isCut || editor.head.isBehind} onClick={() => void keep()}>
+              Keep as a draft
+            </Button>
+          ) : (
+            <Button
+              busy={busy}
+              disabled={isCut || olderBase !== null || (total === 0 && !savedChanges(editor).length)}
+              onClick={() => void commit(draft)}
+            >
+              {total ? "Save and commit" : "Commit"}
+            </Button>
+          )}
+          <Button main busy={busy} disabled={total === 0 || isCut} onClick={() => void submit()}>
             Save {count(total, "change")}
+            {draft !== null && " in the draft"}
           </Button>
         </>
       }
@@ -92,8 +107,12 @@ export function Review({ desk }: { desk: Desk }) {
       )}
       {editor.head.isBehind && (
         <p class="note" role="status">
-          v{editor.site.number} was saved in the meantime. Saving merges your changes with it.
+          {sentence(editor.target.words(editor.target.number))} was saved in the meantime. Saving merges your changes
+          with it.
         </p>
+      )}
+      {draft !== null && (
+        <DraftState editor={editor} busy={busy} onMerge={() => void run(() => rebaseDraft(editor, draft))} />
       )}
       <ChangeList editor={editor} close={close} />
       <Warnings editor={editor} open={isOpen} />
@@ -111,6 +130,33 @@ export function Review({ desk }: { desk: Desk }) {
       </label>
     </Dialog>
   );
+}
+
+/** What the draft holds already, and the version that it must be merged with before it is committed. */
+function DraftState({ editor, busy, onMerge }: { editor: Editor; busy: boolean; onMerge: () => void }) {
+  const saved = savedChanges(editor);
+  const { olderBase } = editor.target;
+  const head = editor.site.environment.value?.version;
+  return (
+    <>
+      <p class="muted">Saved in the draft: {saved.join("; ") || "nothing yet"}.</p>
+      {olderBase !== null && (
+        <div class="note" role="status">
+          <p class="grow">
+            The draft was made from v{olderBase}, and v{head} was saved since. Merge it with v{head} before you commit
+            it.
+          </p>
+          <Button busy={busy} disabled={!online.value || expired.value} onClick={onMerge}>
+            Merge with v{head}
+          </Button>
+        </div>
+      )}
+    </>
+  );
+}
+
+function savedChanges(editor: Editor): string[] {
+  return changesInWords(editor.target.content?.changes ?? {});
 }
 
 function DiscardButton({ editor, close }: { editor: Editor; close: () => void }) {
@@ -134,7 +180,8 @@ function DiscardButton({ editor, close }: { editor: Editor; close: () => void })
 function ChangeList({ editor, close }: { editor: Editor; close: () => void }) {
   const groups = editor.groups.value;
   const cells = editor.cells.value;
-  if (!groups.length && !cells.length) return <p class="muted">Nothing has changed yet.</p>;
+  if (!groups.length && !cells.length)
+    return <p class="muted">Nothing has changed {editor.target.draft === null ? "yet" : "since it was saved"}.</p>;
   const show = (features: Feature[], keys: string[]) => {
     editor.select(keys.filter((key) => editor.draft.get(key)));
     editor.map.fitFeatures(features);
@@ -218,7 +265,8 @@ function Warnings({ editor, open }: { editor: Editor; open: boolean }) {
   const revision = editor.revision.value;
   useEffect(() => {
     setAnswer(null);
-    if (!open || editor.count.peek() === 0 || !online.peek() || editor.head.isBehind) return;
+    if (!open || editor.target.draft !== null || editor.count.peek() === 0 || !online.peek() || editor.head.isBehind)
+      return;
     let isOver = false;
     dryRun(editor).then(
       ({ warnings }) => {

@@ -1,10 +1,13 @@
-/** Saving a draft as one version; what others saved in the meantime is merged first. */
+/** Saving the changes as one version or in a draft; what others saved in the meantime is merged first. */
 import { apiPath, asApiError, request, requestJson, type Schemas, type Version } from "../../api/client";
 import { toWire } from "./draft";
 import type { Editor } from "./editor";
 import { summary } from "./words";
 
-export type Saved = { version: Version } | "conflict";
+type ServerDraft = Schemas["DraftOut"];
+
+/** number: of the new version, or revision of the draft. */
+export type Saved = { number: number; warnings: number } | "conflict";
 
 const MAX_ROUNDS = 5;
 
@@ -14,18 +17,17 @@ const MAX_ROUNDS = 5;
 export async function save(editor: Editor, resume: () => void): Promise<Saved> {
   for (let round = 0; ; round++) {
     try {
-      const version = await send(editor);
-      editor.saved(version.version ?? 0);
+      const saved = await (editor.target.draft === null ? send(editor) : sendToDraft(editor, editor.target.draft));
+      editor.saved(saved.number);
       void editor.site.refresh();
-      return { version };
+      return saved;
     } catch (error) {
       if (asApiError(error).status !== 412 || round >= MAX_ROUNDS) throw error;
       await editor.site.refresh();
-      const { head, site } = editor;
+      const { head, site, target } = editor;
       if (!head.isBehind) throw site.problem.peek() ?? error;
       if (!head.merge(resume)) return "conflict";
-      const version = site.version.peek() as Version;
-      if (editor.count.peek() === 0) return { version }; // others have saved the same
+      if (editor.count.peek() === 0) return { number: target.number ?? 0, warnings: 0 }; // others have saved the same
     }
   }
 }
@@ -39,9 +41,9 @@ export async function dryRun(editor: Editor): Promise<Version> {
   });
 }
 
-async function send(editor: Editor): Promise<Version> {
+async function send(editor: Editor): Promise<Exclude<Saved, string>> {
   const body = bodyOf(editor);
-  return requestJson<Version>(apiPath(editor.site.path("edits")), {
+  const { version, warnings } = await requestJson<Version>(apiPath(editor.site.path("edits")), {
     method: "POST",
     headers: {
       "content-type": "application/json",
@@ -51,25 +53,47 @@ async function send(editor: Editor): Promise<Version> {
     },
     body,
   });
+  return { number: version, warnings: warnings.length };
+}
+
+async function sendToDraft(editor: Editor, draft: string): Promise<Exclude<Saved, string>> {
+  const changes = toWire(editor.draft.changes(), editor.draft.cells());
+  const tag = `"${editor.target.ref}.${editor.base.peek()}"`;
+  const path = apiPath(editor.site.path("drafts", draft, "edits"));
+  const { revision } = await post<ServerDraft>(path, { changes }, { "if-match": tag });
+  return { number: revision, warnings: 0 };
+}
+
+/** Makes the server's draft one version; what is not saved in it stays behind. Throws ApiError. */
+export function commitDraft(editor: Editor, draft: string): Promise<Version> {
+  const message = editor.message.peek().trim();
+  // The same content has the same key: a repeated commit whose answer was lost is answered again.
+  const key = `draft-${draft}-${editor.base.peek()}-${hash(message)}`;
+  return post<Version>(apiPath(editor.site.path("drafts", draft, "commit")), { message }, { "idempotency-key": key });
+}
+
+/** Puts the server's draft on top of the newest version. Throws ApiError: 409 where both changed the same. */
+export async function rebaseDraft(editor: Editor, draft: string): Promise<void> {
+  await post<ServerDraft>(apiPath(editor.site.path("drafts", draft, "rebase")), {});
+  await editor.site.refresh();
 }
 
 /** Stores the changes as a draft on the server, to go on with on another machine. Throws ApiError. */
-export async function saveAsDraft(editor: Editor, name: string): Promise<Schemas["DraftOut"]> {
-  const send = <T>(path: string, body: unknown) =>
-    requestJson<T>(path, {
-      method: "POST",
-      headers: { "content-type": "application/json" },
-      body: JSON.stringify(body),
-    });
+export async function saveAsDraft(editor: Editor, name: string): Promise<ServerDraft> {
   const drafts = editor.site.path("drafts");
-  const made = await send<Schemas["DraftOut"]>(apiPath(drafts), name ? { name } : {});
+  const made = await post<ServerDraft>(apiPath(drafts), name ? { name } : {});
   try {
     const changes = toWire(editor.draft.changes(), editor.draft.cells());
-    return await send<Schemas["DraftOut"]>(apiPath([...drafts, made.id, "edits"]), { changes });
+    return await post<ServerDraft>(apiPath([...drafts, made.id, "edits"]), { changes });
   } catch (error) {
     await request(apiPath([...drafts, made.id]), { method: "DELETE" }).catch(() => undefined);
     throw error;
   }
+}
+
+function post<T>(path: string, body: object, headers: Record<string, string> = {}): Promise<T> {
+  const sent = { "content-type": "application/json", ...headers };
+  return requestJson<T>(path, { method: "POST", headers: sent, body: JSON.stringify(body) });
 }
 
 function bodyOf(editor: Editor, more: Record<string, unknown> = {}): string {

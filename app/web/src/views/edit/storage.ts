@@ -50,7 +50,7 @@ export function randomId(): string {
   return [...crypto.getRandomValues(new Uint8Array(12))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 }
 
-/** The drafts of one site in this tab. */
+/** The drafts of one site, or of one draft of the server, in this tab. */
 export class DraftStore {
   id: string;
   private queue: Promise<unknown> = Promise.resolve();

@@ -1,5 +1,5 @@
 /** Drafts: what gathers in the page, in QGIS or on the command line until somebody commits it. */
-import { GitMerge, Save, Trash2 } from "lucide-preact";
+import { GitMerge, Pencil, Save, Trash2 } from "lucide-preact";
 import { useState } from "preact/hooks";
 import { go } from "../../address";
 import { apiPath, online, request, requestJson, type Schemas, type Version } from "../../api/client";
@@ -79,6 +79,11 @@ function Row({ site, draft, drafts, onDelete }: RowProps) {
       </div>
       <div class="actions">
         {changes.length > 0 && <Button onClick={() => go({ from: draft.base, to: draft.version })}>Review</Button>}
+        {mayWrite && (
+          <Button icon={Pencil} onClick={() => go({ view: "edit", version: draft.version })}>
+            Continue editing
+          </Button>
+        )}
         {mayWrite && draft.behind && (
           <Button icon={GitMerge} busy={busy} disabled={!online.value} onClick={() => void run(rebase)}>
             Merge with v{draft.head}
