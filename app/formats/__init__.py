@@ -24,6 +24,7 @@ from lxml import etree
 from app import parameters, plugins
 from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, TooLarge, UnreadableFile
 from app.formats._format import (
+    ANY_FEATURES,
     UNTITLED,
     Bends,
     Claims,
@@ -45,6 +46,7 @@ from app.model.layers import Layers
 from app.model.names import did_you_mean
 
 __all__ = [  # the public interface; see docs/contributing/plug-ins.md
+    "ANY_FEATURES",
     "BAD_INPUT",
     "UNTITLED",
     "Bends",

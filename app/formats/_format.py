@@ -112,6 +112,12 @@ class LayerRequirements:
     missing_content: Callable[[Layers], str | None] | None = None
 
 
+ANY_FEATURES: tuple[frozenset[Layer], ...] = tuple(
+    frozenset({layer}) for layer in ("objects", "topology", "location", "zones")
+)
+"""``LayerRequirements.one_of`` of a format that writes all features: any layer with some is enough."""
+
+
 @dataclass(frozen=True, slots=True)
 class NoOptions:
     """Options of formats without options of their own."""

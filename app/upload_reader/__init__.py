@@ -23,7 +23,7 @@ from app.limits import Limits
 from app.model.features import Features, from_columns
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
 from app.model.geodesy import local_frame
-from app.model.layers import Layer, Layers, Part, PartKey, is_empty, join_levels
+from app.model.layers import VECTOR_LAYERS, Layer, Layers, Part, PartKey, is_empty, join_levels
 from app.model.names import did_you_mean
 from app.syntax import archives, json, shell, xml, yaml
 from app.upload_reader.bundle import Bundle as Bundle
@@ -409,7 +409,7 @@ def _read_group(
         grid=grid,
         layer=layer,
         options=formats.read_options(group.format, _applicable_options(group, hints)),
-        requested_layers=None if group.format.traits.is_drawing else upload_context.wanted,
+        requested_layers=_requested_layers(group.format, upload_context.wanted),
         decode_cells=upload_context.cells,
         keep_source_properties=upload_context.whole,
         folder=_folder_reader(hints, upload_context, limits, bundle),
@@ -430,6 +430,11 @@ def _read_group(
             bundle.warnings.append(Problem("its datum differs from that of another file; it is ignored", group.main))
     bundle.levels = join_levels(bundle.levels, [lv for lv in layers.levels if lv != Level()])
     return [ParsedPart(key, part, group) for key, part in parts.items() if not is_empty(part)]
+
+
+def _requested_layers(fmt: Format, wanted: frozenset[Layer] | None) -> frozenset[Layer] | None:
+    """Return the layers to read: of a drawing all features, which may be meant for another layer."""
+    return wanted | VECTOR_LAYERS if wanted is not None and fmt.traits.is_drawing else wanted
 
 
 def _folder_reader(

@@ -23,7 +23,7 @@ import re
 
 import orjson
 
-from app.formats import Claims, Format, LayerRequirements, Traits, register
+from app.formats import ANY_FEATURES, Claims, Format, LayerRequirements, Traits, register
 from app.formats.geojson.reading import read
 from app.formats.geojson.words import GEOMETRIES
 from app.formats.geojson.writing import write
@@ -61,7 +61,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
+        needs=LayerRequirements(ANY_FEATURES),
         extensions=(".geojson", ".json"),
         claims=Claims(priority=5),
         traits=Traits(is_drawing=True, marks_blocked=True),

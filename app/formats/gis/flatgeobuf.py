@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.formats import Files, Format, LayerRequirements, ReadContext, Traits, WriteContext, register
+from app.formats import ANY_FEATURES, Files, Format, LayerRequirements, ReadContext, Traits, WriteContext, register
 from app.formats.gis.layers import read_tables
 from app.formats.gis.shapes import transformed
 from app.formats.gis.tables import ReadOptions, columns, to_parts
@@ -98,7 +98,7 @@ register(
         detect=detect,
         read=read,
         write=write,
-        needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
+        needs=LayerRequirements(ANY_FEATURES),
         read_options=ReadOptions,
         extensions=(".fgb",),
         traits=Traits(is_drawing=True, marks_blocked=True),

@@ -7,6 +7,13 @@ is JSON with those that no column can express (nested ones, mixed types, names t
 levels and documents are in ``gpkg_metadata``. Everything is read back; rows that were added in QGIS belong to the part
 of the table's first row. QGIS shows edges as arrows (``layer_styles``).
 
+**Grids and images.** Each is a table of PNG tiles of 512 pixels with overviews, ``occupancy_map``, ``imagery_plan`` …;
+``rasters=false`` leaves them out. A grid's tiles have a palette whose indices are the cell values, and no tile where
+all is unknown. Grids and 8-bit images (grey, colours, palette) come back whole; of other images what is shown is
+written. Tiles are upright in their CRS, so a turned raster has a CRS with its own axes (oblique Mercator centred on the
+datum, srs_id 300001 …): nothing is resampled, and positions differ from transverse Mercator by 0.01 mm at 1 km and 8 mm
+at 10 km. Without a datum, or if the axes of an image are turned in its own CRS, a turned raster is not written.
+
 **Coordinates.** Metres are in transverse Mercator centred on the datum (srs_id 300000): the local frame without its
 heading, so geometries are turned by the heading, and back (to a nanometre) on reading. Without a datum they are in the
 undefined Cartesian system (srs_id -1). Degrees are in EPSG:4326, longitude first.
@@ -15,16 +22,21 @@ undefined Cartesian system (srs_id -1). Degrees are in EPSG:4326, longitude firs
 upload's ``layer`` says. Its columns are its properties; ``id`` or ``name`` is its id, else table and number. A column
 called name in any case is its ``name``; a ``kind`` that is no text becomes ``class``. Any CRS that PROJ knows is
 converted to degrees (WGS 84), rounded to 1e-12; srs_id -1 and engineering systems are metres of the local frame.
+
+Tables of tiles (PNG, JPEG) are images in their CRS at the finest zoom level; gridded coverages (16-bit PNG, float TIFF)
+are images of one band of values. With ``layer=occupancy`` they are grids: the values of a coverage are those of the
+cells, and shades are read by Nav2's default thresholds.
+
 Measures (M) and binary values are not read. Views, virtual tables, generated columns and triggers of the file are
 never run.
 """
 
 from __future__ import annotations
 
-from app.formats import Format, LayerRequirements, Traits, register
+from app.formats import ANY_FEATURES, Format, LayerRequirements, Traits, register
 from app.formats.gis.gpkg.reading import read
 from app.formats.gis.gpkg.words import APPLICATION_ID, FAMILY
-from app.formats.gis.gpkg.writing import write
+from app.formats.gis.gpkg.writing import WriteOptions, write
 from app.formats.gis.tables import ReadOptions
 from app.model.layers import VECTOR_LAYERS
 
@@ -41,12 +53,14 @@ register(
         name=FAMILY,
         title="GeoPackage",
         files={"map.gpkg": "application/geopackage+sqlite3"},
-        layers=frozenset(VECTOR_LAYERS),
+        layers=VECTOR_LAYERS | {"occupancy", "imagery"},
         detect=detect,
         read=read,
         write=write,
-        needs=LayerRequirements(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
+        needs=LayerRequirements((*ANY_FEATURES, frozenset({"occupancy"}), frozenset({"imagery"}))),
+        version=2,
         read_options=ReadOptions,
+        write_options=WriteOptions,
         extensions=(".gpkg",),
         traits=Traits(is_drawing=True, marks_blocked=True),
     )

@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 
 from app.errors import TooLarge
 from app.formats import Files, ReadContext
-from app.formats.gis.gpkg.words import CARTESIAN, DEGREES, DOCUMENT, ENVELOPES, LOCAL_SRS, ORGANIZATION
+from app.formats.gis.gpkg.raster_reading import RasterReader
+from app.formats.gis.gpkg.words import (
+    CARTESIAN,
+    COVERAGE,
+    DEGREES,
+    DOCUMENT,
+    ENVELOPES,
+    LOCAL_SRS,
+    ORGANIZATION,
+    quoted,
+)
 from app.formats.gis.shapes import parse_shapes, raise_unreadable, transformed
 from app.formats.gis.tables import LOCAL, Table, to_parts
 from app.model.features import Features
@@ -40,7 +50,7 @@ _METADATA = "SELECT metadata FROM gpkg_metadata WHERE md_standard_uri = ? ORDER 
 
 
 def read(files: Files, context: ReadContext) -> Layers:
-    """Read all vector tables. Raises UnreadableFile for a damaged file, with the table; TooLarge beyond the limits."""
+    """Read all tables. Raises UnreadableFile for a damaged file, with the table; TooLarge beyond the limits."""
     try:
         with contextlib.closing(_open(files[context.main])) as database:
             return _Reader(database, context).layers()
@@ -70,17 +80,15 @@ def _open(data: bytes) -> sqlite3.Connection:
 
 
 def _authorize(action: int, table: str | None, column: str | None, schema: str | None, source: str | None) -> int:
-    """Allow SELECT on tables, and PRAGMA table_xinfo; source: a view or trigger that causes the action."""
-    del column, schema
+    """Allow SELECT on tables, min, max, and PRAGMA table_xinfo; source: a view or trigger that causes the action."""
+    del schema
     if source is not None:
         return sqlite3.SQLITE_DENY
+    if action == sqlite3.SQLITE_FUNCTION and column in ("min", "max"):
+        return sqlite3.SQLITE_OK
     pragma = action == sqlite3.SQLITE_PRAGMA and table == "table_xinfo"
     reading = action in (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
     return sqlite3.SQLITE_OK if reading or pragma else sqlite3.SQLITE_DENY
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'
 
 
 class _Reader:
@@ -89,6 +97,7 @@ class _Reader:
         self.context = context
         self.left = context.limits.features
         self.tables = self._plain_tables()
+        self.rasters: dict[str, tuple[str, str | None, Any]] = {}
         for name in ("gpkg_contents", "gpkg_spatial_ref_sys"):
             if name not in self.tables:
                 raise_unreadable(f"not a GeoPackage: it has no table {name}")
@@ -102,9 +111,10 @@ class _Reader:
             part = parts.get(key, Features((), np.empty(0, object), (), np.empty(0, bool)))
             if isinstance(part, Features):
                 parts[key] = part.with_document(document)
+        raster_parts = self._raster_parts()
         levels = self.extension.get("levels")
         known_levels = tuple(Level(**v) for v in levels) if isinstance(levels, list) else (Level(),)
-        return Layers(dict[PartKey, Part](parts), self.datum, known_levels)
+        return Layers({**parts, **raster_parts}, self.datum, known_levels)
 
     def _plain_tables(self) -> dict[str, str]:
         """Return the tables by lower-case name. Views and virtual tables would run code of the file."""
@@ -135,6 +145,29 @@ class _Reader:
                 out[key] = row["document"]
         return out
 
+    def _raster_parts(self) -> dict[PartKey, Part]:
+        """Return the grids and images; the tables of tiles are known once all tables are read."""
+        if not self.rasters:
+            return {}
+        for name in ("gpkg_tile_matrix_set", "gpkg_tile_matrix"):
+            if name not in self.tables:
+                raise_unreadable(f"its tiles are not described: it has no table {name}")
+        rows = self.extension.get("rasters")
+        entries = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        frame = self.context.frame if self.datum is None else local_frame(self.datum)
+        reader = RasterReader(self.database, self.context, entries, frame)
+        systems = self._systems()
+        out: dict[PartKey, Part] = {}
+        for name, (data_type, table, srs_id) in self.rasters.items():
+            if table is None:
+                self.context.warn("only tables are read, not views: store it as a layer of its own", where=name)
+                continue
+            if srs_id != CARTESIAN and srs_id not in systems:
+                raise_unreadable(f"unknown srs_id {srs_id!r:.40}: it is not in gpkg_spatial_ref_sys", name)
+            crs = LOCAL if srs_id == CARTESIAN else systems[srs_id][1]
+            out |= reader.read(name, table, crs, is_coverage=data_type == COVERAGE)
+        return out
+
     # --- tables ---
 
     def _tables(self) -> Iterator[Table]:
@@ -145,13 +178,12 @@ class _Reader:
         if len(listed) > MAX_TABLES:
             raise TooLarge(f"{self.context.main} has more than {MAX_TABLES} tables: split it")
         for name, data_type, contents_srs, geometry, srs in listed:
-            if data_type in ("tiles", "2d-gridded-coverage"):
-                self.context.warn("a table of tiles is not read: export it as a GeoTIFF", where=str(name))
-                continue
             if str(name).lower() in ("layer_styles", "qgis_projects") or str(name).lower().startswith("gpkg_"):
                 continue
             table = self.tables.get(str(name).lower())
-            if table is None:
+            if data_type in ("tiles", COVERAGE):
+                self.rasters[str(name)] = (data_type, table, contents_srs)
+            elif table is None:
                 self.context.warn("only tables are read, not views: store it as a layer of its own", where=str(name))
             elif data_type == "features" and geometry is not None:
                 yield self._table(table, str(geometry), systems, contents_srs if srs is None else srs)
@@ -188,7 +220,7 @@ class _Reader:
 
     def _columns(self, table: str) -> list[tuple[str, str]]:
         """Return (name, declared type) of the stored columns: generated ones would run code of the file."""
-        rows = self.database.execute(f"PRAGMA table_xinfo({_quoted(table)})").fetchall()
+        rows = self.database.execute(f"PRAGMA table_xinfo({quoted(table)})").fetchall()
         return [(str(row[1]), str(row[2]).upper()) for row in rows if row[6] == 0]
 
     def _table(
@@ -200,8 +232,8 @@ class _Reader:
             raise_unreadable(f"it has no column {geometry[:80]!r}", name)
         primary = self._primary_key(name)
         plain = [(n, kind) for n, kind in names if n not in (shapes, primary)]
-        selected = ", ".join(_quoted(n) for n in ([shapes] if shapes else []) + [n for n, _ in plain]) or "NULL"
-        cursor = self.database.execute(f"SELECT {selected} FROM {_quoted(name)}")  # noqa: S608
+        selected = ", ".join(quoted(n) for n in ([shapes] if shapes else []) + [n for n, _ in plain]) or "NULL"
+        cursor = self.database.execute(f"SELECT {selected} FROM {quoted(name)}")  # noqa: S608
         rows: list[tuple[Any, ...]] = []
         while batch := cursor.fetchmany(STEP):
             rows += batch
@@ -220,7 +252,7 @@ class _Reader:
         return Table(name, columns, geometries, crs)
 
     def _primary_key(self, name: str) -> str | None:
-        rows = self.database.execute(f"PRAGMA table_xinfo({_quoted(name)})").fetchall()
+        rows = self.database.execute(f"PRAGMA table_xinfo({quoted(name)})").fetchall()
         return next((str(row[1]) for row in rows if row[5] and "INT" in str(row[2]).upper()), None)
 
     def _values(self, values: list[Any], column: str, kind: str, table: str) -> list[Any]:

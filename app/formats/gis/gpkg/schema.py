@@ -78,6 +78,38 @@ VALUES ('layer_styles', 'attributes', 'layer_styles', '', '2000-01-01T00:00:00.0
 'http://www.geopackage.org/spec120/#extension_metadata', 'read-write')""",
 )
 
+TILES = (
+    """CREATE TABLE gpkg_tile_matrix_set (
+table_name TEXT NOT NULL PRIMARY KEY,
+srs_id INTEGER NOT NULL,
+min_x DOUBLE NOT NULL,
+min_y DOUBLE NOT NULL,
+max_x DOUBLE NOT NULL,
+max_y DOUBLE NOT NULL,
+CONSTRAINT fk_gtms_table_name FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
+CONSTRAINT fk_gtms_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id))""",
+    """CREATE TABLE gpkg_tile_matrix (
+table_name TEXT NOT NULL,
+zoom_level INTEGER NOT NULL,
+matrix_width INTEGER NOT NULL,
+matrix_height INTEGER NOT NULL,
+tile_width INTEGER NOT NULL,
+tile_height INTEGER NOT NULL,
+pixel_x_size DOUBLE NOT NULL,
+pixel_y_size DOUBLE NOT NULL,
+CONSTRAINT pk_ttm PRIMARY KEY (table_name, zoom_level),
+CONSTRAINT fk_tmm_table_name FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name))""",
+)
+"""The tables that describe tiles, for a GeoPackage that has some."""
+
+TILE_TABLE = """CREATE TABLE {} (
+id INTEGER PRIMARY KEY AUTOINCREMENT,
+zoom_level INTEGER NOT NULL,
+tile_column INTEGER NOT NULL,
+tile_row INTEGER NOT NULL,
+tile_data BLOB NOT NULL,
+UNIQUE (zoom_level, tile_column, tile_row))"""
+
 _BOX = "ST_MinX(NEW.{c}), ST_MaxX(NEW.{c}), ST_MinY(NEW.{c}), ST_MaxY(NEW.{c})"
 _FILLED = "NEW.{c} NOTNULL AND NOT ST_IsEmpty(NEW.{c})"
 

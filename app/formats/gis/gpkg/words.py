@@ -22,6 +22,12 @@ LOCAL_SRS = 300000
 DOCUMENT = "https://fleet-map-server.github.io/content/1"
 """``md_standard_uri`` of the metadata with the datum, the levels and the parts' documents."""
 
+DATE = "2000-01-01T00:00:00.000Z"
+"""Written as the time of every change: the same layers give the same bytes."""
+
+COVERAGE = "2d-gridded-coverage"
+"""``data_type`` of a table of tiles with values instead of colours."""
+
 ENVELOPES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
 """Bytes of a geometry's envelope, by its code in the flags."""
 
@@ -36,3 +42,8 @@ GEOMETRY_TYPES = (
     "GEOMETRYCOLLECTION",
 )
 """Names of the geometry types, by shapely's type ids (2: a ring)."""
+
+
+def quoted(name: str) -> str:
+    """Return a name of a table or column for SQL."""
+    return '"' + name.replace('"', '""') + '"'

@@ -1,4 +1,4 @@
-"""Write a GeoPackage by SQLite in memory: one table for each layer and type of geometry."""
+"""Write a GeoPackage by SQLite in memory: one table for each layer and type of geometry, one for each raster."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ import shapely
 from numpy.typing import NDArray
 
 from app.formats import WriteContext
+from app.formats.gis.gpkg.raster_writing import RasterWriter
 from app.formats.gis.gpkg.schema import SCHEMA, index_triggers
 from app.formats.gis.gpkg.styles import STYLES, style
 from app.formats.gis.gpkg.words import (
     APPLICATION_ID,
     CARTESIAN,
+    DATE,
     DEGREES,
     DOCUMENT,
     GEOMETRY_TYPES,
     LOCAL_SRS,
     ORGANIZATION,
     USER_VERSION,
+    quoted,
 )
 from app.formats.gis.shapes import transformed
 from app.formats.gis.tables import columns
@@ -33,9 +36,7 @@ from app.model.features import Features, Properties
 from app.model.frame import Level
 from app.model.geodesy import LocalFrame, wgs84_wkt
 from app.model.layers import Layer, Layers, PartKey
-
-DATE = "2000-01-01T00:00:00.000Z"
-"""Written as the time of every change: the same layers give the same bytes."""
+from app.parameters import parameter
 
 SQLITE_VERSION = 3_040_000
 """Written as the version of SQLite, for the same reason."""
@@ -44,6 +45,13 @@ _SUFFIXES = ("points", "lines", "lines", "polygons", "multipoints", "multilines"
 _EXPECTED = {"nodes": 0, "edges": 1, "fence": 3, "zones": 3}
 _SQL_TYPES = {"text": "TEXT", "integer": "INTEGER", "real": "DOUBLE", "boolean": "BOOLEAN"}
 _NO_TYPE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Choice of what is written."""
+
+    rasters: bool = parameter(True, "include occupancy grids and images as tiles; false: features only")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +65,12 @@ class Item:
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """Write ``map.gpkg`` with all vector layers."""
-    unwritten: tuple[Layer, ...] = ("occupancy", "voxels", "imagery")
+    """Write ``map.gpkg`` with all vector layers, grids and images."""
+    options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+    unwritten: tuple[Layer, ...] = ("voxels",) if options.rasters else ("occupancy", "voxels", "imagery")
     for layer in unwritten:
-        context.drop(layer, len(layers.parts_of(layer)), "the GeoPackage contains features, not cells or pixels")
+        why = "a GeoPackage contains features and tiles, not voxels" if layer == "voxels" else "rasters=false"
+        context.drop(layer, len(layers.parts_of(layer)), why)
     context.drop("resources", len(layers.resources()), "a GeoPackage has no further files")
     with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
         database.execute("PRAGMA page_size = 4096")
@@ -73,13 +83,18 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         description = "; ".join(context.attribution)
         for name, items in sorted(_group(layers).items()):
             _TableWriter(database, name, items, layers.frame).write(description)
-        _write_metadata(database, layers)
         database.execute("COMMIT")
-        database.execute("VACUUM")
-        data = bytearray(database.serialize())
-    data[24:28] = data[92:96] = struct.pack(">I", 1)  # counts of changes
-    data[96:100] = struct.pack(">I", SQLITE_VERSION)
-    return {"map.gpkg": bytes(data)}
+        database.execute("VACUUM")  # before there are tiles: it copies everything
+        database.execute("BEGIN")
+        rasters = RasterWriter(database, layers, context)
+        if options.rasters:
+            rasters.write()
+        _write_metadata(database, layers, rasters.entries)
+        database.execute("COMMIT")
+        data = memoryview(database.serialize())
+    changes = struct.pack(">I", 1)
+    version = struct.pack(">I", SQLITE_VERSION)
+    return {"map.gpkg": b"".join([data[:24], changes, data[28:92], changes, version, data[100:]])}
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -135,8 +150,8 @@ class _TableWriter:
         self._create()
         names = [*(["geom"] if self.is_spatial else []), *(c.name for c in self.columns)]
         marks = ", ".join("?" * len(names))
-        listed = ", ".join(map(_quoted, names))
-        self.database.executemany(f"INSERT INTO {_quoted(self.name)} ({listed}) VALUES ({marks})", self._rows())  # noqa: S608
+        listed = ", ".join(map(quoted, names))
+        self.database.executemany(f"INSERT INTO {quoted(self.name)} ({listed}) VALUES ({marks})", self._rows())  # noqa: S608
         if not self.is_spatial:
             self._register("attributes", description, (None, None, None, None), self.srs)
             return
@@ -153,8 +168,8 @@ class _TableWriter:
         lines = ["fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"]
         if self.is_spatial:
             lines.append(f"geom {GEOMETRY_TYPES[int(shapely.get_type_id(self.geometry[0]))]}")
-        lines += [f"{_quoted(c.name)} {_SQL_TYPES[c.type]}" for c in self.columns]
-        self.database.execute(f"CREATE TABLE {_quoted(self.name)} ({', '.join(lines)})")
+        lines += [f"{quoted(c.name)} {_SQL_TYPES[c.type]}" for c in self.columns]
+        self.database.execute(f"CREATE TABLE {quoted(self.name)} ({', '.join(lines)})")
 
     def _rows(self) -> Iterator[tuple[Any, ...]]:
         values = [column.values for column in self.columns]
@@ -218,10 +233,6 @@ def _to_east_north(geometry: NDArray[np.object_], frame: LocalFrame) -> NDArray[
     return transformed(geometry, turn)
 
 
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'
-
-
 # --- tables of the GeoPackage itself ----------------------------------------------------------------------------------
 def _write_systems(database: sqlite3.Connection, frame: LocalFrame | None) -> None:
     rows: list[tuple[Any, ...]] = [
@@ -235,7 +246,7 @@ def _write_systems(database: sqlite3.Connection, frame: LocalFrame | None) -> No
     database.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)", rows)
 
 
-def _write_metadata(database: sqlite3.Connection, layers: Layers) -> None:
+def _write_metadata(database: sqlite3.Connection, layers: Layers, rasters: Sequence[Mapping[str, Any]]) -> None:
     """Write the datum, the levels and the parts' documents, which have no table."""
     content: dict[str, Any] = {}
     if layers.datum is not None:
@@ -249,6 +260,8 @@ def _write_metadata(database: sqlite3.Connection, layers: Layers) -> None:
     ]
     if documents:
         content["documents"] = documents
+    if rasters:
+        content["rasters"] = [{name: value for name, value in row.items() if name != "title"} for row in rasters]
     if not content:
         return
     text = orjson.dumps(content, option=orjson.OPT_SORT_KEYS).decode()
