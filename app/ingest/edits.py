@@ -7,8 +7,8 @@ the response rounded or converted them. An edited feature keeps its anchor, what
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ import shapely.geometry
 
 from app import formats
 from app.errors import Invalid, MissingDatum, NotFound, Problem
+from app.ingest.edited_part import EditedPart
 from app.ingest.prepare import datum_moved_warnings
 from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
@@ -47,56 +48,13 @@ _SHAPES: Mapping[str, frozenset[str]] = {
 _DEFAULT_NAME: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "objects": "edit"}
 
 
-@dataclass(slots=True)
-class _Draft:
-    """Vector part being edited: features put and deleted, on top of the stored ones."""
-
-    stored: Features | None
-    puts: dict[str, tuple[Any, Properties, bool]] = field(default_factory=dict)
-    deletes: set[str] = field(default_factory=set)
-    place: Mapping[str, int] = field(init=False)
-    dragged: set[str] = field(default_factory=set)
-    _edges: dict[str, list[str]] | None = None
-
-    def __post_init__(self) -> None:
-        self.place = {} if self.stored is None else {item: k for k, item in enumerate(self.stored.ids)}
-
-    def has_item(self, item: str) -> bool:
-        if item in self.puts:
-            return True
-        return item not in self.deletes and item in self.place
-
-    def row(self, item: str) -> tuple[Any, Properties, bool]:
-        return self.puts[item] if item in self.puts else self.before(item)
-
-    def before(self, item: str) -> tuple[Any, Properties, bool]:
-        """Return the stored feature."""
-        assert self.stored is not None
-        k = self.place[item]
-        return self.stored.geometry[k], self.stored.properties[k], bool(self.stored.local[k])
-
-    def connected_edges(self, node: str) -> list[str]:
-        """List the stored edges that start or end at a node."""
-        if self._edges is None:
-            self._edges = defaultdict(list)
-            for item, p in zip(self.place, self.stored.properties if self.stored is not None else (), strict=True):
-                if p.get("kind") == "edge":
-                    for end in {str(p.get("source")), str(p.get("target"))}:
-                        self._edges[end].append(item)
-        return self._edges.get(node, [])
-
-    def edited_ids(self) -> set[str]:
-        """Return the ids of the stored features that are deleted or changed."""
-        return self.deletes | {i for i, new in self.puts.items() if i in self.place and not _equal(self.before(i), new)}
-
-
 def edit_changes(
     store: Store, base: Version, changes: Sequence[Mapping[str, Any]]
 ) -> tuple[Changes, tuple[Problem, ...]]:
     """Combine all edits into one change set. Raises Invalid with the location of every invalid edit."""
     if not changes:
         raise Invalid("the request contains no edit: give at least one put, delete or cells in 'changes'")
-    session = _Session(store, base)
+    session = _Session(store, base, _named_ids(changes))
     problems: list[Problem] = []
     for k, change in enumerate(changes):
         try:
@@ -113,11 +71,25 @@ def edit_changes(
     ) else ()
 
 
+def _named_ids(changes: Sequence[Mapping[str, Any]]) -> set[str]:
+    """Return the ids of features that edits put and delete, and of the ends of edges."""
+    out: set[Any] = set()
+    for change in changes:
+        feature = change.get("feature")
+        feature = feature if isinstance(feature, Mapping) else {}
+        properties = feature.get("properties")
+        properties = properties if isinstance(properties, Mapping) else {}
+        for value in (change.get("id"), feature.get("id"), properties.get("source"), properties.get("target")):
+            if isinstance(value, str):
+                out.add(value)
+    return out
+
+
 class _Session:
-    def __init__(self, store: Store, base: Version) -> None:
-        self._store, self._base = store, base
+    def __init__(self, store: Store, base: Version, named: Collection[str]) -> None:
+        self._store, self._base, self._named = store, base, named
         self._frame: LocalFrame | None = None if base.datum is None else local_frame(base.datum)
-        self._drafts: dict[PartKey, _Draft] = {}
+        self._drafts: dict[PartKey, EditedPart] = {}
         self._grids: dict[PartKey, OccupancyGrid] = {}
         self._keys = {e.key for e in base.parts}
         self._datum = base.datum
@@ -150,6 +122,8 @@ class _Session:
                 continue
             put = {i for i, (_, p, _) in draft.puts.items() if p.get("kind") == "edge"}
             cut = {i for node in draft.deletes for i in draft.connected_edges(node) if draft.has_item(i)}
+            ends = (draft.row(i)[1].get(end) for i in put | cut for end in ("source", "target"))
+            draft.read(end for end in ends if isinstance(end, str))
             for item in sorted(put | cut):
                 properties = draft.row(item)[1]
                 if properties.get("kind") != "edge":
@@ -163,7 +137,7 @@ class _Session:
                         out.append(Problem(problem, where=item))
         return out
 
-    def _is_node(self, draft: _Draft, item: Any) -> bool:
+    def _is_node(self, draft: EditedPart, item: Any) -> bool:
         """Return whether this network, or that of another level, has a node with this id."""
         if not isinstance(item, str):
             return False
@@ -175,9 +149,9 @@ class _Session:
         )
 
     @staticmethod
-    def _was_dangling(draft: _Draft, item: str, end: str, node: Any) -> bool:
+    def _was_dangling(draft: EditedPart, item: str, end: str, node: Any) -> bool:
         """Return whether the stored edge had this dangling end before these edits."""
-        return item in draft.place and draft.before(item)[1].get(end) == node and node not in draft.deletes
+        return draft.is_stored(item) and draft.before(item)[1].get(end) == node and node not in draft.deletes
 
     def loosen(self) -> None:
         """Unlink network features from the drawn line they were read from if either was edited.
@@ -189,25 +163,17 @@ class _Session:
         for key, draft in list(self._drafts.items()):
             if key.layer == "objects" and key.name in families:
                 touched[key.level] |= draft.edited_ids()
-            elif key.layer == "topology" and draft.stored is not None:
-                positions = {i: k for k, i in enumerate(draft.stored.ids)}
-                sources = {
-                    draft.stored.properties[positions[i]].get("drawn_from")
-                    for i in draft.edited_ids()
-                    if i in positions
-                }
+            elif key.layer == "topology":
+                sources = {draft.before(i)[1].get("drawn_from") for i in draft.edited_ids()}
                 touched[key.level] |= {s for s in sources if isinstance(s, str)}
         for key in sorted(self._keys):
             if key.layer != "topology" or not touched[key.level]:
                 continue
             draft = self._draft(key)
-            for item in draft.stored.ids if draft.stored is not None else ():
-                if item in draft.deletes:
-                    continue
+            for item in draft.drawn_from(touched[key.level]):
                 geometry, properties, local = draft.row(item)
-                if properties.get("drawn_from") in touched[key.level]:
-                    remaining = {name: value for name, value in properties.items() if name != "drawn_from"}
-                    draft.puts[item] = (geometry, remaining, local)
+                remaining = {name: value for name, value in properties.items() if name != "drawn_from"}
+                draft.puts[item] = (geometry, remaining, local)
 
     def changes(self) -> Changes:
         """Build the change set for the store."""
@@ -237,10 +203,9 @@ class _Session:
         """Return the provenance of an edited part: it keeps its kind (raw, derived …) and is not derived again."""
         return next((e.provenance for e in self._base.parts if e.key == key), EDITED).with_edit_step()
 
-    def _draft(self, key: PartKey) -> _Draft:
+    def _draft(self, key: PartKey) -> EditedPart:
         if key not in self._drafts:
-            stored = self._store.content.load(self._base, [key]).parts.get(key) if key in self._keys else None
-            self._drafts[key] = _Draft(stored if isinstance(stored, Features) else None)
+            self._drafts[key] = EditedPart(self._store.content, self._base, key, self._named)
         return self._drafts[key]
 
     def _layer(self, change: Mapping[str, Any]) -> Layer:
@@ -313,7 +278,7 @@ class _Session:
             return stored, anchored
         return (geometry if anchored == local else self._other(geometry, local)), anchored
 
-    def _straight(self, draft: _Draft, properties: Mapping[str, Any]) -> tuple[Any, bool]:
+    def _straight(self, draft: EditedPart, properties: Mapping[str, Any]) -> tuple[Any, bool]:
         """Build the straight geometry of an edge that has none, from node to node."""
         ends = []
         for end in ("source", "target"):
@@ -333,10 +298,10 @@ class _Session:
         return (self._frame.geometries_to_wgs84(one) if local else self._frame.geometries_to_local(one))[0]
 
     def _drag_edges(
-        self, draft: _Draft, node: str, before: tuple[Any, Properties, bool], now: tuple[Any, bool]
+        self, draft: EditedPart, node: str, before: tuple[Any, Properties, bool], now: tuple[Any, bool]
     ) -> None:
         """Move the ends of connected edges with a moved node, unless these edits put the edge itself."""
-        if draft.stored is None or before[0].equals_exact(now[0], 0.0):
+        if before[0].equals_exact(now[0], 0.0):
             return
         for item in draft.connected_edges(node):
             if item in draft.deletes or (item in draft.puts and item not in draft.dragged):
@@ -364,7 +329,7 @@ class _Session:
         if not draft.has_item(item):
             raise NotFound(f"feature {item!r:.80} not found in {layer}")
         draft.puts.pop(item, None)
-        if item in draft.place:
+        if draft.is_stored(item):
             draft.deletes.add(item)
 
     def _find_part(self, layer: Layer, item: str, change: Mapping[str, Any]) -> PartKey:
@@ -482,10 +447,6 @@ def parse_geometry(geometry: Any) -> Any:
         return shapely.geometry.shape(geometry)
     except Exception as error:
         raise Invalid(f"invalid GeoJSON geometry: {error}") from error
-
-
-def _equal(a: tuple[Any, Properties, bool], b: tuple[Any, Properties, bool]) -> bool:
-    return a[2] == b[2] and a[1] == b[1] and bool(shapely.equals_identical(a[0], b[0]))
 
 
 def _is_nearly_equal(a: Any, b: Any, tolerance: float) -> bool:

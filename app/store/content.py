@@ -19,6 +19,7 @@ from app.store.diff import FeatureChanges
 from app.store.parts.features import features_from_items, features_in_box, find_places, items_by_id
 from app.store.parts.roots import PartRoot, read_document, read_root
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
+from app.store.references import References
 from app.store.tree import ChunkStage
 from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
 
@@ -28,6 +29,7 @@ class ContentReader:
 
     def __init__(self, chunks: Chunks, blobs: Blobs) -> None:
         self._chunks, self._blobs = chunks, blobs
+        self._references = References()
 
     def load(self, version: Version, keys: Collection[PartKey] | None = None) -> Layers:
         """Read a version's content, or some parts of it. Raises NotFound if the version has no part with a given key.
@@ -76,6 +78,12 @@ class ContentReader:
                 selected_ids = set(ids)
                 items = {i: item for i, item in items.items() if i in selected_ids}
         return features_from_items(items, read_document(draft, root))
+
+    def referring(self, version: Version, key: PartKey, names: Collection[str]) -> Features:
+        """Read the features that name one of these as ``source``, ``target`` or ``drawn_from``, and some others."""
+        draft = self._chunks.stage()
+        root = self._root(draft, version, key)
+        return features_from_items(self._references.items(draft, root, names), {})
 
     def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
         """Return the given ids that the part has; none if there is no such part."""
