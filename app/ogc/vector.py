@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from starlette.concurrency import run_in_threadpool
+
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension
@@ -84,16 +86,18 @@ async def _collections(service: Service) -> Sequence[Collection]:
     if datum is None:
         return ()
     crs = list(reference_systems(service, datum))
+    shown = await vector_tables(service)
+    boxes = await run_in_threadpool(lambda: {name: table.bbox for name, table in shown.items()})
     return [
         Collection(
             id=name,
             title=TITLES[name][1],
             description=f"{TITLES[name][2]} {len(table)} features.",
-            bbox=table.bbox,
+            bbox=boxes[name],
             members={"itemType": "feature", "crs": crs, "storageCrs": CRS84},
             links=item_links(service, name),
         )
-        for name, table in (await vector_tables(service)).items()
+        for name, table in shown.items()
     ]
 
 
@@ -105,7 +109,8 @@ async def _paths(service: Service) -> Mapping[str, object]:
     for name, table in (await tables(service)).items():
         base, title = f"/collections/{name}", title_of(service, name)
         suffix = name.title().replace("-", "")
-        filters = [_filter_parameter(key, sorted(types)) for key, types in queryables(table).items()]
+        properties = await run_in_threadpool(queryables, table)
+        filters = [_filter_parameter(key, sorted(types)) for key, types in properties.items()]
         item_id = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}
         out[base] = operation(f"describe{suffix}", f"{title}: collection", (JSON, HTML))
         out[f"{base}/items"] = operation(
