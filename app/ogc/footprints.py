@@ -15,7 +15,7 @@ from app.api.http.responses import API
 from app.convert.extents import raster_outline
 from app.convert.placement import place_raster
 from app.convert.recently_used import RecentlyUsed
-from app.model.features import NO_GEOMETRY, Features
+from app.model.features import NO_GEOMETRY
 from app.model.frame import GROUND, Datum
 from app.model.geodesy import local_frame
 from app.model.imagery import LOCAL
@@ -86,9 +86,7 @@ async def footprint_table(service: Service, name: str) -> Table | None:
         footprint = await run_in_threadpool(_read, service, entry, datum)
     addresses = {"map": service.url("collections", name, "map"), "geotiff": cog_url(service, entry)}
     properties = {**footprint.properties, **{key: url for key, url in addresses.items() if url is not None}}
-    geometry = np.array([footprint.geometry], object)
-    part = Features((entry.key.name,), geometry, (properties,), np.array([footprint.local]))
-    return table_of(entry.key, part, datum)
+    return table_of(entry.key, entry.key.name, footprint.geometry, properties, local=footprint.local, datum=datum)
 
 
 def _read(service: Service, entry: PartEntry, datum: Datum) -> _Footprint:

@@ -36,11 +36,6 @@ def _trail(service: Service, collection: str | None = None) -> list[tuple[str, s
     return out
 
 
-def _properties(source: Table, row: int) -> dict[str, Any]:
-    loaded: dict[str, Any] = orjson.loads(source.texts[row])["properties"]
-    return loaded
-
-
 def _text(value: object, length: int = MAX_CELL) -> str:
     text = value if isinstance(value, str) else "" if value is None else orjson.dumps(value).decode()
     return text if len(text) <= length else text[: length - 1] + "…"
@@ -54,7 +49,7 @@ def items_page(
     add(body, "p", f"{len(rows)} of {matched} features on this page.")
     draw_map(body, source.in_wgs84(rows))
     shown = rows[:MAX_ROWS].tolist()
-    loaded = [_properties(source, row) for row in shown]
+    loaded = [source.properties(row) for row in shown]
     names = list(dict.fromkeys(name for one in loaded for name in one))[:MAX_COLUMNS]
     lines = [
         (
@@ -77,9 +72,7 @@ def item_page(service: Service, collection: str, source: Table, row: int, links:
     """Build the page of a feature."""
     root, body = page(source.ids[row], _trail(service, collection))
     draw_map(body, source.in_wgs84(np.array([row])))
-    table(
-        body, ("property", "value"), [(name, _text(value, 20_000)) for name, value in _properties(source, row).items()]
-    )
+    table(body, ("property", "value"), [(name, _text(value, 20_000)) for name, value in source.properties(row).items()])
     representations(body, links)
     return root
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
-import orjson
 import shapely
 from numpy.typing import NDArray
 
@@ -210,13 +209,9 @@ def _in_box(table: Table, box: Box, crs: ReferenceSystem) -> Rows:
 
 def _with_value(table: Table, rows: Rows, name: str, values: Sequence[object]) -> Rows:
     """Return the rows whose property has one of these values. Booleans and numbers are never equal."""
-    key = orjson.dumps(name) + b":"
     chosen = []
-    for row in rows.tolist():
-        text = table.texts[row]
-        if key not in text:
-            continue
-        value = orjson.loads(text[table.spans[row, 1] + len(b',"properties":') : -1]).get(name)
+    for row in table.with_property(rows.tolist(), name, values):
+        value = table.properties(row).get(name)
         if any(value == one and isinstance(value, bool) == isinstance(one, bool) for one in values):
             chosen.append(row)
     return np.array(chosen, np.intp)

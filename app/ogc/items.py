@@ -29,7 +29,7 @@ from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcFeatureOut, OgcFeaturesOut
 from app.ogc.service import Link, Service, link
 from app.ogc.tables import Table
-from app.ogc.vector import find_table, queryables, tables, title_of
+from app.ogc.vector import RESERVED, find_table, queryables, tables, title_of
 
 ITEMS = {"json": GEOJSON, "jsonfg": JSONFG, "html": HTML}
 
@@ -76,7 +76,7 @@ async def _table(service: Service, collection: str) -> Table:
 
 def feature_texts(table: Table, rows: NDArray[np.intp], output: Output, collection: str) -> list[bytes]:
     """Write features as JSON."""
-    texts = [table.texts[row] for row in rows.tolist()]
+    texts = table.texts(rows.tolist())
     other = output.place or (output.crs if output.crs.kind != "crs84" else None)
     shapes: list[bytes] = []
     if other is not None:
@@ -87,11 +87,10 @@ def feature_texts(table: Table, rows: NDArray[np.intp], output: Output, collecti
         places = shapes or [b"null"] * len(texts)
         heads = [kind + place + b"," for place in places]
         at = len(b'{"type":"Feature",')
-        return [text[:at] + head + text[at:] for text, head in zip(texts, heads, strict=True)]
+        return [text[:at] + head + text[at:] for (text, _, _), head in zip(texts, heads, strict=True)]
     if not shapes:
-        return texts
-    spans = table.spans[rows].tolist()
-    return [text[:a] + shape + text[b:] for text, shape, (a, b) in zip(texts, shapes, spans, strict=True)]
+        return [text for text, _, _ in texts]
+    return [text[:a] + shape + text[b:] for (text, a, b), shape in zip(texts, shapes, strict=True)]
 
 
 def _finite(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -191,15 +190,18 @@ async def list_items(service: Service, collection: CollectionPath, f: Representa
     """
     table = await _table(service, collection)
     systems = reference_systems(service, table.datum)
-    query = parse_items_query(service.request.query_params.multi_items(), table, systems)
+    pairs = service.request.query_params.multi_items()
+    if any(name not in RESERVED for name, _ in pairs):
+        await run_in_threadpool(queryables, table)
+    query = parse_items_query(pairs, table, systems)
     output = _output(service, systems, query.crs)
-    if query.is_plain and output.used == "json":  # joining texts takes less than a switch of threads
-        return _respond_items(service, collection, table, query, output)
-    return await run_in_threadpool(_respond_items, service, collection, table, query, output)
+    page = find_page(table, query) if query.is_plain else await run_in_threadpool(find_page, table, query)
+    if query.is_plain and output.used == "json" and table.is_written(page.rows.tolist()):
+        return _respond_page(service, collection, table, page, output)  # takes less than a switch of threads
+    return await run_in_threadpool(_respond_page, service, collection, table, page, output)
 
 
-def _respond_items(service: Service, collection: str, table: Table, query: ItemQuery, output: Output) -> Response:
-    page = find_page(table, query)
+def _respond_page(service: Service, collection: str, table: Table, page: ItemsPage, output: Output) -> Response:
     links = _page_links(service, collection, output, page.cursor)
     if output.used == "html":
         shown = item_pages.items_page(service, collection, table, page.rows, page.matched, links)
@@ -246,7 +248,7 @@ async def get_item(
             unknown[0][:80], "is unknown", f"unknown query parameter {unknown[0][:80]!r}{near}; accepted: crs, f"
         )
     output = _output(service, systems, parse_crs(given["crs"], systems, "crs") if "crs" in given else None)
-    row = table.rows.get(feature)
+    row = (await run_in_threadpool(getattr, table, "rows")).get(feature)
     if row is None:
         listed = service.url("collections", collection, "items")
         raise NotFound(f"{collection} has no feature {feature[:80]!r}: list them at {listed}")
@@ -259,7 +261,7 @@ async def get_item(
     )
     if output.used == "html":
         return item_pages.respond_page(service, item_pages.item_page(service, collection, table, row, links))
-    (text,) = feature_texts(table, rows, output, collection)
+    (text,) = await run_in_threadpool(feature_texts, table, rows, output, collection)
     members = {**_fg_members(output, collection), "links": links}
     if output.used == "jsonfg":
         members.pop("featureType")  # it is a member of the feature itself
@@ -333,7 +335,7 @@ async def _respond_schema(service: Service, collection: str, name: str) -> Respo
     used = service.choose(offers)
     table = await _table(service, collection)
     build = collection_schema if name == "schema" else queryables_schema
-    schema = build(service, collection, table)
+    schema = await run_in_threadpool(build, service, collection, table)
     if used == "json":
         return service.respond(orjson.dumps(schema), SCHEMA)
     links = service.alternates(service.url("collections", collection, name), offers, used)

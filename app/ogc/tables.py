@@ -1,4 +1,4 @@
-"""Features of a collection as prepared rows, so that a page is joined text, and a box a comparison of arrays.
+"""Features of a collection as rows, so that a page is joined text, and a box a comparison of arrays.
 
 Tables depend on the content of a layer and on the datum only, so that versions share them. They are cached up to a
 number of bytes.
@@ -7,25 +7,30 @@ number of bytes.
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from functools import cached_property
+from operator import itemgetter
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import orjson
+import ormsgpack
 import shapely
 from numpy.typing import NDArray
 
 from app.api.http.features import Position, geometries_as_geojson
 from app.api.http.responses import json_bytes
-from app.model.features import Features, Properties
+from app.model.features import Properties
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.layers import PartKey
 from app.ogc.crs import ReferenceSystem
 from app.store.content import ContentReader
 from app.store.extent import join
+from app.store.parts.features import PackedFeatures
 from app.store.values import Box, Version
 
 VectorLayer = Literal["topology", "objects", "zones", "location"]
@@ -34,14 +39,17 @@ VECTOR_LAYERS: tuple[VectorLayer, ...] = get_args(VectorLayer)
 MAX_CACHED_BYTES = 256 * 2**20
 """Maximum size of the cached tables of a process; the newest one is cached in any case."""
 
-ROW_BYTES = 600
+ROW_BYTES = 900
 """Estimated size of a row besides its text and coordinates: Python objects and a geometry."""
+
+_PLACED: Final = frozenset({"level", "part", "stored_level", "stored_part"})
+_EDGE: Final = ormsgpack.packb("kind") + ormsgpack.packb("edge")
 
 MAX_PROPERTIES = 1000
 """Maximum number of properties in a collection's schema; further ones are in its features only."""
 
 BATCH = 4096
-"""Number of features that are written at a time."""
+"""Maximum number of features that are written at a time."""
 
 WGS84_DIGITS = 12
 
@@ -57,17 +65,32 @@ _JSON_TYPES: Mapping[type, JsonType] = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class Text(NamedTuple):
+    """A feature as GeoJSON in CRS84, with the start and the end of its geometry."""
+
+    text: bytes
+    start: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """What a collection without features says of them."""
+
+    types: Mapping[str, frozenset[JsonType]]
+    geometry_types: frozenset[str]
+
+
+@dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of a collection in the order of level, part and id.
+    """Rows of a collection in the order of level, part and id. What a request may not need is made on demand, once.
 
     Attributes:
         ids: distinct ids. source_ids: those of the parts, where two parts may have the same.
         parts: first row and key of each part.
         geometry: shapely geometries as they are anchored; local: bool [n], True for metres.
-        boxes: float64 [n, 4] in degrees, NaN without coordinates. heights: float64 [n, 2], NaN without heights.
-        texts: each feature as GeoJSON in CRS84. spans: int32 [n, 2], start and end of the geometry in it.
-        types: JSON types of each property. geometry_types: names of the geometries' types.
+        packed: properties of each row as MessagePack.
+        declared: types of properties and names of geometries' types of a collection without features.
     """
 
     ids: Sequence[str]
@@ -75,28 +98,64 @@ class Table:
     parts: Sequence[tuple[int, PartKey]]
     geometry: NDArray[np.object_]
     local: NDArray[np.bool_]
-    boxes: NDArray[np.float64]
-    heights: NDArray[np.float64]
-    texts: Sequence[bytes]
-    spans: NDArray[np.int32]
-    types: Mapping[str, frozenset[JsonType]]
-    geometry_types: frozenset[str]
+    packed: Sequence[bytes]
     datum: Datum
-    rows: Mapping[str, int] = field(default_factory=dict)
+    declared: Declared | None = None
+    _texts: dict[int, Text] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def part_of(self, row: int) -> PartKey:
         """Return the key of a row's part."""
-        return next(key for start, key in reversed(self.parts) if start <= row)
+        return self.parts[bisect_right(self.parts, row, key=itemgetter(0)) - 1][1]
 
     def position(self, row: int) -> Position:
         """Return the position of a row in the order of the collection."""
         key = self.part_of(row)
         return Position(key.layer, key.level, key.name, self.source_ids[row])
 
-    @property
+    def properties(self, row: int) -> dict[str, Any]:
+        """Return the properties of a row, with its place."""
+        return with_place(ormsgpack.unpackb(self.packed[row]), self.part_of(row))
+
+    def all_properties(self) -> Iterator[dict[str, Any]]:
+        """Yield the properties of each row, with its place."""
+        ends = [*(start for start, _ in self.parts[1:]), len(self)]
+        for (start, key), end in zip(self.parts, ends, strict=True):
+            for packed in self.packed[start:end]:
+                yield with_place(ormsgpack.unpackb(packed), key)
+
+    def with_property(self, rows: Sequence[int], name: str, values: Sequence[object]) -> Sequence[int]:
+        """Return the rows whose property may have one of these values: without unpacking what cannot."""
+        if name in _PLACED:
+            return rows
+        words = [ormsgpack.packb(value) for value in values if isinstance(value, str)]
+        key = ormsgpack.packb(name)
+        sought = [key + word for word in words] if len(words) == len(values) else [key]
+        return [row for row in rows if any(one in self.packed[row] for one in sought)]
+
+    @cached_property
+    def rows(self) -> Mapping[str, int]:
+        """Return the row of each id."""
+        return {item: row for row, item in enumerate(self.ids)}
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """Return the boxes in degrees, float64 [n, 4], NaN without coordinates."""
+        bounds: NDArray[np.float64] = shapely.bounds(self.in_wgs84(np.arange(len(self)))).reshape(-1, 4)
+        return bounds
+
+    @cached_property
+    def heights(self) -> NDArray[np.float64]:
+        """Return the minimum and maximum height of each row, float64 [n, 2], NaN without heights."""
+        out = np.full((len(self), 2), np.nan)
+        for row in np.flatnonzero(shapely.has_z(self.geometry)).tolist():
+            z = shapely.get_coordinates(self.geometry[row], include_z=True)[:, 2]
+            out[row] = z.min(), z.max()
+        return out
+
+    @cached_property
     def bbox(self) -> Box | None:
         """Return the box in degrees around all rows, None without coordinates."""
         boxes = self.boxes[~np.isnan(self.boxes[:, 0])]
@@ -105,11 +164,52 @@ class Table:
         low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
         return join([(float(low[0]), float(low[1]), float(high[0]), float(high[1]))], self.datum.longitude)
 
+    @cached_property
+    def types(self) -> Mapping[str, frozenset[JsonType]]:
+        """Return the JSON types of each property."""
+        if self.declared is not None:
+            return self.declared.types
+        seen: dict[tuple[str, type], None] = {}  # in the order of their first feature
+        for members in self.all_properties():
+            seen.update(dict.fromkeys(zip(members, map(type, members.values()), strict=True)))
+        out: dict[str, set[JsonType]] = {}
+        for name, kind in seen:
+            if kind is not type(None) and (name in out or len(out) < MAX_PROPERTIES):
+                out.setdefault(name, set()).add(_JSON_TYPES.get(kind, "object"))
+        return {name: frozenset(types) for name, types in out.items()}
+
+    @cached_property
+    def geometry_types(self) -> frozenset[str]:
+        """Return the names of the geometries' types."""
+        if self.declared is not None:
+            return self.declared.geometry_types
+        _, first = np.unique(shapely.get_type_id(self.geometry), return_index=True)
+        return frozenset(str(geometry.geom_type) for geometry in self.geometry[first])
+
+    def is_written(self, rows: Sequence[int]) -> bool:
+        """Return whether the texts of rows are ready."""
+        return all(row in self._texts for row in rows)
+
+    def texts(self, rows: Sequence[int]) -> list[Text]:
+        """Return rows as GeoJSON in CRS84."""
+        missing = [row for row in rows if row not in self._texts]
+        for start in range(0, len(missing), BATCH):
+            self._write(missing[start : start + BATCH])
+        return [self._texts[row] for row in rows]
+
+    def _write(self, rows: Sequence[int]) -> None:
+        shapes = geometries_as_geojson(self.in_wgs84(np.array(rows, np.intp)), WGS84_DIGITS)
+        for row, shape in zip(rows, shapes, strict=True):
+            head = b'{"type":"Feature","id":' + orjson.dumps(self.ids[row]) + b',"geometry":'
+            shown = b"null" if shape is None else bytes(orjson.dumps(shape))
+            text = head + shown + b',"properties":' + json_bytes(self.properties(row)) + b"}"
+            self._texts[row] = Text(text, len(head), len(head) + len(shown))
+
     @property
     def size(self) -> int:
-        """Return the estimated size in bytes."""
+        """Return the estimated size in bytes, once all texts are written."""
         coordinates = int(shapely.get_num_coordinates(self.geometry).sum())
-        return ROW_BYTES * len(self) + sum(map(len, self.texts)) + 24 * coordinates
+        return ROW_BYTES * len(self) + 3 * sum(map(len, self.packed)) + 72 * coordinates
 
     def in_wgs84(self, rows: NDArray[np.intp]) -> NDArray[np.object_]:
         """Return the geometries of rows in degrees."""
@@ -152,118 +252,87 @@ class _Columns:
     ids: list[str] = field(default_factory=list)
     source_ids: list[str] = field(default_factory=list)
     parts: list[tuple[int, PartKey]] = field(default_factory=list)
-    arrays: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
-    texts: list[bytes] = field(default_factory=list)
-    types: dict[str, set[JsonType]] = field(default_factory=dict)
-    rows: dict[str, int] = field(default_factory=dict)
+    geometry: list[NDArray[np.object_]] = field(default_factory=list)
+    local: list[NDArray[np.bool_]] = field(default_factory=list)
+    packed: list[bytes] = field(default_factory=list)
+    taken: set[str] = field(default_factory=set)
 
-    def add_part(self, key: PartKey, part: Features, indices: NDArray[np.intp], frame: LocalFrame) -> None:
+    def add_part(self, key: PartKey, part: PackedFeatures, rows: NDArray[np.intp]) -> None:
         """Add some features of a part."""
         self.parts.append((len(self.ids), key))
-        for start in range(0, len(indices), BATCH):
-            self._add_batch(key, part, indices[start : start + BATCH], frame)
-
-    def _add_batch(self, key: PartKey, part: Features, indices: NDArray[np.intp], frame: LocalFrame) -> None:
-        geometry, local = part.geometry[indices], part.local[indices]
-        degrees = _converted(geometry, local, frame)
-        spans = np.empty((len(indices), 2), np.int32)
-        shapes = geometries_as_geojson(degrees, WGS84_DIGITS)
-        for k, (index, shape) in enumerate(zip(indices.tolist(), shapes, strict=True)):
-            source_id, properties = part.ids[index], part.properties[index]
-            item = self._distinct_id(source_id, key)
-            members = with_place(properties, key)
-            self._note_types(members)
-            head = b'{"type":"Feature","id":' + orjson.dumps(item) + b',"geometry":'
-            shown = b"null" if shape is None else bytes(orjson.dumps(shape))
-            self.texts.append(head + shown + b',"properties":' + json_bytes(members) + b"}")
-            spans[k] = len(head), len(head) + len(shown)
-            self.ids.append(item)
-            self.source_ids.append(source_id)
-        columns = {
-            "geometry": geometry,
-            "local": local,
-            "boxes": shapely.bounds(degrees).reshape(-1, 4),
-            "heights": _heights(degrees),
-            "spans": spans,
-        }
-        for name, column in columns.items():
-            self.arrays.setdefault(name, []).append(column)
+        numbers = rows.tolist()
+        ids = [part.ids[row] for row in numbers]
+        self.source_ids += ids
+        if self.taken.isdisjoint(ids):
+            self.taken.update(ids)
+        else:
+            ids = [self._distinct_id(item, key) for item in ids]
+        self.ids += ids
+        self.geometry.append(part.geometry[rows])
+        self.local.append(part.local[rows])
+        self.packed += [part.properties[row] for row in numbers]
 
     def _distinct_id(self, item: str, key: PartKey) -> str:
         """Return the id, qualified by level and part if an earlier part has the same one."""
         candidate, number = item, 1
-        while candidate in self.rows:
+        while candidate in self.taken:
             candidate = f"{item}@{key.level}/{key.name}" + (f"#{number}" if number > 1 else "")
             number += 1
-        self.rows[candidate] = len(self.ids)
+        self.taken.add(candidate)
         return candidate
-
-    def _note_types(self, properties: Properties) -> None:
-        for name, value in properties.items():
-            if value is None or (name not in self.types and len(self.types) >= MAX_PROPERTIES):
-                continue
-            self.types.setdefault(name, set()).add(_JSON_TYPES.get(type(value), "object"))
 
     def table(self, datum: Datum) -> Table:
         """Return the table."""
-        arrays = {name: np.concatenate(columns) for name, columns in self.arrays.items()}
-        kinds = frozenset(str(name) for name in {g.geom_type for g in arrays["geometry"]})
-        return Table(
-            ids=self.ids,
-            source_ids=self.source_ids,
-            parts=self.parts,
-            texts=self.texts,
-            types={name: frozenset(types) for name, types in self.types.items()},
-            geometry_types=kinds,
-            datum=datum,
-            rows=self.rows,
-            **arrays,
-        )
+        geometry, local = np.concatenate(self.geometry), np.concatenate(self.local)
+        return Table(self.ids, self.source_ids, self.parts, geometry, local, self.packed, datum)
 
 
 def with_place(properties: Properties, key: PartKey) -> dict[str, Any]:
     """Add level and part; stored properties of these names move to ``stored_level`` and ``stored_part``."""
-    place = {"level": key.level, "part": key.name}
-    moved = {f"stored_{name}": properties[name] for name in place if name in properties}
-    return {**properties, **place, **moved}
-
-
-def _heights(geometry: NDArray[np.object_]) -> NDArray[np.float64]:
-    """Return minimum and maximum z of each geometry, NaN for those without."""
-    out = np.full((len(geometry), 2), np.nan)
-    for row in np.flatnonzero(shapely.has_z(geometry)).tolist():
-        z = shapely.get_coordinates(geometry[row], include_z=True)[:, 2]
-        out[row] = z.min(), z.max()
+    out = {**properties, "level": key.level, "part": key.name}
+    if "level" in properties:
+        out["stored_level"] = properties["level"]
+    if "part" in properties:
+        out["stored_part"] = properties["part"]
     return out
 
 
 def build_tables(content: ContentReader, version: Version, layer: VectorLayer) -> dict[str, Table]:
-    """Build the tables of a layer, by id of the collection. Takes seconds for 100 000 features: call it in a thread."""
+    """Build the tables of a layer, by id of the collection. Not for the event loop: large ones take a second."""
     assert version.datum is not None
-    frame = local_frame(version.datum)
     columns: dict[str, _Columns] = {}
-    for key, part in _parts(content, version, layer):
-        kinds = [properties.get("kind") for properties in part.properties]
-        shapes = shapely.get_type_id(part.geometry).tolist()
-        names = np.array([collection_of(layer, k, s) for k, s in zip(kinds, shapes, strict=True)], object)
-        for name in dict.fromkeys(names.tolist()):
-            columns.setdefault(name, _Columns()).add_part(key, part, np.flatnonzero(names == name), frame)
+    for entry in version.parts:
+        if entry.key.layer == layer and entry.count:
+            part = content.packed_features(version, entry.key)
+            names = _collections_of(layer, part)
+            for name in dict.fromkeys(names.tolist()):
+                columns.setdefault(name, _Columns()).add_part(entry.key, part, np.flatnonzero(names == name))
     return {name: one.table(version.datum) for name, one in sorted(columns.items())}
 
 
-def table_of(key: PartKey, part: Features, datum: Datum) -> Table:
-    """Build the table of all features of one part."""
-    columns = _Columns()
-    columns.add_part(key, part, np.arange(len(part)), local_frame(datum))
-    return columns.table(datum)
+def _collections_of(layer: VectorLayer, part: PackedFeatures) -> NDArray[np.object_]:
+    """Return the id of the collection of each feature."""
+    if layer == "topology":
+        names = [collection_of(layer, "edge" if _is_edge(packed) else "node", 0) for packed in part.properties]
+    else:
+        names = [collection_of(layer, None, shape) for shape in shapely.get_type_id(part.geometry).tolist()]
+    return np.array(names, object)
 
 
-def _parts(content: ContentReader, version: Version, layer: VectorLayer) -> Iterator[tuple[PartKey, Features]]:
-    for entry in version.parts:
-        if entry.key.layer == layer and entry.count:
-            part = content.load(version, [entry.key]).parts[entry.key]
-            assert isinstance(part, Features)
-            yield entry.key, part
+def _is_edge(packed: bytes) -> bool:
+    """Return whether packed properties have the kind ``edge``; most that have not lack these bytes."""
+    return _EDGE in packed and ormsgpack.unpackb(packed).get("kind") == "edge"
+
+
+def table_of(key: PartKey, item: str, geometry: Any, properties: Properties, *, local: bool, datum: Datum) -> Table:
+    """Build the table of one feature."""
+    packed = ormsgpack.packb(dict(properties))
+    return Table([item], [item], [(0, key)], np.array([geometry], object), np.array([local]), [packed], datum)
+
+
+def empty_table(declared: Declared, datum: Datum) -> Table:
+    """Build a table without rows."""
+    return Table([], [], [], np.empty(0, object), np.empty(0, bool), [], datum, declared)
 
 
 # --- cache ---

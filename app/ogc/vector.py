@@ -5,13 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from starlette.concurrency import run_in_threadpool
+
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension
 from app.ogc.footprints import footprint_table, raster_parts, raster_title
 from app.ogc.negotiation import GEOJSON, HTML, JSON, JSONFG, SCHEMA
 from app.ogc.service import Link, Service, link
-from app.ogc.tables import CACHE, VECTOR_LAYERS, Table, VectorLayer, build_tables, table_key
+from app.ogc.tables import (
+    CACHE,
+    VECTOR_LAYERS,
+    Declared,
+    JsonType,
+    Table,
+    VectorLayer,
+    build_tables,
+    empty_table,
+    table_key,
+)
 
 TITLES: Final[Mapping[str, tuple[VectorLayer, str, str]]] = {
     "nodes": ("topology", "Nodes", "Places of the network that robots drive on."),
@@ -24,6 +36,23 @@ TITLES: Final[Mapping[str, tuple[VectorLayer, str, str]]] = {
     "fence": ("location", "Fence", "The area of the site."),
 }
 """Collections by id: layer, title, description."""
+
+
+def _declared(geometry_type: str, *names: str) -> Declared:
+    text: frozenset[JsonType] = frozenset({"string"})
+    return Declared(dict.fromkeys((*names, "name", "level", "part"), text), frozenset({geometry_type}))
+
+
+EMPTY: Final[Mapping[str, Declared]] = {
+    "nodes": _declared("Point", "kind"),
+    "edges": _declared("LineString", "kind", "source", "target"),
+    "objects-points": _declared("Point", "kind"),
+    "objects-lines": _declared("LineString", "kind"),
+    "objects-polygons": _declared("Polygon", "kind"),
+    "zones": _declared("Polygon", "kind"),
+    "fence": _declared("Polygon", "kind"),
+}
+"""What drafts say of collections without features, so that programs can add the first one."""
 
 
 async def layer_tables(service: Service, layer: VectorLayer) -> dict[str, Table]:
@@ -45,11 +74,21 @@ async def find_table(service: Service, name: str) -> Table | None:
     entry = TITLES.get(name)
     if entry is None:
         return await footprint_table(service, name)
-    return (await layer_tables(service, entry[0])).get(name)
+    table = (await layer_tables(service, entry[0])).get(name)
+    datum = service.version.datum
+    if table is None and service.draft is not None and datum is not None and name in EMPTY:
+        return empty_table(EMPTY[name], datum)
+    return table
 
 
 async def vector_tables(service: Service) -> dict[str, Table]:
-    """Return the tables of the vector layers, in the order of TITLES."""
+    """Return the tables of the vector layers, in the order of TITLES.
+
+    Drafts have those without features, too: a version cannot be written, so empty layers would only be in the way.
+    """
+    if service.draft is not None:
+        found = {name: await find_table(service, name) for name in TITLES}
+        return {name: table for name, table in found.items() if table is not None}
     cached = {name: table for layer in VECTOR_LAYERS for name, table in (await layer_tables(service, layer)).items()}
     return {name: cached[name] for name in TITLES if name in cached}
 
@@ -84,16 +123,18 @@ async def _collections(service: Service) -> Sequence[Collection]:
     if datum is None:
         return ()
     crs = list(reference_systems(service, datum))
+    shown = await vector_tables(service)
+    boxes = await run_in_threadpool(lambda: {name: table.bbox for name, table in shown.items()})
     return [
         Collection(
             id=name,
             title=TITLES[name][1],
             description=f"{TITLES[name][2]} {len(table)} features.",
-            bbox=table.bbox,
+            bbox=boxes[name],
             members={"itemType": "feature", "crs": crs, "storageCrs": CRS84},
             links=item_links(service, name),
         )
-        for name, table in (await vector_tables(service)).items()
+        for name, table in shown.items()
     ]
 
 
@@ -105,7 +146,8 @@ async def _paths(service: Service) -> Mapping[str, object]:
     for name, table in (await tables(service)).items():
         base, title = f"/collections/{name}", title_of(service, name)
         suffix = name.title().replace("-", "")
-        filters = [_filter_parameter(key, sorted(types)) for key, types in queryables(table).items()]
+        properties = await run_in_threadpool(queryables, table)
+        filters = [_filter_parameter(key, sorted(types)) for key, types in properties.items()]
         item_id = {"name": "featureId", "in": "path", "required": True, "schema": {"type": "string"}}
         out[base] = operation(f"describe{suffix}", f"{title}: collection", (JSON, HTML))
         out[f"{base}/items"] = operation(

@@ -22,6 +22,7 @@ from app.model.imagery import LOCAL
 from app.ogc.crs import ReferenceSystem
 from app.ogc.tables import Table, TableKey, VectorLayer
 from app.ogc.tile_matrix_sets import TileMatrixSet
+from app.store.gc_pause import gc_paused
 from app.store.values import Box
 from app.syntax.vector_tile import (
     LINE,
@@ -74,6 +75,7 @@ _SOURCES: RecentlyUsed[_Source] = RecentlyUsed(MAX_SOURCE_BYTES, lambda source: 
 TILES: RecentlyUsed[bytes] = RecentlyUsed(32 * 2**20, len)
 """Tiles of this process by ETag."""
 
+_SINGLE = frozenset({str, int, float, bool})
 _KINDS = np.array([1, 2, 2, 3, 1, 2, 3, 0])
 """Vector tiles' type of each of shapely's, 0 for none."""
 
@@ -117,20 +119,23 @@ def _source(name: str, key: TableKey, table: Table, one: TileMatrixSet) -> _Sour
         geometry = geodesy.geometries_from_wgs84(one.code, shapely.force_2d(table.in_wgs84(rows)))
     types = shapely.get_type_id(geometry)
     kinds = np.where(types >= 0, _KINDS[types], 0)
-    properties = encode_properties(_flat(table))
+    with gc_paused():
+        properties = encode_properties(_flat(table))
     return _SOURCES.put((name, key, one.id), _Source(geometry, shapely.bounds(geometry), kinds, properties))
 
 
 def _flat(table: Table) -> Iterator[dict[str, Value]]:
     """Yield the properties of each feature with its id; nested ones are JSON texts, as tiles have single values."""
-    for item, text in zip(table.ids, table.texts, strict=True):
-        members = orjson.loads(text)["properties"]
-        out: dict[str, Value] = {
-            name: value if isinstance(value, str | int | float) else orjson.dumps(value).decode()
-            for name, value in members.items()
-            if value is not None
-        }
-        yield {**out, "id": item}
+    for item, members in zip(table.ids, table.all_properties(), strict=True):
+        members["id"] = item
+        if _SINGLE.issuperset(map(type, members.values())):
+            yield members
+        else:
+            yield {
+                name: value if type(value) in _SINGLE else orjson.dumps(value).decode()
+                for name, value in members.items()
+                if value is not None
+            }
 
 
 def _content(source: _Source, box: Box) -> Iterator[tuple[GeometryType, Pieces, Integers]]:

@@ -16,7 +16,15 @@ from app.store.blobs import Blobs
 from app.store.cell_changes import CellChangeImage
 from app.store.chunks import Chunks
 from app.store.diff import FeatureChanges
-from app.store.parts.features import features_from_items, features_in_box, find_places, items_by_id
+from app.store.gc_pause import gc_paused
+from app.store.parts.features import (
+    PackedFeatures,
+    features_from_items,
+    features_in_box,
+    find_places,
+    items_by_id,
+    load_packed,
+)
 from app.store.parts.roots import PartRoot, read_document, read_root
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
 from app.store.references import References
@@ -84,6 +92,12 @@ class ContentReader:
         draft = self._chunks.stage()
         root = self._root(draft, version, key)
         return features_from_items(self._references.items(draft, root, names), {})
+
+    def packed_features(self, version: Version, key: PartKey) -> PackedFeatures:
+        """Read all features of a vector part by id, with packed properties: a fraction of the time of ``features``."""
+        draft = self._chunks.stage()
+        with gc_paused():
+            return load_packed(draft, self._root(draft, version, key))
 
     def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
         """Return the given ids that the part has; none if there is no such part."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ _TILE_LAYER = 3 << 3 | 2
 _NAME, _FEATURE, _KEY, _VALUE, _EXTENT, _VERSION = 1 << 3 | 2, 2 << 3 | 2, 3 << 3 | 2, 4 << 3 | 2, 5 << 3, 15 << 3
 _TAGS, _TYPE, _GEOMETRY = 2 << 3 | 2, 3 << 3, 4 << 3 | 2
 _STRING, _DOUBLE, _INT, _BOOL = 1 << 3 | 2, 3 << 3 | 1, 4 << 3, 7 << 3
+_STRING_HEADS = [bytes((_VALUE, size + 2, _STRING, size)) for size in range(126)]
+"""What comes before a value's text, by its size: all of these numbers take a byte."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,21 +69,34 @@ class EncodedProperties:
         return sum(map(len, self.values)) + 33 * len(self.values) + self.tags.nbytes + self.starts.nbytes
 
 
+T = TypeVar("T")
+
+
+class _Numbers(dict[T, int]):
+    """Numbers of values in the order of their first look-up."""
+
+    def __missing__(self, value: T) -> int:
+        self[value] = number = len(self)
+        return number
+
+
 def encode_properties(properties: Iterable[Mapping[str, Value]]) -> EncodedProperties:
     """Write the properties of features."""
-    keys: dict[str, int] = {}
-    values: dict[tuple[type, Value], int] = {}
-    tags: list[int] = []
+    keys: _Numbers[str] = _Numbers()
+    values: _Numbers[str | tuple[type, Value]] = _Numbers()
+    key_tags: list[int] = []
+    value_tags: list[int] = []
     counts: list[int] = []
     for members in properties:
-        for key, value in members.items():
-            tags.append(keys.setdefault(key, len(keys)))
-            tags.append(values.setdefault((type(value), value), len(values)))
+        key_tags += map(keys.__getitem__, members)
+        # 1, 1.0 and True are equal, so that they need their types
+        distinct = (value if value.__class__ is str else (type(value), value) for value in members.values())
+        value_tags += map(values.__getitem__, distinct)
         counts.append(len(members))
     return EncodedProperties(
         [_sized(_KEY, key.encode()) for key in keys],
-        [_sized(_VALUE, _value(value)) for _, value in values],
-        np.array(tags, np.int64).reshape(-1, 2),
+        [_string(value) if isinstance(value, str) else _sized(_VALUE, _value(value[1])) for value in values],
+        np.column_stack([np.array(key_tags, np.int64), np.array(value_tags, np.int64)]),
         np.concatenate([[0], np.cumsum(np.array(counts, np.int64))]).astype(np.int64),
     )
 
@@ -110,6 +125,11 @@ def _value(value: Value) -> bytes:
     if isinstance(value, int | float):
         return bytes((_DOUBLE,)) + struct.pack("<d", value)
     return _sized(_STRING, value.encode())
+
+
+def _string(text: str) -> bytes:
+    data = text.encode()
+    return _STRING_HEADS[len(data)] + data if len(data) < len(_STRING_HEADS) else _sized(_VALUE, _sized(_STRING, data))
 
 
 def _sized(key: int, data: bytes) -> bytes:

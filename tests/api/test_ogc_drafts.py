@@ -10,6 +10,7 @@ from tests.api.conftest import Api
 
 Json = dict[str, Any]
 
+MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 UTM = "http://www.opengis.net/def/crs/EPSG/0/32630"
 MERGE = {"content-type": "application/merge-patch+json"}
 GEOJSON = {"content-type": "application/geo+json"}
@@ -43,6 +44,26 @@ class Gis:
 @pytest.fixture
 def gis(api: Api, farm: str) -> Gis:
     return Gis(api, farm)
+
+
+def test_draft_lists_empty_collections_and_takes_their_first_feature(api: Api, gis: Gis) -> None:
+    listed = {one["id"]: one for one in api.get(f"{gis.at}/collections").json()["collections"]}
+    assert set(listed) >= {"nodes", "edges", "objects-points", "objects-lines", "objects-polygons", "zones", "fence"}
+    assert "zones" not in [one["id"] for one in api.get(f"/ogc/{gis.env}/collections").json()["collections"]]
+    assert "extent" not in listed["zones"]
+    at = f"{gis.at}/collections/zones"
+    page = api.get(f"{at}/items").json()
+    assert (page["features"], page["numberMatched"]) == ([], 0)
+    for query in ("?f=html", "?bbox=0,0,1,1", "?kind=keepout", "?f=jsonfg", f"?crs={MERCATOR}"):
+        api.get(f"{at}/items{query}")
+    schema = api.get(f"{at}/schema").json()["properties"]
+    assert schema["geometry"]["format"] == "geometry-polygon"
+    assert {"kind", "name", "level", "part"} <= set(schema)
+    ring = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [0.0, 0.0]]
+    gis.add("zones", {"type": "Polygon", "coordinates": [ring]}, kind="keepout", name="pond")
+    (zone,) = api.get(f"{at}/items").json()["features"]
+    assert (zone["id"], zone["properties"]["kind"]) == ("pond", "keepout")
+    assert api.get(f"{at}").json()["extent"]["spatial"]["bbox"]
 
 
 def point(x: float, y: float) -> Json:

@@ -328,6 +328,39 @@ def unchecked_features(
     return features
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedFeatures:
+    """Columns of a vector part in the order of the ids; properties stay packed (MessagePack), as most are not read."""
+
+    ids: Sequence[str]
+    geometry: NDArray[np.object_]
+    properties: Sequence[bytes]
+    local: NDArray[np.bool_]
+
+
+def load_packed(draft: ChunkStage, root: PartRoot) -> PackedFeatures:
+    """Load a vector part without unpacking its properties."""
+    ids: list[str] = []
+    wkb: list[bytes] = []
+    packed: list[bytes] = []
+    local_count = 0
+    for name in ("local", "wgs84"):
+        node = root.trees[name]
+        (leaves,) = tree.leaves(draft, [node]) if node is not None else ([],)
+        for start in range(0, len(leaves), BATCH):
+            some = leaves[start : start + BATCH]
+            raws = draft.stream(some)
+            for leaf in some:
+                leaf_ids, _, leaf_wkb, leaf_packed = split_leaf(raws[leaf])
+                ids += leaf_ids
+                wkb += leaf_wkb
+                packed += leaf_packed
+        local_count = len(ids) if name == "local" else local_count
+    order = sorted(range(len(ids)), key=ids.__getitem__)
+    local = np.array(order, np.intp) < local_count
+    return PackedFeatures([ids[k] for k in order], from_wkb([wkb[k] for k in order]), [packed[k] for k in order], local)
+
+
 # --- box queries ---
 
 
