@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 import numpy as np
 import shapely
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem
 from app.model import network
-from app.model.features import Features
+from app.model.features import Features, Properties
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Part, PartKey
@@ -51,7 +52,7 @@ def assign_layer(
         elif layer == "zones":
             _move(out, key, part, areas, PartKey("zones", level, ZONES), "keepout")
         elif layer == "location":
-            fence = _is_own_fence(part, areas, context, bundle, file)
+            fence = _is_own_fence(part, key.name, areas, context, bundle, file)
             _move(out, key, part, fence, PartKey("location", level, SITE), "fence")
     return out
 
@@ -70,17 +71,17 @@ def _move(
 
 
 def _is_own_fence(
-    part: Features, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
+    part: Features, family: str, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
 ) -> NDArray[np.bool_]:
     """Find the environment's fence among the polygons: a mask with at most one True."""
-    indices = np.flatnonzero(areas & ~part.local)
+    indices = np.flatnonzero(areas)
     chosen = np.zeros(len(part), bool)
     fence = bundle.fence or context.fence
     if fence is not None:
         same = [k for k in indices if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
         chosen[same[:1]] = True
         return chosen
-    named = [k for k in indices if _FENCE.search(str(part.properties[k].get("name") or ""))]
+    named = [k for k in indices if _FENCE.search(_title(part.properties[k], family))]
     if len(indices) == 1 or len(named) == 1:
         chosen[indices if len(indices) == 1 else named] = True
     elif len(indices):
@@ -88,3 +89,10 @@ def _is_own_fence(
             Problem("no polygon is named fence; all polygons become regions and no GNSS fence is set", file)
         )
     return chosen
+
+
+def _title(properties: Properties, family: str) -> str:
+    """Return the name of a polygon, and of its layer in a drawing whose polygons have no names (DXF)."""
+    details = properties.get(family)
+    layer = details.get("layer") if isinstance(details, Mapping) else None
+    return f"{properties.get('name') or ''} {layer or ''}"

@@ -20,6 +20,7 @@ from app.formats.gis.dxf import check_blocks
 from app.limits import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum
+from app.model.geodesy import local_frame
 from app.model.layers import NETWORK, SITE, Layers, PartKey
 from app.parameters import parse
 from app.syntax import ogr
@@ -262,3 +263,55 @@ def test_features_that_a_header_invents_are_refused() -> None:
             read("flatgeobuf", data)
         except (BadUpload, Invalid) as error:
             assert error.detail
+
+
+def metres_dxf(*squares: tuple[str, float], unit: int = 6) -> bytes:
+    """Return a drawing of squares (layer, side in units) with a corner at (10, 20)."""
+    rows = [
+        "0",
+        "SECTION",
+        "2",
+        "HEADER",
+        "9",
+        "$INSUNITS",
+        "70",
+        str(unit),
+        "0",
+        "ENDSEC",
+        "0",
+        "SECTION",
+        "2",
+        "ENTITIES",
+    ]
+    for layer, side in squares:
+        rows += ["0", "LWPOLYLINE", "8", layer, "100", "AcDbEntity", "100", "AcDbPolyline", "90", "4", "70", "1"]
+        for x, y in ((10, 20), (10 + side, 20), (10 + side, 20 + side), (10, 20 + side)):
+            rows += ["10", f"{x:.1f}", "20", f"{y:.1f}"]
+    return "\n".join([*rows, "0", "ENDSEC", "0", "EOF", ""]).encode()
+
+
+def test_local_dxf_is_the_fence_at_its_place_on_earth() -> None:
+    data = metres_dxf(("WALLS", 5.0), ("SITE_BOUNDARY", 100.0))
+    datum = Datum(53.2686, -0.5245, heading=90.0)
+    bundle = read_upload({"a.dxf": data}, UploadHints(layer="location"), EnvironmentContext(datum), Limits())
+    fence = bundle.parts[PartKey("location", "ground", SITE)]
+    assert isinstance(fence, Features)
+    assert [p["kind"] for p in fence.properties] == ["fence"]
+    # A heading of 90 degrees: x points south, y east. A degree of latitude is 111.3 km here, of longitude 66.7 km.
+    (polygon,) = fence.in_wgs84(local_frame(datum))
+    west, south, east, north = polygon.bounds
+    assert (west - datum.longitude, east - datum.longitude) == pytest.approx((20 / 66_720, 120 / 66_720), rel=2e-3)
+    assert (north - datum.latitude, south - datum.latitude) == pytest.approx((-10 / 111_300, -110 / 111_300), rel=2e-3)
+    rest = bundle.parts[PartKey("objects", "ground", "dxf")]
+    assert isinstance(rest, Features)
+    assert [p["dxf"]["layer"] for p in rest.properties] == ["WALLS"]
+
+
+@pytest.mark.parametrize("layer", ["location", "zones", "topology", "objects"])
+def test_local_dxf_is_any_layer_without_a_datum(layer: Any) -> None:
+    data = metres_dxf(("A", 100.0), unit=0)
+    hints = UploadHints(layer=layer, options={"metres_per_unit": "2"})
+    bundle = read_upload({"a.dxf": data}, hints, EnvironmentContext(), Limits())
+    (part,) = [p for key, p in bundle.parts.items() if key.layer == layer and isinstance(p, Features)]
+    assert part.local.all()
+    assert shapely.total_bounds(part.geometry).tolist() == [20.0, 40.0, 220.0, 240.0]
