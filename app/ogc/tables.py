@@ -251,6 +251,23 @@ def build_tables(content: ContentReader, version: Version, layer: VectorLayer) -
     return {name: one.table(version.datum) for name, one in sorted(columns.items())}
 
 
+def build_item_table(
+    content: ContentReader, version: Version, layer: VectorLayer, collection: str, item: str
+) -> Table | None:
+    """Build the table of one feature, by an id that is not qualified; None if there is none. Reads little."""
+    assert version.datum is not None
+    for entry in version.parts:
+        if entry.key.layer != layer or not entry.count:
+            continue
+        part = content.features(version, entry.key, ids=[item])
+        kinds = zip(part.properties, shapely.get_type_id(part.geometry).tolist(), strict=True)
+        if any(collection_of(layer, properties.get("kind"), shape) == collection for properties, shape in kinds):
+            columns = _Columns()
+            columns.add_part(entry.key, part, np.array([0]), local_frame(version.datum))
+            return columns.table(version.datum)
+    return None
+
+
 def _parts(content: ContentReader, version: Version, layer: VectorLayer) -> Iterator[tuple[PartKey, Features]]:
     for entry in version.parts:
         if entry.key.layer == layer and entry.count:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from starlette.concurrency import run_in_threadpool
+
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension
 from app.ogc.negotiation import GEOJSON, HTML, JSON, JSONFG, SCHEMA
 from app.ogc.service import Link, Service, link
-from app.ogc.tables import CACHE, VECTOR_LAYERS, Table, VectorLayer, build_tables, table_key
+from app.ogc.tables import CACHE, VECTOR_LAYERS, Table, VectorLayer, build_item_table, build_tables, table_key
 
 TITLES: Final[Mapping[str, tuple[VectorLayer, str, str]]] = {
     "nodes": ("topology", "Nodes", "Places of the network that robots drive on."),
@@ -43,6 +45,19 @@ async def find_table(service: Service, name: str) -> Table | None:
     """Return the table of a collection; None if there is no such collection with items."""
     entry = TITLES.get(name)
     return None if entry is None else (await layer_tables(service, entry[0])).get(name)
+
+
+async def find_item_table(service: Service, name: str, item: str) -> Table | None:
+    """Return a table of a collection that has a feature, if there is one; of a draft, whose content changes often, only
+    with this feature.
+    """
+    entry = TITLES.get(name)
+    key = None if entry is None else table_key(service.version, entry[0])
+    if entry is None or key is None or service.version.pending is None or "@" in item or CACHE.get(key) is not None:
+        return await find_table(service, name)
+    content = service.services.store.content
+    table = await run_in_threadpool(build_item_table, content, service.version, entry[0], name, item)
+    return table or await find_table(service, name)
 
 
 async def tables(service: Service) -> dict[str, Table]:
