@@ -74,7 +74,9 @@ def repair(
                 if raw is not None:
                     store.chunks.heal({name: raw})
                     healed["chunk", name] = donor.name
-    for environment, number in sorted({v for f in (*blobs.values(), *chunks.values()) for v in f.versions}):
+    users = {v for f in (*blobs.values(), *chunks.values()) for v in f.versions}
+    # drafts and dry runs keep no uploads
+    for environment, number in sorted((name, number) for name, number in users if isinstance(number, int)):
         place = (environment, number)
         lost_blobs = {n for n in blobs if ("blob", n) not in healed}
         lost_chunks = {n for n in chunks if ("chunk", n) not in healed}

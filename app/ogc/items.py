@@ -29,7 +29,7 @@ from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcFeatureOut, OgcFeaturesOut
 from app.ogc.service import Link, Service, link
 from app.ogc.tables import Table
-from app.ogc.vector import RESERVED, find_table, queryables, tables, title_of
+from app.ogc.vector import RESERVED, find_item_table, find_table, queryables, tables, title_of
 
 ITEMS = {"json": GEOJSON, "jsonfg": JSONFG, "html": HTML}
 
@@ -238,7 +238,7 @@ async def get_item(
     f: Representation = None,  # noqa: ARG001  parsed by choose()
 ) -> Response:
     """Return one feature with links."""
-    table = await _table(service, collection)
+    table = await find_item_table(service, collection, feature) or await _table(service, collection)
     systems = reference_systems(service, table.datum)
     given = service.request.query_params
     unknown = sorted(set(given) - {"f", "crs"})

@@ -335,6 +335,22 @@ def empty_table(declared: Declared, datum: Datum) -> Table:
     return Table([], [], [], np.empty(0, object), np.empty(0, bool), [], datum, declared)
 
 
+def build_item_table(
+    content: ContentReader, version: Version, layer: VectorLayer, collection: str, item: str
+) -> Table | None:
+    """Build the table of one feature, by an id that is not qualified; None if there is none. Reads little."""
+    assert version.datum is not None
+    for entry in version.parts:
+        if entry.key.layer != layer or not entry.count:
+            continue
+        part = content.features(version, entry.key, ids=[item])
+        kinds = zip(part.properties, shapely.get_type_id(part.geometry).tolist(), strict=True)
+        if any(collection_of(layer, properties.get("kind"), shape) == collection for properties, shape in kinds):
+            local = bool(part.local[0])
+            return table_of(entry.key, item, part.geometry[0], part.properties[0], local=local, datum=version.datum)
+    return None
+
+
 # --- cache ---
 
 TableKey = tuple[Datum, tuple[tuple[PartKey, str], ...]]

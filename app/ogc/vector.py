@@ -20,6 +20,7 @@ from app.ogc.tables import (
     JsonType,
     Table,
     VectorLayer,
+    build_item_table,
     build_tables,
     empty_table,
     table_key,
@@ -79,6 +80,19 @@ async def find_table(service: Service, name: str) -> Table | None:
     if table is None and service.draft is not None and datum is not None and name in EMPTY:
         return empty_table(EMPTY[name], datum)
     return table
+
+
+async def find_item_table(service: Service, name: str, item: str) -> Table | None:
+    """Return a table of a collection that has a feature, if there is one; of a draft, whose content changes often, only
+    with this feature.
+    """
+    entry = TITLES.get(name)
+    key = None if entry is None else table_key(service.version, entry[0])
+    if entry is None or key is None or service.version.pending is None or "@" in item or CACHE.get(key) is not None:
+        return await find_table(service, name)
+    content = service.services.store.content
+    table = await run_in_threadpool(build_item_table, content, service.version, entry[0], name, item)
+    return table or await find_table(service, name)
 
 
 async def vector_tables(service: Service) -> dict[str, Table]:

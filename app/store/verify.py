@@ -1,5 +1,7 @@
 """Verification of stored bytes against their hashes, and of versions' roots against their chunks. Read-only.
 
+Drafts and dry runs are checked like versions.
+
 A version's root is the hash of its parts' hashes, a part's hash that of its first chunk, and each chunk contains the
 hashes of the next: if all chunks match their hashes and none is missing, every version is unchanged since its commit.
 """
@@ -7,11 +9,11 @@ hashes of the next: if all chunks match their hashes and none is missing, every 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-from sqlalchemy import select
+from sqlalchemy import Table, select
 
 from app.errors import Damaged, Unavailable
 from app.store import tables
@@ -24,18 +26,19 @@ from app.store.parts.resources import file_leaf
 from app.store.parts.roots import document_chunks, read_root
 from app.store.prepare import version_root
 from app.store.tree import ChunkStage, Node
-from app.store.values import PartEntry
+from app.store.values import DRAFT_PREFIX, DRY_PREFIX, PartEntry
 
 Kind = Literal["database", "blob", "chunk", "version", "cache"]
 KINDS: Final[tuple[Kind, ...]] = ("database", "chunk", "version", "blob", "cache")
-VersionName = tuple[str, int]
-"""An environment's name and a version's number."""
+VersionName = tuple[str, int | str]
+"""An environment's name, and a version's number or the name of a draft or dry run: ``draft:…``, ``dry:…``."""
 
 Progress = Callable[[Kind, int], None]
 """Callback after each checked object, with its kind and its bytes."""
 
 PAGE: Final = 200
 MAX_LINES: Final = 20
+_PENDING: Final[Mapping[str, Table]] = {DRAFT_PREFIX: tables.draft, DRY_PREFIX: tables.dry_run}
 _NOTHING: Final[frozenset[str]] = frozenset()
 
 
@@ -65,7 +68,7 @@ class VerifyResult:
 
     @property
     def unused_chunks(self) -> list[str]:
-        """Return the damaged chunks that no version uses, to be removed when all others are repaired."""
+        """Return the damaged chunks that nothing uses, to be removed when all others are repaired."""
         return [f.name for f in self.findings if f.kind == "chunk" and not f.versions]
 
 
@@ -117,17 +120,48 @@ class Verifier:
             problem, entries = check_root(row)
             if problem is not None:
                 out.findings.append(Finding("version", f"{environment} {row.number}", problem, (version,)))
-            for entry in entries:
-                below = walk.below(bytes.fromhex(entry.hash))
-                for chunk in below.bad:
-                    chunk_users.setdefault(chunk, []).append(version)
-                for blob in below.blobs:
-                    blob_users.setdefault(blob, []).append(version)
+            _add_users(walk, entries, version, chunk_users, blob_users)
+        self._check_pending(out, walk, chunk_users, blob_users)
         for chunk, users in chunk_users.items():
             out.findings.append(Finding("chunk", chunk, bad.get(chunk, "lost"), tuple(dict.fromkeys(users))))
         for environment, number, blob in self._sources():
             blob_users.setdefault(blob, []).append((environment, number))
         self._check_blobs(out, blob_users)
+
+    def _check_pending(
+        self, out: VerifyResult, walk: _Walk, chunks: dict[str, list[VersionName]], blobs: dict[str, list[VersionName]]
+    ) -> None:
+        for name, row in self._pending():
+            self._count(out, "version", len(row.manifest))
+            problem, entries = _check_manifest(row)
+            bad: dict[str, list[VersionName]] = {}
+            _add_users(walk, entries, name, bad, blobs)
+            if (problem is None and not bad) or not self._is_pending(name, row.root):
+                continue  # what an edit or a commit left meanwhile may have been collected
+            if problem is not None:
+                out.findings.append(Finding("version", " ".join(map(str, name)), problem, (name,)))
+            for chunk, users in bad.items():
+                chunks.setdefault(chunk, []).extend(users)
+
+    def _pending(self) -> Iterator[tuple[VersionName, Any]]:
+        """Iterate over (name, row) of every draft and dry run."""
+        e = tables.environment
+        for prefix, t in _PENDING.items():
+            query = select(e.c.name, t.c.id, t.c.root, t.c.manifest).join(t, t.c.environment_id == e.c.id)
+            last = ""
+            while True:
+                with self._database.read() as connection:
+                    rows = connection.execute(query.where(t.c.id > last).order_by(t.c.id).limit(PAGE)).all()
+                yield from (((str(row.name), prefix + row.id), row) for row in rows)
+                if len(rows) < PAGE:
+                    break
+                last = rows[-1].id
+
+    def _is_pending(self, name: VersionName, root: str) -> bool:
+        prefix, _, key = str(name[1]).partition(":")
+        t = _PENDING[prefix + ":"]
+        with self._database.read() as connection:
+            return connection.execute(select(t.c.id).where(t.c.id == key, t.c.root == root)).first() is not None
 
     def _check_blobs(self, out: VerifyResult, users: Mapping[str, list[VersionName]]) -> None:
         missing = dict.fromkeys(users)
@@ -166,15 +200,26 @@ class Verifier:
                 return
             environment, number = rows[-1].id, rows[-1].number
 
-    def _sources(self) -> list[tuple[str, int, str]]:
-        e, s = tables.environment, tables.source
+    def _sources(self) -> list[tuple[str, int | str, str]]:
+        e, s, d = tables.environment, tables.source, tables.dry_run
         query = select(e.c.name, s.c.number, s.c.sha256).join(s, s.c.environment_id == e.c.id)
+        tried = select(e.c.name, d.c.id, d.c.sources).join(d, d.c.environment_id == e.c.id)
         with self._database.read() as connection:
-            return [(r.name, r.number, r.sha256) for r in connection.execute(query)]
+            out: list[tuple[str, int | str, str]] = [(r.name, r.number, r.sha256) for r in connection.execute(query)]
+            for row in connection.execute(tried):
+                out += [(row.name, DRY_PREFIX + row.id, source["sha256"]) for source in row.sources]
+        return out
 
 
 def check_root(row: Any) -> tuple[str | None, tuple[PartEntry, ...]]:
     """Check a version's own row; returns its problem (None if intact), and its parts."""
+    problem, entries = _check_manifest(row)
+    if problem is None and row.number == row.head and row.root != row.head_root:
+        problem = f"the root in its environment is {row.head_root}, but {row.root} was committed"
+    return problem, entries
+
+
+def _check_manifest(row: Any) -> tuple[str | None, tuple[PartEntry, ...]]:
     try:
         datum, levels, entries, templates = unpack_manifest(bytes(row.manifest))
         root = version_root(entries, datum, levels, templates)
@@ -184,9 +229,23 @@ def check_root(row: Any) -> tuple[str | None, tuple[PartEntry, ...]]:
         return f"invalid manifest ({type(error).__name__})", ()
     if root != row.root:
         return f"the root of its manifest is {root}, but {row.root} was committed", entries
-    if row.number == row.head and row.root != row.head_root:
-        return f"the root in its environment is {row.head_root}, but {row.root} was committed", entries
     return None, entries
+
+
+def _add_users(
+    walk: _Walk,
+    entries: Sequence[PartEntry],
+    name: VersionName,
+    chunks: dict[str, list[VersionName]],
+    blobs: dict[str, list[VersionName]],
+) -> None:
+    """Note which damaged chunks and which blobs these parts contain."""
+    for entry in entries:
+        below = walk.below(bytes.fromhex(entry.hash))
+        for chunk in below.bad:
+            chunks.setdefault(chunk, []).append(name)
+        for blob in below.blobs:
+            blobs.setdefault(blob, []).append(name)
 
 
 class _Walk:

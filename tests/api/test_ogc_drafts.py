@@ -201,6 +201,19 @@ def test_if_match_names_the_feature(gis: Gis) -> None:
     assert gis.item("nodes", "barn")["properties"]["a"] == 1
 
 
+@pytest.mark.parametrize(("collection", "item"), [("nodes", "barn"), ("edges", "barn_field")])
+def test_feature_is_the_same_read_alone_or_from_the_table(gis: Gis, collection: str, item: str) -> None:
+    gis.patch(collection, item, properties={"colour": "red"})
+    at = f"{gis.at}/collections/{collection}/items"
+    queries = ("", "?f=jsonfg", f"?crs={gis.api.url}{gis.at}/crs/local", "?f=html")
+    alone = [gis.api.get(f"{at}/{item}{query}") for query in queries]
+    assert gis.api.get(f"{at}/none-such", 404).json()["detail"].startswith(f"{collection} has no feature")
+    assert len(gis.api.get(at).json()["features"]) > 1, "now the table is cached"
+    for before, query in zip(alone, queries, strict=True):
+        now = gis.api.get(f"{at}/{item}{query}")
+        assert (now.headers["etag"], now.content) == (before.headers["etag"], before.content), query
+
+
 def test_drafts_of_others_are_read_and_not_written(api: Api, farm: str) -> None:
     ann, bob, viewer = api.token_for("editor"), api.token_for("editor"), api.token_for("viewer")
     Gis(ann, farm).patch("nodes", "barn", properties={"colour": "red"})

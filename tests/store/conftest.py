@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from app.store.store import Store
 from tests.postgres import Cluster, postgres_cluster, postgres_url
+from tests.store.samples import DATUM
 
 __all__ = ["postgres_cluster", "postgres_url"]
 
@@ -69,6 +71,38 @@ def store(database_url: str, tmp_path: Path) -> Iterator[Store]:
     new_store.migrate()
     yield new_store
     new_store.close()
+
+
+NOW = datetime(2030, 1, 1, tzinfo=UTC)
+
+
+class Clock:
+    """Clock that a test sets."""
+
+    now = NOW
+
+    def __call__(self) -> datetime:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def farm(store: Store, clock: Clock) -> Iterator[Store]:
+    """Store with an environment ``farm`` at version 1, and a clock."""
+    timed = Store(store.database_url, store.blob_dir, clock=clock)
+    timed.environments.create("farm", datum=DATUM)
+    yield timed
+    timed.close()
+
+
+def count(store: Store, table: str) -> int:
+    """Count the rows of a table."""
+    with store._database.read() as connection:
+        return int(connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar_one())
 
 
 @pytest.fixture

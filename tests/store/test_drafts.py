@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 
 import pytest
 
@@ -13,33 +12,10 @@ from app.store.changes import Changes, Replace
 from app.store.pending import as_prepared
 from app.store.store import Store
 from app.store.values import Draft, Pending, Writer
-from tests.store.samples import DATUM, GRID, TOPOLOGY, grid, network, save
+from tests.store.conftest import Clock, count
+from tests.store.samples import GRID, TOPOLOGY, grid, network, save
 
-NOW = datetime(2030, 1, 1, tzinfo=UTC)
 ANN, BOB = Writer("1", "ann"), Writer("2", "bob")
-
-
-class Clock:
-    """Clock that a test sets."""
-
-    now = NOW
-
-    def __call__(self) -> datetime:
-        return self.now
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def farm(store: Store, clock: Clock) -> Iterator[Store]:
-    """Store with an environment ``farm`` at version 1, and a clock."""
-    timed = Store(store.database_url, store.blob_dir, clock=clock)
-    timed.environments.create("farm", datum=DATUM)
-    yield timed
-    timed.close()
 
 
 def edit(store: Store, draft: Draft, nodes: int) -> Draft:
@@ -110,8 +86,7 @@ def test_draft_expires_long_after_its_last_edit(farm: Store, clock: Clock) -> No
         farm.drafts.get("farm", draft.id)
     assert farm.drafts.all("farm") == []
     farm.drafts.remove_expired()
-    with farm._database.read() as connection:
-        assert connection.exec_driver_sql("SELECT count(*) FROM draft").scalar_one() == 0
+    assert count(farm, "draft") == 0
 
 
 def test_drafts_are_limited_in_number_and_size(farm: Store, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,5 +106,4 @@ def test_purged_environment_has_no_drafts(farm: Store) -> None:
     farm.drafts.create("farm", ANN)
     farm.environments.delete("farm")
     farm.environments.purge("farm")
-    with farm._database.read() as connection:
-        assert connection.exec_driver_sql("SELECT count(*) FROM draft").scalar_one() == 0
+    assert count(farm, "draft") == 0

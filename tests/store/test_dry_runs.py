@@ -7,9 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -21,33 +20,8 @@ from app.store.dry_runs import LIFETIME, MAX_DRY_RUNS
 from app.store.pending import as_prepared
 from app.store.store import Store
 from app.store.values import Source, Version
+from tests.store.conftest import NOW, Clock, count
 from tests.store.samples import DATUM, GRID, TOPOLOGY, assert_same_layers, everything, grid, network, replaces, save
-
-NOW = datetime(2030, 1, 1, tzinfo=UTC)
-
-
-class Clock:
-    """Clock that a test sets."""
-
-    def __init__(self) -> None:
-        self.now = NOW
-
-    def __call__(self) -> datetime:
-        return self.now
-
-
-@pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def farm(store: Store, clock: Clock) -> Iterator[Store]:
-    """Store with an environment ``farm`` at version 1, and a clock."""
-    timed = Store(store.database_url, store.blob_dir, clock=clock)
-    timed.environments.create("farm", datum=DATUM)
-    yield timed
-    timed.close()
 
 
 def attempt(store: Store, *operations: Operation, sources: tuple[Source, ...] = ()) -> Version:
@@ -57,11 +31,6 @@ def attempt(store: Store, *operations: Operation, sources: tuple[Source, ...] = 
 
 def commit(store: Store, dry: Version) -> Version:
     return store.versions.commit("farm", as_prepared(dry), author="bob", message="commit", sources=dry.sources)
-
-
-def count(store: Store, table: str) -> int:
-    with store._database.read() as connection:
-        return int(connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar_one())
 
 
 def test_dry_run_is_read_by_its_id_only(farm: Store) -> None:
@@ -211,6 +180,7 @@ from pathlib import Path
 from app.store.dry_runs import MAX_DRY_RUNS
 from app.store.store import Store
 from app.store.changes import Changes, Replace
+from tests.store.conftest import NOW, Clock, count
 from tests.store.samples import TOPOLOGY, network
 
 store = Store(sys.argv[1], Path(sys.argv[2]))

@@ -16,14 +16,16 @@ import pytest
 from sqlalchemy import exc
 
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
+from app.ingest.repair import repair
+from app.limits import Limits
 from app.store.blobs import _unreadable_error
 from app.store.changes import Changes
 from app.store.chunks import insert
 from app.store.encode import compress, digest
 from app.store.scrub import LOCK, Scrub, figures, read_state
 from app.store.store import Store
-from app.store.values import Source
-from tests.store.samples import GRID, everything, grid, replaces, save
+from app.store.values import Source, Writer
+from tests.store.samples import GRID, TOPOLOGY, everything, grid, network, replaces, save
 
 
 def filled(store: Store) -> None:
@@ -341,6 +343,55 @@ def test_page_checks_run_one_at_a_time(sqlite_store: Store, monkeypatch: pytest.
     monkeypatch.setattr(database, "integrity", lambda limit: None)
     database.check()
     database.check()
+
+
+def test_verification_covers_drafts_and_dry_runs(farm: Store) -> None:
+    draft = farm.drafts.create("farm", Writer("1", "ann"))
+    current, base = farm.versions.get("farm", draft.ref), farm.versions.get("farm")
+    assert current.pending is not None
+    prepared = farm.versions.prepare_further(base, current, Changes(replaces({TOPOLOGY: network(60)})))
+    farm.drafts.store("farm", current.pending, prepared, rebased=False)
+    digest = farm.blobs.put(b"original" * 10_000)
+    tried = farm.versions.prepare(base, Changes(replaces({TOPOLOGY: network(50)})))
+    source = Source("o", 80_000, digest)
+    dry = farm.versions.store_dry_run("farm", tried, author="ann", message="", sources=(source,))
+    verification = farm.verifier().run()
+    assert verification.findings == []
+    assert verification.checked["version"] == 4
+    for ref in (draft.ref, dry.ref):
+        entry = farm.versions.get("farm", ref).part(TOPOLOGY)
+        assert entry is not None
+        spoil_chunk(farm, entry.hash)
+        verification = farm.verifier().run()
+        (finding,) = [f for f in verification.findings if f.name == entry.hash]
+        assert (finding.kind, finding.problem, finding.versions) == ("chunk", "damaged", (("farm", ref),))
+        assert entry.hash not in verification.unused_chunks, "else a repair would take it from the draft"
+    assert repair(farm, verification.findings, [], lambda *_: pytest.fail("a draft has no uploads"), Limits()) == {}
+    path = farm.blobs.path(digest)
+    assert path is not None
+    path.unlink()
+    assert ("blob", digest, (("farm", dry.ref),)) in {
+        (f.kind, f.name, f.versions) for f in farm.verifier().run().findings
+    }
+    farm.drafts.delete("farm", draft.id)
+    left = {users for f in farm.verifier().run().findings for users in f.versions}
+    assert left == {("farm", dry.ref)}
+
+
+def test_draft_that_changes_during_the_verification_is_no_damage(farm: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    draft = farm.drafts.create("farm", Writer("1", "ann"))
+    current, base = farm.versions.get("farm", draft.ref), farm.versions.get("farm")
+    assert current.pending is not None
+    prepared = farm.versions.prepare_further(base, current, Changes(replaces({TOPOLOGY: network(60)})))
+    farm.drafts.store("farm", current.pending, prepared, rebased=False)
+    entry = farm.versions.get("farm", draft.ref).part(TOPOLOGY)
+    assert entry is not None
+    verifier = farm.verifier()
+    rows = list(verifier._pending())
+    monkeypatch.setattr(verifier, "_pending", lambda: iter(rows))
+    farm.drafts.delete("farm", draft.id)
+    spoil_chunk(farm, entry.hash, lose=True)
+    assert verifier.run().findings == []
 
 
 def test_repair_removes_only_damaged_unused_chunks(store: Store) -> None:
