@@ -9,8 +9,6 @@ from __future__ import annotations
 import dataclasses
 import ipaddress
 import os
-import re
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, Self
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -21,55 +19,9 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from app.events.ros_names import parse_keys, parse_selectors
 from app.limits import Limits
 from app.logs import LogFormat
+from app.setting_values import basemap_origin, parse_networks, parse_size
 
 _DEFAULTS = Limits()
-
-_UNITS = {"": 1, "b": 1} | {f"{p}b": 1000**n for n, p in enumerate("kmgt", 1)}
-_UNITS |= {f"{p}ib": 1024**n for n, p in enumerate("kmgt", 1)}
-_SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)", re.IGNORECASE)
-
-
-def parse_size(text: str) -> int:
-    """Parse a size such as ``512MiB``, ``2 GB`` or ``1048576`` as bytes. Raises ValueError."""
-    match = _SIZE.fullmatch(text.strip())
-    factor = _UNITS.get(match[2].lower()) if match else None
-    if match is None or factor is None:
-        raise ValueError(
-            f"must be a size in bytes, such as 512MiB or 2GB, got {text[:40]!r}: units are kB, MB, GB and TB "
-            "(powers of 1000), KiB, MiB, GiB and TiB (powers of 1024)"
-        )
-    size = Decimal(match[1]) * factor
-    if size != int(size):
-        raise ValueError(f"must be a whole number of bytes, got {text[:40]!r}")
-    return int(size)
-
-
-def format_size(size: int) -> str:
-    """Format bytes for ``parse_size``, with the largest unit that gives a whole number."""
-    for unit, factor in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
-        if size and size % factor == 0:
-            return f"{size // factor}{unit}"
-    return str(size)
-
-
-def parse_networks(text: str) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
-    """Parse comma-separated addresses and CIDRs. Raises ValueError."""
-    out = []
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        try:
-            out.append(ipaddress.ip_network(part))
-        except ValueError as error:
-            raise ValueError(f"{error}: use networks such as 192.168.7.0/24, comma-separated") from None
-    return out
-
-
-_ORIGIN = re.compile(r"(https?://(?:[a-z0-9.-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?)/[!-~]*", re.IGNORECASE)
-
-
-def basemap_origin(url: str) -> str | None:
-    """Return the origin of a base map's tiles; None if the URL is no plain one with a host."""
-    match = _ORIGIN.fullmatch(url)
-    return match[1].lower() if match else None
 
 
 class Settings(BaseSettings):
@@ -85,6 +37,11 @@ class Settings(BaseSettings):
         default=None,
         description="Database URL: `postgresql+psycopg://user:password@host/name` (with PostGIS), or `sqlite:///FILE`. "
         "Default: an SQLite file in the data folder.",
+    )
+    database_direct_url: str | None = Field(
+        default=None,
+        description="Database URL for locks and notifications, if `database_url` leads to a pooler of transactions "
+        "such as PgBouncer: that of PostgreSQL itself. Default: `database_url`.",
     )
     blob_url: str | None = Field(
         default=None,
@@ -107,6 +64,11 @@ class Settings(BaseSettings):
         default=None,
         description="Token of the first administrator, for containers and tests; use at least 32 random characters. "
         "Unset: the first start creates a token and prints it once.",
+    )
+    signing_key: Path | None = Field(
+        default=None,
+        description="File with the private Ed25519 key (PEM) that signs manifests, the same on all servers; older keys "
+        "below it endorse it. Unset: the first start creates a key, in the data folder or in PostgreSQL.",
     )
     insecure_no_auth: bool = Field(
         default=False,
@@ -406,6 +368,8 @@ class Settings(BaseSettings):
 
     @field_validator(
         "database_url",
+        "database_direct_url",
+        "signing_key",
         "blob_url",
         "admin_token",
         "tls_certificate",
@@ -446,6 +410,14 @@ class Settings(BaseSettings):
         if value is not None and "://" in value and not value.startswith("file://"):
             raise ValueError("unsupported scheme: use a path or a file:// URL")
         return value
+
+    @model_validator(mode="after")
+    def _direct_url_needs_postgres(self) -> Self:
+        if self.database_direct_url is not None:
+            urls = (self.database, self.database_direct_url)
+            if not all(url.startswith("postgres") for url in urls):
+                raise ValueError("database_direct_url requires a database_url of PostgreSQL, and one itself")
+        return self
 
     @model_validator(mode="after")
     def _no_auth_only_on_loopback(self) -> Self:
@@ -552,6 +524,11 @@ class Settings(BaseSettings):
     def database(self) -> str:
         """Database URL, with its default."""
         return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'fleetmap.sqlite3'}"
+
+    @property
+    def direct_database(self) -> str:
+        """Database URL for what belongs to a session, with its default."""
+        return self.database_direct_url or self.database
 
     @property
     def blob_dir(self) -> Path:
