@@ -44,7 +44,7 @@ def cases() -> list[tuple[str, str, dict[str, bytes]]]:
 CASES = [pytest.param(f, files, id=case) for f, case, files in cases()]
 NAMES = sorted(formats.all_formats())
 
-READ_ONLY = {"dxf", "gml", "isoxml", "shapefile"}
+READ_ONLY = {"dxf", "gml", "shapefile"}
 """Formats that are not served, as CHANGELOG.md says."""
 
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+import shapely
+from lxml import etree
 
 from app import formats
 from app.errors import UnreadableFile
-from app.formats import FileGroup, ReadContext
+from app.formats import FileGroup, ReadContext, WriteContext
 from app.limits import Limits
-from app.model.features import Features
-from app.model.layers import SITE, PartKey
+from app.model.features import Features, features
+from app.model.frame import Datum
+from app.model.geodesy import local_frame
+from app.model.layers import NETWORK, SITE, ZONES, Layers, PartKey
 from app.upload_reader import EnvironmentContext, UploadHints
 from app.upload_reader import read as read_upload
 
@@ -71,3 +77,102 @@ def test_wrong_values_are_refused(old: str, new: str, reason: str) -> None:
     with pytest.raises(UnreadableFile, match=reason) as caught:
         objects({MAIN: data})
     assert caught.value.problems[0].line
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+DATUM = Datum(53.2686, -0.5245, heading=30.0)
+FORMAT = formats.get_format("isoxml")
+
+TEXT, NUMBER, COUNT = r".{1,32}", r"-?[0-9]+(\.[0-9]{1,15})?", r"[0-9]{1,10}"
+SCHEMA = {
+    "ISO11783_TaskData": (
+        {"VersionMajor": "4", "VersionMinor": "[0-3]", "DataTransferOrigin": "[12]",
+         "ManagementSoftwareManufacturer": TEXT, "ManagementSoftwareVersion": TEXT}, {}, {"PFD"}),
+    "PFD": ({"A": r"PFD-?[0-9]{1,11}", "C": TEXT, "D": COUNT}, {}, {"PLN", "LSG", "PNT", "GGP"}),
+    "PLN": ({"A": "[1-9]|1[0-2]"}, {"B": TEXT, "C": COUNT, "E": r"PLN-?[0-9]{1,11}"}, {"LSG"}),
+    "LSG": ({"A": "[1-9]"}, {"B": TEXT, "C": COUNT, "F": r"LSG-?[0-9]{1,11}"}, {"PNT"}),
+    "PNT": ({"A": "[1-9]|1[01]", "C": NUMBER, "D": NUMBER},
+            {"B": TEXT, "E": r"-?[0-9]{1,10}", "G": r"PNT-?[0-9]{1,11}"}, set()),
+    "GGP": ({"A": r"GGP-?[0-9]{1,11}"}, {"B": TEXT}, {"GPN"}),
+    "GPN": ({"A": r"GPN-?[0-9]{1,11}", "C": "[1-5]"}, {"B": TEXT}, {"LSG"}),
+}  # fmt: skip
+"""Required attributes, optional ones and children of each element, by the public schema of ISO 11783-10, version 4."""
+
+
+def check_schema(root: etree._Element) -> None:
+    identifiers: list[str] = []
+    for element in root.iter():
+        required, optional, children = SCHEMA[str(element.tag)]
+        assert set(required) <= set(element.attrib) <= {*required, *optional}, element.attrib
+        for name, value in element.attrib.items():
+            assert re.fullmatch({**required, **optional}[str(name)], str(value)), (element.tag, name, value)
+        assert {child.tag for child in element} <= children
+        identifiers += [str(v) for v in element.attrib.values() if re.fullmatch(r"[A-Z]{3}-?[0-9]+", str(v))]
+    assert len(identifiers) == len(set(identifiers))
+    for polygon in root.iter("PLN"):
+        kinds = [line.get("A") for line in polygon]
+        assert kinds.count("1") == 1, "one exterior"
+        assert set(kinds) <= {"1", "2"}
+    for pattern in root.iter("GPN"):
+        (line,) = pattern
+        assert line.get("A") == "5"
+        ends = [point.get("A") for point in line]
+        assert ends == ["6", *["9"] * (len(ends) - 2), "7"]
+
+
+def layers() -> Layers:
+    pair = shapely.LineString([(0, 0), (100, 0)])
+    network = [
+        ("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(100, 0), {"kind": "node"}),
+        ("e1", pair, {"kind": "edge", "source": "a", "target": "b", "name": "Row 1", "width": 1.5}),
+        ("e2", shapely.reverse(pair), {"kind": "edge", "source": "b", "target": "a"}),
+        ("e3", shapely.LineString([(0, 0), (50, 9), (100, 0)]), {"kind": "edge", "source": "a", "target": "b"}),
+    ]  # fmt: skip
+    two = shapely.MultiPolygon([shapely.box(20, 20, 30, 30), shapely.box(40, 20, 50, 30)])
+    zones = [("k", shapely.box(5, 5, 9, 9), {"kind": "keepout"}), ("s", two, {"kind": "speed", "name": "s" * 40})]
+    things = [
+        ("h", shapely.box(60, 20, 70, 30), {"kind": "building", "name": "Bärn\x00", "height": 4.0}),
+        ("t", shapely.Point(80, 20, 2.5), {"kind": "tree"}),
+        ("p", shapely.LineString([(0, 40), (9, 40)]), {"kind": "path"}),
+    ]  # fmt: skip
+    fence = [("f", shapely.box(-10, -10, 110, 60), {"kind": "fence"})]
+    return Layers({
+        PartKey("topology", "ground", NETWORK): features(network, "local"),
+        PartKey("zones", "ground", ZONES): features(zones, "local"),
+        PartKey("objects", "ground", "kml"): features(things, "local"),
+        PartKey("location", "ground", SITE): features(fence, "local"),
+    }, DATUM)  # fmt: skip
+
+
+def test_site_becomes_a_valid_field() -> None:
+    context = WriteContext(title="Home")
+    data = formats.write(FORMAT, layers(), context)
+    assert formats.write(FORMAT, layers(), WriteContext(title="Home")) == data
+    root = etree.fromstring(data[MAIN])
+    check_schema(root)
+    (field,) = root
+    assert (field.get("C"), int(field.get("D"))) == ("Home", pytest.approx(120 * 70, abs=1)), "square metres"
+    assert [p.get("A") for p in field.iter("PLN")] == ["1", "4", "6", "2", "2"]
+    assert [(p.get("C"), p[0].get("C")) for p in field.iter("GPN")] == [("1", "1500"), ("3", None)]
+    assert {d.subject: d.count for d in context.dropped} == {
+        "lines": 1, "nodes": 2, "further properties": 1, "ends of long names": 2, "joins of several shapes": 1,
+        "properties of edges": 4,
+    }  # fmt: skip
+    back = {f.properties["isoxml"]["type"]: f for f in objects(data)}
+    assert back["boundary"].properties["name"] == "Home boundary"
+    metres = local_frame(DATUM).geometries_to_local(np.array([back["boundary"].geometry, back["other"].geometry]))
+    assert shapely.hausdorff_distance(metres[0], shapely.box(-10, -10, 110, 60)) < 2e-4
+    assert shapely.distance(metres[1], shapely.Point(80, 20)) < 2e-4
+    assert shapely.get_z(metres[1]) == 2.5
+
+
+def test_fields_that_were_read_come_back_whole() -> None:
+    first = objects(FILES)
+    context = WriteContext()
+    data = formats.write(FORMAT, Layers({PartKey("objects", "ground", "isoxml"): first}), context)
+    assert context.dropped == []
+    check_schema(etree.fromstring(data[MAIN]))
+    again = objects(data)
+    assert again.ids == first.ids
+    assert again.properties == first.properties
+    assert shapely.equals_exact(again.geometry, first.geometry).all()

@@ -17,9 +17,6 @@ from app.model.geodesy import LocalFrame
 from app.model.imagery import LOCAL, GeoImage
 from app.model.layers import Layers, PartKey
 
-TURNED = "its axes are turned and it has no CRS with such axes: set a datum, or download it as {}"
-"""Reason of a raster that is not written; {} is a format."""
-
 
 class RasterWriter:
     """Writes rasters, and collects what describes them for the metadata."""
@@ -38,7 +35,7 @@ class RasterWriter:
         for key, grid in self.layers.grids().items():
             position = place(transform_of(grid), LOCAL, self.frame)
             if position is None:
-                self.context.drop("turned grids", 1, TURNED.format("occupancy_grid"))
+                self.context.drop("turned grids", 1, "no CRS has their axes: set a datum, or download occupancy_grid")
                 continue
             entry = {**grid_keys(grid), "properties": grid.properties}
             self._write(key, grid_pyramid(grid), position, entry, ())
@@ -49,7 +46,7 @@ class RasterWriter:
     def _write_image(self, key: PartKey, picture: GeoImage) -> None:
         position = place(picture.transform, picture.crs, self.frame)
         if position is None:
-            self.context.drop("turned images", 1, TURNED.format("satellite"))
+            self.context.drop("turned images", 1, "no CRS has their axes: set a datum, or download satellite")
             return
         height, width, bands = picture.pixels.shape
         entry: dict[str, Any] = {

@@ -67,10 +67,11 @@ class Item:
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """Write ``map.gpkg`` with all vector layers, grids and images."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    unwritten: tuple[Layer, ...] = ("voxels",) if options.rasters else ("occupancy", "voxels", "imagery")
-    for layer in unwritten:
-        why = "a GeoPackage contains features and tiles, not voxels" if layer == "voxels" else "rasters=false"
-        context.drop(layer, len(layers.parts_of(layer)), why)
+    context.drop("voxels", len(layers.parts_of("voxels")), "a GeoPackage contains features and tiles, not voxels")
+    rasters: tuple[Layer, ...] = ("occupancy", "imagery")
+    for layer in rasters:
+        count = 0 if options.rasters else len(layers.parts_of(layer))
+        context.drop(layer, count, "rasters=false leaves them out")
     context.drop("resources", len(layers.resources()), "a GeoPackage has no further files")
     with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
         database.execute("PRAGMA page_size = 4096")
@@ -86,10 +87,10 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         database.execute("COMMIT")
         database.execute("VACUUM")  # before there are tiles: it copies everything
         database.execute("BEGIN")
-        rasters = RasterWriter(database, layers, context)
+        tiles = RasterWriter(database, layers, context)
         if options.rasters:
-            rasters.write()
-        _write_metadata(database, layers, rasters.entries)
+            tiles.write()
+        _write_metadata(database, layers, tiles.entries)
         database.execute("COMMIT")
         data = memoryview(database.serialize())
     changes = struct.pack(">I", 1)

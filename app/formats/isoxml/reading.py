@@ -1,14 +1,4 @@
-"""ISOXML (ISO 11783-10): ``TASKDATA.XML`` of farm software and terminals, with its fields. Read only.
-
-Polygons, lines and points of fields (``PFD`` with ``PLN``, ``LSG``, ``PNT``) and guidance lines (``GGP`` with ``GPN``)
-are objects of the family ``isoxml``, or what the upload's ``layer`` says. A boundary without a name is called after its
-field, ``Oats boundary``, so ``layer=location`` finds the fence also beside obstacles. ``properties.isoxml`` contains
-``field``, ``type`` (``boundary``, ``obstacle``, ``headland`` …) and ``group`` of guidance lines.
-
-Coordinates are degrees WGS 84 and, if given, heights in millimetres, which become metres. Fields in files of their own
-(``XFR``, such as ``PFD00001.XML``) are read from the upload. Tasks, products, machines and points in binary files are
-not read.
-"""
+"""Read the fields of ISOXML task data."""
 
 from __future__ import annotations
 
@@ -22,27 +12,12 @@ import shapely
 from lxml import etree
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Claims, Files, Format, ReadContext, Traits, register
+from app.formats import Files, ReadContext
+from app.formats.isoxml.words import LINES, NAME, POINTS, POLYGONS
 from app.model.features import MAX_ID, NO_GEOMETRY, Properties, features, unique_ids
 from app.model.frame import MAX_METRES, is_writable
-from app.model.layers import VECTOR_LAYERS, Layers, PartKey
+from app.model.layers import Layers, PartKey
 from app.syntax import xml
-
-NAME = "isoxml"
-ROOT = "ISO11783_TaskData"
-
-POLYGONS = (
-    *("boundary", "treatment zone", "water", "building", "road", "obstacle", "flag", "other", "mainland", "headland"),
-    *("buffer zone", "windbreak"),
-)
-LINES = (
-    *("exterior", "interior", "tram line", "sampling route", "guidance line", "drainage", "fence", "flag", "obstacle"),
-)
-POINTS = (
-    *("flag", "other", "field access", "storage", "obstacle", "guidance a", "guidance b", "guidance centre"),
-    *("guidance point", "reference point", "home base"),
-)
-"""Types of polygons, lines and points, by number from 1 (ISO 11783-10, annex D)."""
 
 _ROOT = re.compile(rb"<ISO11783_TaskData[\s>]")
 _EXTERNAL = re.compile(r"[A-Z]{3}\d{5}")
@@ -196,18 +171,3 @@ def _closed(ring: Sequence[Sequence[float]]) -> Any:
 def _type(element: etree._Element, names: Sequence[str]) -> str:
     text = str(element.get("A") or "")
     return names[int(text) - 1] if text.isascii() and text.isdigit() and 0 < int(text[:4]) <= len(names) else "other"
-
-
-register(
-    Format(
-        name=NAME,
-        title="ISOXML task data",
-        files={"TASKDATA.XML": "application/xml"},
-        layers=frozenset(VECTOR_LAYERS),
-        detect=detect,
-        read=read,
-        extensions=(".xml",),
-        claims=Claims(companions=companions),
-        traits=Traits(is_drawing=True),
-    )
-)
