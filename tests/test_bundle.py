@@ -126,6 +126,16 @@ def test_fence_is_found_among_the_fields() -> None:
     assert kinds(part(bundle, "objects", "kml")) == ["region"]
 
 
+def test_single_polygon_replaces_another_fence() -> None:
+    first = part(read_upload({"a.kml": kml(FENCE)}, layer="location"), "location", "site")
+    context = EnvironmentContext(fence=first.geometry[0])
+    moved = FIELD.replace("field", "new boundary")
+    replaced = read({"b.kml": kml(moved)}, UploadHints(layer="location"), context, Limits())
+    assert part(replaced, "location", "site").properties[0]["name"] == "new boundary"
+    both = read({"b.kml": kml(moved, FENCE)}, UploadHints(layer="location"), context, Limits())
+    assert part(both, "location", "site").properties[0]["name"] == "the edge", "the one that is there already"
+
+
 def test_polygons_without_a_fence_are_regions() -> None:
     bundle = read_upload({"a.kml": kml(FIELD, FIELD.replace("field", "other"))}, layer="location")
     assert kinds(part(bundle, "objects", "kml")) == ["region", "region"]

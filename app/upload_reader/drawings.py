@@ -73,14 +73,19 @@ def _move(
 def _is_own_fence(
     part: Features, family: str, areas: NDArray[np.bool_], context: EnvironmentContext, bundle: Bundle, file: str
 ) -> NDArray[np.bool_]:
-    """Find the environment's fence among the polygons: a mask with at most one True."""
+    """Find the fence among the polygons: a mask with at most one True.
+
+    That is the polygon at the place of the fence that there is, else the only one, else the one named so. Nothing but
+    the first replaces a fence of the same upload: a file of coordinates has it exactly, a drawing shows it.
+    """
     indices = np.flatnonzero(areas)
     chosen = np.zeros(len(part), bool)
     fence = bundle.fence or context.fence
     if fence is not None:
         same = [k for k in indices if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
         chosen[same[:1]] = True
-        return chosen
+        if same or bundle.fence is not None:
+            return chosen
     named = [k for k in indices if _FENCE.search(_title(part.properties[k], family))]
     if len(indices) == 1 or len(named) == 1:
         chosen[indices if len(indices) == 1 else named] = True
