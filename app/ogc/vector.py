@@ -101,8 +101,8 @@ async def vector_tables(service: Service) -> dict[str, Table]:
     Drafts have those without features, too: a version cannot be written, so empty layers would only be in the way.
     """
     if service.draft is not None:
-        found = {name: await find_table(service, name) for name in TITLES}
-        return {name: table for name, table in found.items() if table is not None}
+        candidates = {name: await find_table(service, name) for name in TITLES}
+        return {name: table for name, table in candidates.items() if table is not None}
     cached = {name: table for layer in VECTOR_LAYERS for name, table in (await layer_tables(service, layer)).items()}
     return {name: cached[name] for name in TITLES if name in cached}
 

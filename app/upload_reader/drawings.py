@@ -67,7 +67,10 @@ def _move(
     generic = ("region", "path", "poi", None)
     properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
     parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
-    parts[key] = part.select(~mask)
+    if mask.all():
+        del parts[key]  # a drawing of zones says nothing of objects, so it does not replace them by none
+    else:
+        parts[key] = part.select(~mask)
 
 
 def _is_own_fence(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import json
 import socket
 import time
 from collections.abc import Iterator
@@ -288,3 +289,20 @@ def test_content_far_from_the_datum_adds_warnings(api: Api, lon: float, lat: flo
     assert bool(warnings) == far
     if far:
         assert "7746 km" in warnings[0], "by the spherical law of cosines, computed independently"
+
+
+@pytest.mark.parametrize(("layer", "kind"), [("zones", "keepout"), ("location", "fence")])
+def test_drawing_that_is_all_zones_or_fence_keeps_the_objects(api: Api, bare: str, layer: str, kind: str) -> None:
+    def drawing(name: str) -> dict[str, bytes]:
+        ring = [[-0.5245, 53.2686], [-0.5244, 53.2686], [-0.5244, 53.2687], [-0.5245, 53.2686]]
+        shape = {"type": "Polygon", "coordinates": [ring]}
+        feature = {"type": "Feature", "id": name, "properties": {"name": name}, "geometry": shape}
+        return {f"{name}.geojson": json.dumps({"type": "FeatureCollection", "features": [feature]}).encode()}
+
+    api.upload(bare, drawing("shed"))
+    changes = api.upload(bare, drawing("yard"), layer=layer, mode="replace").json()["changes"]
+    assert "objects" not in changes
+    latest = f"environments/{bare}/versions/latest/layers"
+    assert [f["id"] for f in api.get(f"{latest}/objects").json()["features"]] == ["shed"]
+    (area,) = api.get(f"{latest}/{layer}").json()["features"]
+    assert area["properties"]["kind"] == kind
