@@ -157,6 +157,23 @@ def test_commit_waits_for_the_server_and_happens_once(open_page: Open, server: W
     assert [one["version"] for one in server.get(f"environments/{site}/versions")] == [1, 0]
 
 
+def test_who_signs_in_again_is_told_nothing_of_tokens(open_page: Open, server: WebServer, grid: list[Path]) -> None:
+    site = empty_site(server, "signed")
+    page = open_page(f"/?site={site}&view=upload")
+    choose(page, *grid)
+    page.context.clear_cookies()
+    try_files(page)
+    dialog = page.get_by_role("dialog", name="Sign in again")
+    dialog.get_by_label("Token").fill(server.token)
+    problem = page.locator(".panel .problem")
+    expect(problem).to_have_count(1)
+    dialog.get_by_role("button", name="Sign in").click()
+    expect(dialog).to_be_hidden()
+    expect(problem).to_have_count(0)
+    try_files(page)
+    expect(page.get_by_role("button", name="Commit as v1")).to_be_visible()
+
+
 def test_files_are_dropped_on_any_view(open_page: Open, server: WebServer) -> None:
     site = empty_site(server, "dropped")
     page = open_page(f"/?site={site}")

@@ -99,7 +99,7 @@ export function Review({ desk }: { desk: Desk }) {
         </>
       }
     >
-      {problem && <Problem error={problem} />}
+      {problem && !(problem.status === 401 && !expired.value) && <Problem error={problem} />}
       {!online.value && (
         <p class="note" role="status">
           Offline: your changes are kept on this device. Save when the server answers again.

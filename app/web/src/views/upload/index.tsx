@@ -9,6 +9,7 @@ import { useEffect } from "preact/hooks";
 import { api, ask, online } from "../../api/client";
 import { useLoaded } from "../../api/loaded";
 import { dropped } from "../../dropped";
+import { expired } from "../../session";
 import { Button } from "../../ui/button";
 import { Problem } from "../../ui/states";
 import type { ViewProps } from "../registry";
@@ -55,6 +56,14 @@ export default function UploadView({ site, map }: ViewProps) {
     addEventListener("beforeunload", warn);
     return () => removeEventListener("beforeunload", warn);
   }, [desk]);
+  useEffect(
+    () =>
+      effect(() => {
+        // Who has signed in again is not told that a token is required.
+        if (!expired.value && desk.problem.peek()?.status === 401) desk.problem.value = null;
+      }),
+    [desk],
+  );
   useEffect(() => effect(() => void desk.watchHead(site.environment.value?.version)), [desk, site]);
   const step = desk.step.value;
   const files = desk.files.value;
