@@ -76,7 +76,10 @@ class Cluster:
         name = f"t{uuid.uuid4().hex}"
         with self.connect() as connection:
             names = sql.Identifier(name), sql.Identifier(template)
-            connection.execute(sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(*names))
+            copy = sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(*names)
+            if connection.info.server_version >= 150_000:  # its default logs each page, which takes twice the time
+                copy += sql.SQL(" STRATEGY FILE_COPY")
+            connection.execute(copy)
         return name
 
     def drop_database(self, name: str) -> None:

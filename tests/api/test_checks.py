@@ -172,7 +172,7 @@ def test_large_network_is_checked_in_time(api: Api, bare: str) -> None:
     api.upload(bare, {"big.tmap2.yaml": samples.tmap2(nodes, tuple(w for a, b in ways for w in ((a, b), (b, a))))})
     begun = time.perf_counter()
     body = checks(api, bare)
-    assert time.perf_counter() - begun < 60
+    assert time.perf_counter() - begun < 240  # some seconds of the processor; a quadratic rule takes an hour
     assert {item["rule"] for item in body["items"]} == {"unreachable-part"}, "rows that no column connects"
     assert len(body["items"]) == side - 1 <= MAX_FINDINGS
     assert len(body["rules"]) == len(RULES)

@@ -250,7 +250,7 @@ def fill(folder: Path) -> Path:
 def test_full_disk_stops_only_writes(small_disk: Path) -> None:
     settings = settings_for(small_disk / "data")
     for started_full in (False, True):
-        with running(settings) as api:
+        with running(settings, migrates=True) as api:
             if not started_full:
                 farm = environment(api, "farm")
                 api.upload(farm, {NETWORK: samples.tmap2()})

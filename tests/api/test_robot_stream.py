@@ -83,7 +83,7 @@ def test_a_fleet_arrives_within_a_second(api: Api, bare: str) -> None:
         while pending:
             pending.discard(json.loads(next(following)["data"])["robot"])
         print(f"500 robots after {time.monotonic() - begun:.2f} s")
-        assert time.monotonic() - begun < 10.0  # 0.4 s on a quiet machine
+        assert time.monotonic() - begun < 60.0  # 0.4 s on a quiet machine; one a second would take 500 s
 
 
 def test_streams_of_all_environments_have_the_robots_of_the_token(api: Api, fresh: Any) -> None:

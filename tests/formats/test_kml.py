@@ -789,9 +789,9 @@ def test_many_items_are_written_in_time():
     def seconds(n: int) -> float:
         xy = np.stack([np.linspace(7, 7.1, n), np.linspace(50, 50.1, n)], axis=1)
         part = from_columns([f"n{k}" for k in range(n)], shapely.points(xy), [{"kind": "node"}] * n, "wgs84")
-        start = time.perf_counter()
+        start = time.process_time()
         load(save(Layers({TOPOLOGY: part})))
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     assert seconds(10_000) < 40 * max(seconds(1_000), 0.02)
 

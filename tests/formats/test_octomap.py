@@ -272,9 +272,9 @@ def test_large_map_is_read_in_bounded_time(shared: Path) -> None:
     data = (shared / "data" / "octomap" / "geb079" / "geb079.bt").read_bytes()
     times = []
     for _ in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         voxels, _ = read(data)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     assert len(voxels) == 428144
     assert min(times) < 1.0
 
