@@ -86,6 +86,11 @@ class Settings(BaseSettings):
         description="Database URL: `postgresql+psycopg://user:password@host/name` (with PostGIS), or `sqlite:///FILE`. "
         "Default: an SQLite file in the data folder.",
     )
+    database_direct_url: str | None = Field(
+        default=None,
+        description="Database URL for locks and notifications, if `database_url` leads to a pooler of transactions "
+        "such as PgBouncer: that of PostgreSQL itself. Default: `database_url`.",
+    )
     blob_url: str | None = Field(
         default=None,
         description="Folder for uploaded files, as a path or `file://` URL; all workers must share it. Default: "
@@ -107,6 +112,11 @@ class Settings(BaseSettings):
         default=None,
         description="Token of the first administrator, for containers and tests; use at least 32 random characters. "
         "Unset: the first start creates a token and prints it once.",
+    )
+    signing_key: Path | None = Field(
+        default=None,
+        description="File with the private Ed25519 key (PEM) that signs manifests, the same on all servers; older keys "
+        "below it endorse it. Unset: the first start creates a key, in the data folder or in PostgreSQL.",
     )
     insecure_no_auth: bool = Field(
         default=False,
@@ -406,6 +416,8 @@ class Settings(BaseSettings):
 
     @field_validator(
         "database_url",
+        "database_direct_url",
+        "signing_key",
         "blob_url",
         "admin_token",
         "tls_certificate",
@@ -446,6 +458,14 @@ class Settings(BaseSettings):
         if value is not None and "://" in value and not value.startswith("file://"):
             raise ValueError("unsupported scheme: use a path or a file:// URL")
         return value
+
+    @model_validator(mode="after")
+    def _direct_url_needs_postgres(self) -> Self:
+        if self.database_direct_url is not None:
+            urls = (self.database, self.database_direct_url)
+            if not all(url.startswith("postgres") for url in urls):
+                raise ValueError("database_direct_url requires a database_url of PostgreSQL, and one itself")
+        return self
 
     @model_validator(mode="after")
     def _no_auth_only_on_loopback(self) -> Self:
@@ -552,6 +572,11 @@ class Settings(BaseSettings):
     def database(self) -> str:
         """Database URL, with its default."""
         return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'fleetmap.sqlite3'}"
+
+    @property
+    def direct_database(self) -> str:
+        """Database URL for what belongs to a session, with its default."""
+        return self.database_direct_url or self.database
 
     @property
     def blob_dir(self) -> Path:

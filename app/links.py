@@ -3,7 +3,8 @@
 A link is the map's URL with two more query parameters: ``expires`` (seconds since 1970) and ``signature``
 (``<environment id>.<HMAC-SHA-256 in base64url>``). The HMAC covers the environment's id, the path, all other parameters
 sorted by name, and the expiry. Because of the id a link ends with its environment, even if another environment gets the
-same name. The secrets are in a file that only the server reads; all processes of a data directory share it.
+same name. The secrets are in a document that only the server reads; all processes share it, and all servers on
+PostgreSQL.
 
 A link that was once rejected as expired stays expired, even if the clock is set back: each secret stores the latest
 such expiry, and its links that do not expire later are rejected.
@@ -12,21 +13,18 @@ such expiry, and its links that do not expire later are rejected.
 from __future__ import annotations
 
 import base64
-import fcntl
 import hashlib
 import hmac
 import json
 import logging
-import os
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from urllib.parse import parse_qsl, urlencode
 
-from app.errors import ExpiredLink, InvalidLink
+from app.backends.documents import Document
+from app.errors import ExpiredLink, InvalidLink, Unavailable
 
 log = logging.getLogger(__name__)
 
@@ -140,12 +138,15 @@ class _Secret:
 
 
 class LinkSecrets:
-    """Secrets of a data directory, in ``links.json``; created on first use. Safe for threads and processes."""
+    """Secrets in a document that all processes share; created on first use. Thread-safe.
 
-    def __init__(self, folder: Path) -> None:
-        self._file = folder / "links.json"
+    former: document whose secrets the first server takes over, so that existing links stay valid.
+    """
+
+    def __init__(self, document: Document, former: Document | None = None) -> None:
+        self._document, self._former = document, former
         self._lock = threading.Lock()
-        self._cached: tuple[int, list[_Secret]] | None = None
+        self._cached: tuple[Hashable, list[_Secret]] | None = None
 
     def newest(self) -> bytes:
         """Return the secret that signs new links."""
@@ -159,9 +160,7 @@ class LinkSecrets:
         newest = self._load()[0]
         if now < expires <= newest.over:
             log.warning("links: clock was set back; secret replaced, all older links are invalid")
-            with self._exclusive():
-                if self._read()[0].value == newest.value:
-                    self._write([_new_secret()])
+            self._update(lambda stored: [_new_secret()] if stored[0].value == newest.value else stored)
         return self.newest()
 
     def check(self, address: SignedAddress, now: float) -> None:
@@ -185,10 +184,13 @@ class LinkSecrets:
 
     def rotate(self, now: float, seconds: float) -> None:
         """Sign with a new secret from now on; the old one stays valid for ``seconds``, until its links have ended."""
-        with self._exclusive():
-            old = [replace(s, until=now + seconds) if s.until is None else s for s in self._read()]
+
+        def change(stored: list[_Secret]) -> list[_Secret]:
+            old = [replace(s, until=now + seconds) if s.until is None else s for s in stored]
             valid_secrets = [s for s in old if s.until is not None and now < s.until]
-            self._write([_new_secret(), *valid_secrets][:MAX_SECRETS])
+            return [_new_secret(), *valid_secrets][:MAX_SECRETS]
+
+        self._update(change)
 
     def _valid(self, now: float) -> list[_Secret]:
         """Return the valid secrets and delete expired ones, so that no change of the clock makes them valid again."""
@@ -198,55 +200,40 @@ class LinkSecrets:
         return [s for s in stored_secrets if s.until is None or now < s.until]
 
     def _change(self, change: Callable[[_Secret], _Secret | None]) -> None:
-        """Update or delete each secret in the file. A failed write is only logged: the next check repeats it."""
+        """Update or delete each stored secret. A failed write is only logged: the next check repeats it."""
         try:
-            with self._exclusive():
-                self._write([changed for s in self._read() if (changed := change(s)) is not None])
-        except OSError as error:
-            log.warning("links: storing an expiry failed, will retry (reason=%s)", error.strerror)
+            self._update(lambda stored: [changed for s in stored if (changed := change(s)) is not None])
+        except (OSError, Unavailable) as error:
+            reason = error.detail if isinstance(error, Unavailable) else error.strerror
+            log.warning("links: storing an expiry failed, will retry (reason=%s)", reason)
 
     def _load(self) -> list[_Secret]:
         with self._lock:
-            stamp = self._stamp()
+            stamp = self._document.stamp()  # before reading: a concurrent change is then read again
             if self._cached is None or self._cached[0] != stamp:
-                if stamp == 0:
-                    with self._exclusive():
-                        if self._stamp() == 0:
-                            self._write([_new_secret()])
-                stamp = self._stamp()  # before reading: a concurrent change is then read again
-                self._cached = (stamp, self._read())
+                content = self._document.read()
+                if content is None:
+                    content = self._document.update(lambda present: present or self._first())
+                    stamp = self._document.stamp()
+                self._cached = (stamp, _unpack(content))
             return self._cached[1]
 
-    def _stamp(self) -> int:
-        try:
-            return self._file.stat().st_mtime_ns
-        except FileNotFoundError:
-            return 0
+    def _update(self, change: Callable[[list[_Secret]], list[_Secret]]) -> None:
+        self._document.update(lambda content: _pack(change(_unpack(content or self._first()))))
+        self._cached = None
 
-    def _read(self) -> list[_Secret]:
-        try:
-            lines = json.loads(self._file.read_bytes())
-        except FileNotFoundError:
-            return []
-        return [_Secret(base64.b64decode(line["secret"]), line["until"], line.get("over", 0.0)) for line in lines]
+    def _first(self) -> bytes:
+        return (self._former.read() if self._former is not None else None) or _pack([_new_secret()])
 
-    def _write(self, lines: list[_Secret]) -> None:
-        """Replace the file atomically, readable by its owner only."""
-        body = [{"secret": base64.b64encode(s.value).decode(), "until": s.until, "over": s.over} for s in lines]
-        temporary = self._file.with_suffix(f".{os.getpid()}")
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with os.fdopen(descriptor, "w") as handle:
-            json.dump(body, handle, indent=1)
-            handle.flush()
-            os.fsync(handle.fileno())
-        temporary.replace(self._file)
 
-    @contextmanager
-    def _exclusive(self) -> Iterator[None]:
-        self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with (self._file.parent / "lock").open("w") as handle:
-            fcntl.flock(handle, fcntl.LOCK_EX)
-            yield
+def _unpack(content: bytes) -> list[_Secret]:
+    lines = json.loads(content)
+    return [_Secret(base64.b64decode(line["secret"]), line["until"], line.get("over", 0.0)) for line in lines]
+
+
+def _pack(lines: list[_Secret]) -> bytes:
+    body = [{"secret": base64.b64encode(s.value).decode(), "until": s.until, "over": s.over} for s in lines]
+    return json.dumps(body, indent=1).encode()
 
 
 def _new_secret() -> _Secret:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import fcntl
 import logging
@@ -11,7 +10,6 @@ import shutil
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
-from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__, derive, logs, ogc
+from app import __version__, derive, housekeeping, logs, ogc
 from app import formats as every_format
 from app.api import events, health, maps, page, ros2, routers
 from app.api.http import openapi, problems
@@ -30,7 +28,7 @@ from app.api.http.application import FleetMapApp
 from app.api.http.auth import Authenticator
 from app.api.http.compression import JsonCompression
 from app.api.http.connections import ConnectionLimits, Connections, fit_open_files
-from app.api.http.conversions import HEARTBEAT_SECONDS, ConversionJobs
+from app.api.http.conversions import ConversionJobs
 from app.api.http.deltas import Deltas
 from app.api.http.dependencies import ApiOptions, Services, Writability
 from app.api.http.metrics import Metrics
@@ -39,13 +37,16 @@ from app.api.http.protocol import BoundedProtocol, tls_context
 from app.api.http.response_cache import ResponseCache
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
+from app.backends.documents import FileDocument
+from app.backends.lead import open_leads
+from app.backends.notify import Listener
 from app.config import Settings
 from app.convert.maps import Maps
 from app.convert.preview import Previews
 from app.convert.tiles import Tiles
 from app.convert.views import Views
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
-from app.events import bus
+from app.events import bus, relay
 from app.events.bus import Bus, BusOptions
 from app.events.credentials import ZenohCredentials
 from app.events.relay import Relay
@@ -53,26 +54,15 @@ from app.events.ros2 import Ros2Options, Ros2Publisher
 from app.events.ros_names import parse_keys, parse_selectors
 from app.events.security import RouterSecurity
 from app.fleet import ReportQueue as FleetIntake
-from app.fleet import next_step
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
 from app.pool import PRELOADED_MODULES, Pool
 from app.sandbox import SandboxPolicy
-from app.signing import Keys
+from app.signing import Keys, MountedKeys, SharedKeys, SigningKeys
 from app.store.scrub import Scrub
 from app.store.store import Store
 
 log = logging.getLogger(__name__)
-
-TICK_SECONDS = 1.0
-"""Interval of housekeeping, and so the maximum delay of a planned channel move."""
-
-CLOCK_TOLERANCE = timedelta(seconds=60)
-"""Maximum backward step of the clock that is not logged."""
-
-COLLECT_EVERY = timedelta(hours=24)
-COLLECT_GRACE = timedelta(hours=6)
-"""Minimum age of unreferenced data that the daily garbage collection removes; uploads may still use younger data."""
 
 CACHE_SHARE = 0.1
 """Share of the cached maps that a scrub hashes: each process also hashes a map at its first use."""
@@ -107,21 +97,20 @@ async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]
     app.state.services = services
     app.state.feed = events.EventFeed(services)
     services.fleet.start()
+    services.leads.start()
+    listener = start_listener(settings, services)
     threading.Thread(target=_prepare, args=(services,), daemon=True).start()
     publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
     app.response_cache = services.response_cache
     scrub = start_scrub(settings, services)
-    ticker = asyncio.create_task(_run_housekeeping(services))
     try:
-        yield
+        async with housekeeping.running(services):
+            yield
     finally:
         app.response_cache = None
-        ticker.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await ticker
         if scrub is not None:
             await run_in_threadpool(scrub.close)
-        for one in publishing:
+        for one in (*publishing, *([listener] if listener else [])):
             await run_in_threadpool(one.close)
         await run_in_threadpool(close_services, services)
 
@@ -189,8 +178,7 @@ def open_services(settings: Settings) -> Services:
     pools: list[Pool] = []
     try:
         with startup_lock(settings.data_dir):
-            if settings.database.startswith("sqlite"):
-                store.migrate()
+            store.initialise()
             try:
                 store.check()
             except Unavailable as error:
@@ -263,10 +251,11 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     service.cache.on_damage = metrics.cache_damaged.inc
     access = _authenticator(settings, store)
 
-    keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
+    keys, secrets = _signing_keys(settings, store), _link_secrets(settings, store)
     with contextlib.suppress(OSError):  # create now: later the disk may be full
         keys.public()
         secrets.newest()
+    leads = open_leads(settings.direct_database, settings.data_dir)
 
     def count(name: str, result: str) -> None:
         metrics.conversions.labels(name, result).inc()
@@ -290,9 +279,23 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         tiles=tiles,
         previews=Previews(store, tiles, service.cache),
         views=Views(store, tiles),
-        fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
+        leads=leads,
+        fleet=FleetIntake(store, leads.lead(relay.NAME), bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
     )
+
+
+def _signing_keys(settings: Settings, store: Store) -> SigningKeys:
+    """Return the keys of a mounted file, of the database that servers share, or of the data folder."""
+    folder = settings.data_dir / "keys"
+    if settings.signing_key is not None:
+        return MountedKeys(settings.signing_key)
+    return SharedKeys(store.document("keys"), folder) if store.is_shared else Keys(folder)
+
+
+def _link_secrets(settings: Settings, store: Store) -> LinkSecrets:
+    file = FileDocument(settings.data_dir / "keys" / "links.json")
+    return LinkSecrets(store.document("links"), file) if store.is_shared else LinkSecrets(file)
 
 
 def _api_options(settings: Settings) -> ApiOptions:
@@ -321,6 +324,7 @@ def _authenticator(settings: Settings, store: Store) -> Authenticator:
         failures=settings.token_failures,
         find_session=store.sessions.find,
         anonymous=settings.anonymous_list,
+        share=store.wrong_tokens.add if store.is_shared else None,
         insecure=settings.insecure_no_auth,
     )
 
@@ -363,6 +367,15 @@ def start_scrub(settings: Settings, services: Services) -> Scrub | None:
     return scrub
 
 
+def start_listener(settings: Settings, services: Services) -> Listener | None:
+    """Start to listen for commits of other servers; None if there are none."""
+    if not services.store.is_shared:
+        return None
+    listener = Listener(settings.direct_database, services.store.generation, services.leads.host_lead("notify"))
+    listener.start()
+    return listener
+
+
 def start_relay(settings: Settings, services: Services) -> Relay | None:
     """Start the event relay; None if Zenoh is off."""
     if settings.zenoh_mode == "off":
@@ -380,9 +393,9 @@ def start_relay(settings: Settings, services: Services) -> Relay | None:
         on_status=services.fleet.enqueue_status,
         on_alive=services.fleet.set_presence,
     )
-    relay = Relay(services.store, zenoh_bus, settings.data_dir)
-    relay.start()
-    return relay
+    thread = Relay(services.store, zenoh_bus, settings.data_dir, services.leads)
+    thread.start()
+    return thread
 
 
 def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
@@ -394,6 +407,7 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
         Ros2Options(chosen, parse_keys(settings.ros2_keys), settings.ros2_domain_id),
         _bus_options(settings),
         settings.data_dir,
+        services.leads,
         generation=services.store.generation,
         look=partial(ros2.channel_versions, services, chosen, settings.ros2_channel),
         fetch=partial(ros2.topic_content, services, settings.ros2_derive),
@@ -434,6 +448,7 @@ def _bus_options(settings: Settings) -> BusOptions:
 def close_services(services: Services) -> None:
     """Stop the workers, remove the spool and close the store. Blocks."""
     services.fleet.close()
+    services.leads.close()
     services.pool.close()
     services.spare.close()
     services.jobs.close()
@@ -470,46 +485,3 @@ def _ensure_first_token(store: Store, settings: Settings) -> None:
                 store.tokens.create("administrator", "admin", token=text)
     elif (token := store.tokens.create_administrator()) is not None:
         print(f"administrator's token, shown only once: {token}", file=sys.stdout, flush=True)
-
-
-def _note_time(newest: datetime) -> datetime:
-    """Return the current time; log a warning if the clock was set back."""
-    now = datetime.now(UTC)
-    if newest - now > CLOCK_TOLERANCE:
-        log.warning(
-            "clock: set back by %d s; expired tokens and links stay expired, replace those that expired too early",
-            (newest - now).total_seconds(),
-        )
-    return now
-
-
-async def _run_housekeeping(services: Services) -> None:
-    """Run periodic tasks: expiry of what has an end, channel moves, rollouts, collection."""
-    beat = 0.0
-    newest = datetime.now(UTC)
-    collect = newest + COLLECT_EVERY
-    while True:
-        await asyncio.sleep(TICK_SECONDS)
-        beat += TICK_SECONDS
-        try:
-            services.response_cache.flush_counters()
-            newest = _note_time(newest)
-            await run_in_threadpool(services.store.tokens.end_expired)
-            await run_in_threadpool(services.store.tokens.store_uses)
-            await run_in_threadpool(services.store.sessions.store_uses)
-            await run_in_threadpool(services.store.channels.apply_due_moves, datetime.now(UTC))
-            await run_in_threadpool(services.store.channels.advance_rollouts, datetime.now(UTC), next_step)
-            await run_in_threadpool(services.store.overlays.end_due, datetime.now(UTC))
-            await run_in_threadpool(services.store.versions.remove_expired_dry_runs)
-            await run_in_threadpool(services.store.drafts.remove_expired)
-            if beat >= HEARTBEAT_SECONDS:
-                beat = 0.0
-                await run_in_threadpool(services.jobs.send_heartbeats)
-                await run_in_threadpool(services.store.sessions.sweep)
-            if datetime.now(UTC) >= collect:
-                collect = datetime.now(UTC) + COLLECT_EVERY
-                await run_in_threadpool(services.store.garbage.collect, COLLECT_GRACE)
-        except FleetMapError as error:
-            log.warning("housekeeping: skipped, will retry: %s", error.detail)
-        except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
-            log.error("housekeeping: failed, will retry: %s", problems.describe(error))  # noqa: TRY400  a trace shows paths

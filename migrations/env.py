@@ -7,7 +7,7 @@ import os
 from alembic import context
 from sqlalchemy import Connection
 
-from app.store.schema import comparison
+from app.store.schema import comparison, note_compatibility
 from app.store.tables import metadata
 
 
@@ -22,6 +22,7 @@ def run(connection: Connection) -> None:
     )
     with context.begin_transaction():
         context.run_migrations()
+        note_compatibility(connection, context.script)
 
 
 def main() -> None:

@@ -44,7 +44,8 @@ START_SECONDS = 60.0
 PANELS: Mapping[str, str] = {
     **dict.fromkeys(("data", "database", "blob", "cache", "memory"), "Data"),
     **dict.fromkeys(
-        ("host", "port", "tls", "admin", "insecure", "token", "anonymous", "header", "body"), "Network and access"
+        ("host", "port", "tls", "admin", "signing", "insecure", "token", "anonymous", "header", "body"),
+        "Network and access",
     ),
     "zenoh": "Events over Zenoh",
     "ros2": "Maps as ROS 2 topics",
@@ -301,11 +302,10 @@ def _check_certificate(settings: Settings) -> None:
 def check(settings: Settings) -> None:
     """Check database and data folder before the start. Raises Unavailable, with a solution."""
     with _store(settings) as store:
-        if settings.database.startswith("sqlite"):
-            from app.main import startup_lock
+        from app.main import startup_lock
 
-            with startup_lock(settings.data_dir):
-                store.migrate()
+        with startup_lock(settings.data_dir):
+            store.initialise()
         store.check()
         try:
             store.check_writable()

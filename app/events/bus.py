@@ -274,6 +274,14 @@ class Bus:
             self._publishers.move_to_end(environment)
             publisher.put(messages.dumps(body), encoding=messages.JSON)
 
+    def close_publishers(self) -> None:
+        """Undeclare the publishers of events, with their caches."""
+        with self._lock:
+            while self._publishers:
+                _, publisher = self._publishers.popitem()
+                with contextlib.suppress(Exception):
+                    _undeclare(publisher)
+
     def close(self) -> None:
         """Undeclare everything, close the session and stop the router."""
         for threads in (self._threads, self._workers):
@@ -313,10 +321,7 @@ class Bus:
         ]
 
     def _close_session(self) -> None:
-        for publisher in self._publishers.values():
-            with contextlib.suppress(Exception):
-                _undeclare(publisher)
-        self._publishers.clear()
+        self.close_publishers()
         for declaration in self._declared:
             with contextlib.suppress(Exception):
                 _undeclare(declaration)

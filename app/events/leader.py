@@ -1,36 +1,40 @@
-"""Run a background thread in exactly one process per data folder, elected by a file lock."""
+"""Run a background thread in one process of each server, of which one at a time leads among all servers."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
 import threading
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
+from app.backends.lead import LeadLostError, Leads
 from app.errors import FleetMapError
 
 log = logging.getLogger(__name__)
 
 POLL_SECONDS = 1.0
-"""Interval between attempts of the other processes to get the lock, and pause after an error."""
+"""Interval between attempts of a server's other processes to get its lock, and pause after an error."""
+
+STAND_BY_SECONDS = 0.05
+"""Interval at which the process that takes part for its server checks whether it leads."""
 
 
 class LeaderThread(ABC):
-    """Thread that works while it holds the lock ``NAME.lock``. Writes its state to ``NAME.json`` for all processes.
+    """Thread that works while its process leads. Writes its state to ``NAME.json`` for all processes of the server.
 
     Args:
         well: log line when the state becomes ``connected``.
         trouble: start of the log line when the state becomes ``down``.
     """
 
-    def __init__(self, data_dir: Path, name: str, *, well: str, trouble: str) -> None:
+    def __init__(self, data_dir: Path, name: str, leads: Leads, *, well: str, trouble: str) -> None:
         self._data_dir, self._name, self._healthy_state, self._problem = data_dir, name, well, trouble
-        self._lock: IO[str] | None = None
+        self._host_lead, self._lead = leads.host_lead(name), leads.lead(name)
+        self._is_new = True
         self._logged_state: dict[str, Any] = {}
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"fleetmap-{name}", daemon=True)
@@ -38,17 +42,16 @@ class LeaderThread(ABC):
     def start(self) -> None:
         """Start the thread and return at once. Replaces the state of a killed process if the lock is free."""
         with contextlib.suppress(OSError):  # the thread tries again and reports the error
-            self._try_lock()
+            self._try_represent()
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread, release its resources and then the lock."""
+        """Stop the thread, release its resources and then the lead."""
         self._stopping.set()
         self._thread.join(15)
         self._release()
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        self._lead.release()
+        self._host_lead.release()
 
     @abstractmethod
     def _run_once(self) -> None:
@@ -58,6 +61,15 @@ class LeaderThread(ABC):
     def _release(self) -> None:
         """Release resources."""
 
+    def _is_able(self) -> bool:
+        """Whether this process could work now. One that cannot leaves the lead to others."""
+        return True
+
+    def _stand_by(self) -> None:
+        """Wait while another server leads, or this process is not able to. Raises FleetMapError while it is down."""
+        self._publish_state({"state": "standby"})
+        self._stopping.wait(STAND_BY_SECONDS)
+
     def _on_unexpected_error(self) -> None:
         """Log an internal error. Subclasses may also clean up."""
         log.exception("%s: unexpected error; retrying", self._thread.name)
@@ -65,10 +77,18 @@ class LeaderThread(ABC):
     def _run(self) -> None:
         while not self._stopping.is_set():
             try:
-                if self._try_lock():
+                if not self._try_represent():
+                    self._stopping.wait(POLL_SECONDS)
+                elif not self._is_able():
+                    if self._lead is not self._host_lead:
+                        self._lead.release()
+                    self._stand_by()
+                elif self._lead.try_acquire():
                     self._run_once()
                 else:
-                    self._stopping.wait(POLL_SECONDS)
+                    self._stand_by()
+            except LeadLostError as error:
+                log.info("%s: %s", self._thread.name, error.detail)
             except FleetMapError as error:
                 self._publish_state({"state": "down", "detail": error.detail})
                 self._stopping.wait(POLL_SECONDS)
@@ -76,15 +96,12 @@ class LeaderThread(ABC):
                 self._on_unexpected_error()
                 self._stopping.wait(POLL_SECONDS)
 
-    def _try_lock(self) -> bool:
-        if self._lock is None:
-            handle = (self._data_dir / f"{self._name}.lock").open("a")
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                handle.close()
-                return False
-            self._lock = handle
+    def _try_represent(self) -> bool:
+        """Become the one process of this server that takes part; return whether it is this one."""
+        if not self._host_lead.try_acquire():
+            return False
+        if self._is_new:
+            self._is_new = False
             self._publish_state({"state": "starting"})
         return True
 

@@ -1,19 +1,25 @@
 """Relay of the outbox to Zenoh: in order and at least once, even if router, server or database fail.
 
-One process per data folder relays, elected by a file lock; if it dies, another takes over. The database stores the
-position after events were passed to a connected session, so events may be published again after a crash; robots detect
-repeated events by ``sequence``.
+One process of all servers relays; if it dies, another takes over. One process of each server has a session with Zenoh,
+answers queries and is ready to take over. The database stores the position after events were passed to a connected
+session, so events may be published again after a crash; robots detect repeated events by ``sequence``.
+
+A new leader publishes new events first. Then it publishes the last events of each environment again, oldest first, so
+that the caches of its publishers have them in order for late joiners.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
+from app.backends.lead import Leads
 from app.events import leader
 from app.events.bus import EVENT_CACHE_SIZE, Bus
-from app.events.leader import POLL_SECONDS, LeaderThread
+from app.events.leader import POLL_SECONDS, STAND_BY_SECONDS, LeaderThread
+from app.store.outbox import HistoryRange
 from app.store.store import Store
 from app.store.values import Event
 
@@ -24,37 +30,65 @@ PAGE = 500
 MAX_REPLAYED_EVENTS = 20_000
 """Maximum number of events republished at start to fill the publishers' caches, the newest of each environment."""
 
+REPLAY_SECONDS = 0.05
+"""Duration of republishing after which new events are published."""
+
 NAME = "events"
 
 
 class Relay(LeaderThread):
     """Thread that publishes the events of the outbox."""
 
-    def __init__(self, store: Store, bus: Bus, data_dir: Path) -> None:
+    def __init__(self, store: Store, bus: Bus, data_dir: Path, leads: Leads) -> None:
         super().__init__(
-            data_dir, NAME, well=f"event relay: connected to Zenoh at {bus.endpoints}", trouble="event relay: down"
+            data_dir,
+            NAME,
+            leads,
+            well=f"event relay: connected to Zenoh at {bus.endpoints}",
+            trouble="event relay: down",
         )
         self._store, self._bus = store, bus
         self._replayed_for = 0
+        self._history: deque[HistoryRange] = deque()
+        self._checked = 0.0
 
     def _release(self) -> None:
         self._bus.close()
 
-    def _run_once(self) -> None:
-        """Publish pending events, then wait for more."""
-        if not self._bus.ensure_connected():
-            self._publish_state(self._bus.state)
+    def _is_able(self) -> bool:
+        return self._bus.ensure_connected()
+
+    def _stand_by(self) -> None:
+        """Stay connected without publishers, so that late joiners ask only the leader for history."""
+        if self._replayed_for and not self._lead.is_held:
+            self._replayed_for = 0
+            self._bus.close_publishers()
+        state = self._bus.state
+        if state["state"] != "connected":
+            self._publish_state(state)
             self._stopping.wait(POLL_SECONDS / 4)
             return
-        if self._replayed_for != self._bus.opened:
-            self._replay()
-            self._replayed_for = self._bus.opened
+        if time.monotonic() - self._checked > POLL_SECONDS:
+            self._store.events.relay_position()
+            self._checked = time.monotonic()
+        self._publish_state({**state, "leader": False})
+        self._stopping.wait(STAND_BY_SECONDS)
+
+    def _run_once(self) -> None:
+        """Publish pending events, then wait for more, or go on with the history."""
         generation = self._store.generation()
         self._publish_new()
-        self._publish_state(self._bus.state)  # only now: without the database nothing is published
-        # Also return periodically: another host may have committed, and the session must be checked.
+        if self._replayed_for != self._bus.opened:
+            position = self._store.events.relay_position()
+            self._history = deque(self._store.events.history(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS))
+            self._replayed_for = self._bus.opened
+        self._publish_state({**self._bus.state, "leader": True})  # only now: without the database nothing is published
+        if self._history:
+            self._replay()
+            return
+        # Also return periodically: a notification may have been lost, and the session must be checked.
         last_read = time.monotonic()
-        while not self._stopping.wait(COMMIT_POLL_SECONDS):
+        while self._lead.is_held and not self._stopping.wait(COMMIT_POLL_SECONDS):
             if self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS:
                 return
 
@@ -65,19 +99,21 @@ class Relay(LeaderThread):
             if not page:
                 return
             for event in page:
-                if not self._bus.connected:
+                if not self._bus.connected or not self._lead.is_held:
                     return
                 self._publish(event)
                 position = event.position
-            self._store.events.set_relayed(position)
+            with self._lead.fenced():
+                self._store.events.set_relayed(position)
 
     def _replay(self) -> None:
-        """Fill the empty caches of a new session: publish the last events of each environment again, oldest first."""
-        position = self._store.events.relay_position()
-        for event in self._store.events.last(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS):
-            if self._stopping.is_set():
-                return
-            self._publish(event)
+        """Publish the last events of some environments again, also those that were new just now."""
+        started, position = time.monotonic(), self._store.events.relay_position()
+        while self._history and time.monotonic() - started < REPLAY_SECONDS:
+            for event in self._store.events.last(self._history.popleft(), EVENT_CACHE_SIZE, position):
+                if self._stopping.is_set() or not self._lead.is_held:
+                    return
+                self._publish(event)
 
     def _publish(self, event: Event) -> None:
         # After a rename the body keeps the old name; robots subscribe to both until they have synced.

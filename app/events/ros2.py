@@ -23,6 +23,7 @@ import numpy as np
 import zenoh
 from zenoh import ext
 
+from app.backends.lead import Leads
 from app.errors import FleetMapError
 from app.events import cdr, leader, ros_names
 from app.events.bus import BusOptions, connection_error, session_configuration
@@ -152,19 +153,20 @@ class _PublishedEnvironment:
 
 
 class Ros2Publisher(LeaderThread):
-    """Thread that publishes maps to ROS 2. One process per data folder publishes; if it dies, another takes over."""
+    """Thread that publishes maps to ROS 2. One process of all servers publishes; if it dies, another takes over."""
 
     def __init__(
         self,
         options: Ros2Options,
         bus: BusOptions,
         data_dir: Path,
+        leads: Leads,
         *,
         generation: Callable[[], int],
         look: LookUpVersions,
         fetch: Fetch,
     ) -> None:
-        super().__init__(data_dir, NAME, well="ROS 2 publisher: connected", trouble="ROS 2 publisher: down")
+        super().__init__(data_dir, NAME, leads, well="ROS 2 publisher: connected", trouble="ROS 2 publisher: down")
         self._options, self._bus = options, bus
         self._generation, self._look_up_versions, self._fetch = generation, look, fetch
         self._session: zenoh.Session | None = None
@@ -182,7 +184,7 @@ class Ros2Publisher(LeaderThread):
         self._publish_changes(self._look_up_versions())
         self._publish_state({"state": "connected", "topics": len(self._owners)})
         last_read = time.monotonic()
-        while not self._stopping.wait(COMMIT_POLL_SECONDS):
+        while self._lead.is_held and not self._stopping.wait(COMMIT_POLL_SECONDS):
             if self._generation() != generation or time.monotonic() - last_read > VERSION_POLL_SECONDS:
                 return
 
@@ -199,6 +201,12 @@ class Ros2Publisher(LeaderThread):
             self._publish_state({"state": "down", "detail": connection_error(self._bus, error)})
             return False
         return True
+
+    def _stand_by(self) -> None:
+        """Withdraw the topics: another server publishes them."""
+        if self._session is not None:
+            self._release()
+        super()._stand_by()
 
     def _on_unexpected_error(self) -> None:
         super()._on_unexpected_error()
@@ -221,7 +229,7 @@ class Ros2Publisher(LeaderThread):
             self._retire(name, ())
             del self._environments[name]
         for name, version in standing.items():
-            if self._stopping.is_set():
+            if self._stopping.is_set() or not self._lead.is_held:
                 return
             place = self._environments.setdefault(name, _PublishedEnvironment())
             waits = place.retry is not None and time.monotonic() < place.retry

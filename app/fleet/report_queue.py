@@ -1,6 +1,9 @@
 """Queue of robot reports: stores them in order, many in one transaction.
 
 Reports from Zenoh wait while the database is unavailable. Simultaneous reports of a fleet need few transactions.
+
+Of several servers, which all receive what robots publish over Zenoh, the one that relays events stores it. The others
+keep the reports of the last seconds: if one of them takes over, it stores what the former leader may not have.
 """
 
 from __future__ import annotations
@@ -10,12 +13,13 @@ import logging
 import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from app.backends.lead import Lead
 from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
@@ -34,6 +38,15 @@ BATCH = 100
 """Maximum number of reports in one transaction: about 0.25 s on SQLite, which blocks other writers."""
 
 PRESENCE_REFRESH_SECONDS = 15.0
+"""Interval at which the time of the last check is stored, once for all robots that are present."""
+
+SETTLE_SECONDS = 5.0
+"""Time after taking over until this process has seen which robots are present, and stores the differences."""
+
+STAND_BY_SECONDS = 10.0
+"""Time for which a server that does not lead keeps reports from Zenoh."""
+
+MAX_STAND_BY = 5_000
 RETRY_SECONDS = 1.0
 WARN_SECONDS = 20.0
 MAX_PRESENT = 100_000
@@ -64,13 +77,22 @@ class ReportQueue:
     ``enqueue_status`` and ``set_presence`` return at once, ``store_report`` after the report is stored.
 
     Args:
+        lead: lead of the server that stores what comes over Zenoh.
         bus_vouches: whether reports from Zenoh count as authenticated, because the router requires users.
     """
 
     def __init__(
-        self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC), *, bus_vouches: bool = False
+        self,
+        store: Store,
+        lead: Lead,
+        clock: Callable[[], datetime] = lambda: datetime.now(UTC),
+        *,
+        bus_vouches: bool = False,
     ) -> None:
-        self._store, self._clock, self._bus_vouches = store, clock, bus_vouches
+        self._store, self._lead, self._clock, self._bus_vouches = store, lead, clock, bus_vouches
+        self._standby: deque[tuple[float, _QueuedReport]] = deque(maxlen=MAX_STAND_BY)
+        self._leads_since: float | None = None
+        self._is_settled = False
         self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _QueuedReport | None] = queue.Queue(QUEUE_SIZE)
         self._shares: Counter[str] = Counter()
         self._present: set[str] = set()
@@ -141,13 +163,15 @@ class ReportQueue:
             self._queue.put_nowait(None)
 
     def _run(self) -> None:
-        renewed = time.monotonic()
+        renewed = 0.0
         batch: list[_QueuedReport] = []
         while True:
-            batch += self._take_batch(PRESENCE_REFRESH_SECONDS / 3 if not batch else 0.0, BATCH - len(batch))
+            wait = PRESENCE_REFRESH_SECONDS / 3 if not batch else 0.0
+            batch += self._take_batch(wait, BATCH - len(batch))
             renew = time.monotonic() - renewed > PRESENCE_REFRESH_SECONDS
             try:
-                self._write_presence(everybody=renew)
+                batch = self._share(batch)
+                self._write_presence(renew=renew)
                 renewed = time.monotonic() if renew else renewed
                 self._write(batch)
                 batch = []
@@ -163,6 +187,21 @@ class ReportQueue:
                 batch = self._write_each(batch)
             if self._stopping.is_set() and self._queue.empty():
                 return
+
+    def _share(self, batch: list[_QueuedReport]) -> list[_QueuedReport]:
+        """Return what this process has to store: all reports if it leads, else only those from HTTP."""
+        now = time.monotonic()
+        if self._lead.is_held:
+            if self._leads_since is None:
+                self._leads_since, self._is_settled = now, False
+            earlier = [queued for came, queued in self._standby if now - came < STAND_BY_SECONDS]
+            self._standby.clear()
+            return [*earlier, *batch]
+        self._leads_since = None
+        self._standby.extend((now, queued) for queued in batch if queued.result is None)
+        while self._standby and now - self._standby[0][0] > STAND_BY_SECONDS:
+            self._standby.popleft()
+        return [queued for queued in batch if queued.result is not None]
 
     def _take_batch(self, seconds: float, limit: int) -> list[_QueuedReport]:
         out: list[_QueuedReport] = []
@@ -195,6 +234,14 @@ class ReportQueue:
         return out
 
     def _write(self, batch: list[_QueuedReport]) -> None:
+        """Store reports. Raises LeadLostError for those from Zenoh if another server has taken over."""
+        self._write_batch([queued for queued in batch if queued.result is not None])
+        from_bus = [queued for queued in batch if queued.result is None]
+        if from_bus:
+            with self._lead.fenced():
+                self._write_batch(from_bus)
+
+    def _write_batch(self, batch: list[_QueuedReport]) -> None:
         if not batch:
             return
         unheard: list[str] = []
@@ -220,16 +267,31 @@ class ReportQueue:
                 _resolve_futures(queued, Unavailable("internal server error; details are in the server log"))
         return left
 
-    def _write_presence(self, *, everybody: bool) -> None:
+    def _write_presence(self, *, renew: bool) -> None:
+        """Store the robots that came or went. renew: also that the others are still present."""
         with self._lock:
-            present_robots = set(self._present if everybody else self._has_news)
-            absent_robots = set(self._departed)
-        if not present_robots and not absent_robots:
-            return
-        self._store.robots.note_presence(present_robots, absent_robots, self._clock())
+            arrived, departed = set(self._has_news), set(self._departed)
+            has_robots = bool(self._present)
+        if self._leads_since is not None:
+            with self._lead.fenced():
+                arrived, departed = self._settle(arrived, departed)
+                if arrived or departed:
+                    self._store.robots.note_presence(arrived, departed, self._clock())
+                if renew and self._is_settled and has_robots:
+                    self._store.robots.renew_presence(self._clock())
         with self._lock:
-            self._has_news -= present_robots
-            self._departed -= absent_robots
+            self._has_news -= arrived
+            self._departed -= departed
+
+    def _settle(self, arrived: set[str], departed: set[str]) -> tuple[set[str], set[str]]:
+        """Add, once after taking over, what the stored presence lacks: changes that no server has stored."""
+        if self._is_settled or self._leads_since is None or time.monotonic() - self._leads_since < SETTLE_SECONDS:
+            return arrived, departed
+        stored = self._store.robots.present_robots()
+        with self._lock:
+            present = set(self._present)
+        self._is_settled = True
+        return arrived | (present - stored), departed | (stored - present)
 
 
 def wait_until_stored(result: Future[FleetMapError | None], seconds: float = 0.0) -> None:

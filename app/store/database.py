@@ -20,6 +20,8 @@ import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
+from app.backends.lead import check_fence
+from app.backends.notify import LocalNotifier, Notifier, SharedNotifier, new_number
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
 from app.store.base import utcnow
 
@@ -117,8 +119,9 @@ class AuditMark(Protocol):
 class Database:
     """Transactions on an engine. Database errors that a retry may avoid become Unavailable.
 
-    written: called after each commit, so that caches in memory notice it. record: adds the audit row to a transaction.
-    clock: returns the present as an aware time. file: SQLite's; None on PostgreSQL.
+    written: called after each commit with the new number of the commit counter, so that caches in memory notice it.
+    record: adds the audit row to a transaction. clock: returns the present as an aware time. file: SQLite's; None on
+    PostgreSQL.
     """
 
     def __init__(
@@ -126,13 +129,14 @@ class Database:
         url: str,
         *,
         readonly: bool,
-        written: Callable[[], None] = lambda: None,
+        written: Callable[[int], None] = lambda _: None,
         record: Callable[[Connection, datetime], AuditMark | None] = lambda *_: None,
         clock: Callable[[], datetime] = utcnow,
     ) -> None:
         self.engine = engine(url, readonly=readonly)
         self._written, self._record, self.now = written, record, clock
         self.sqlite = self.engine.dialect.name == "sqlite"
+        self._notifier: Notifier = LocalNotifier() if self.sqlite else SharedNotifier()
         name = self.engine.url.database if self.sqlite else None
         self.file = Path(name) if name and name != ":memory:" and not name.startswith("file:") else None
         self._inode: int | None = None
@@ -164,17 +168,22 @@ class Database:
     def write(self, *, notify: bool = True, upkeep: bool = False) -> Iterator[Connection]:
         """Begin a transaction that writes: all or nothing, durable when it ends.
 
-        notify: whether caches are notified. upkeep: no change by a user, so that it gets no row in the audit log.
+        Within ``Lead.fenced()`` only the leader can commit it. notify: whether caches are notified, on all servers.
+        upkeep: no change by a user, so that it gets no row in the audit log.
         """
         with self._write_turn(), self.connection() as connection:
             connection.execution_options(write=True)
+            number = new_number()
             with connection.begin():
                 yield connection
                 caller = None if upkeep else self._record(connection, self.now())
+                if notify:
+                    self._notifier.announce(connection, number)
+                check_fence(connection)
         if caller is not None:
             caller.recorded = True
         if notify:
-            self._written()
+            self._written(number)
 
     @contextmanager
     def connection(self) -> Iterator[Connection]:

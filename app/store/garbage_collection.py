@@ -18,6 +18,7 @@ from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.manifest import unpack_manifest
+from app.store.robots import presence_seen
 
 IDEMPOTENCY_DAYS: Final = 7
 EVENT_DAYS: Final = 30
@@ -100,8 +101,9 @@ class GarbageCollector:
         with self._database.write(upkeep=True) as connection:
             connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))
             silent = now - timedelta(days=ROBOT_DAYS)
-            for table in (tables.robot, tables.robot_history, tables.presence):
+            for table in (tables.robot, tables.robot_history):
                 connection.execute(delete(table).where(table.c.time < silent))
+            connection.execute(delete(tables.presence).where(presence_seen() < silent))
             decided = tables.overlay.c.state.in_(("rejected", "expired", "ended"))
             old = tables.overlay.c.decided < now - timedelta(days=OVERLAY_DAYS)
             connection.execute(delete(tables.overlay).where(decided, old))

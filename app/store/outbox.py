@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -17,6 +18,14 @@ from app.store.values import Event, PartEntry, rfc3339
 
 LOG_SEARCH_WINDOW = 100_000
 """Number of newest log positions that are searched for the last events of environments and of former names."""
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryRange:
+    """Events of one environment from a log position on."""
+
+    environment_id: str
+    first: int
 
 
 def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> list[dict[str, Any]]:
@@ -141,8 +150,8 @@ class Outbox:
             elif stored_position < position:
                 connection.execute(update(table).where(table.c.id == 1).values(position=position))
 
-    def last(self, position: int, each: int, limit: int) -> list[Event]:
-        """List the last ``each`` events up to a position of all environments, also purged ones, in log order.
+    def history(self, position: int, each: int, limit: int) -> list[HistoryRange]:
+        """Choose the last ``each`` events up to a position of all environments, also purged ones, newest first.
 
         If these are more than ``limit``, each environment has fewer; if even one per environment is too many, those
         with the oldest events have none.
@@ -150,20 +159,38 @@ class Outbox:
         table = tables.event
         rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
         recent = (
-            select(table.c.position, rank.label("rank"))
+            select(table.c.environment_id, table.c.position, rank.label("rank"))
             .where(table.c.position <= position, table.c.position > position - LOG_SEARCH_WINDOW)
             .subquery()
         )
         chosen = (
-            select(recent.c.position)
+            select(recent.c.environment_id, recent.c.position)
             .where(recent.c.rank <= each)
             .order_by(recent.c.rank, recent.c.position.desc())
             .limit(limit)
+            .subquery()
         )
-        query = select(table).where(table.c.position.in_(chosen)).order_by(table.c.position)
+        query = select(chosen.c.environment_id, func.min(chosen.c.position).label("first"))
+        query = query.group_by(chosen.c.environment_id).order_by(func.max(chosen.c.position).desc())
+        with self._database.read() as connection:
+            return [HistoryRange(row.environment_id, row.first) for row in connection.execute(query)]
+
+    def last(self, chosen: HistoryRange, each: int, position: int) -> list[Event]:
+        """List an environment's chosen events and later ones up to a position, at most the last ``each``, in order."""
+        table = tables.event
+        query = (
+            select(table)
+            .where(
+                table.c.environment_id == chosen.environment_id,
+                table.c.position >= chosen.first,
+                table.c.position <= position,
+            )
+            .order_by(table.c.sequence.desc())
+            .limit(each)
+        )
         with self._database.read() as connection:
             rows = connection.execute(query).all()
-        return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
+        return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in reversed(rows)]
 
     def last_position(self) -> int:
         """Return the position of the newest event."""

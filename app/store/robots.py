@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from datetime import datetime
+from datetime import datetime, timedelta
 from fnmatch import fnmatchcase
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, delete, func, insert, select, true, tuple_, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, case, delete, func, insert, select, true, tuple_, update
 
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.event_types import RobotPlace
@@ -23,6 +23,9 @@ MAX_ROBOTS: Final = 10_000
 """Maximum number of robots in an environment: on a router without users anyone can invent names."""
 
 MAX_PRESENT: Final = 100_000
+
+LAST_SEEN: Final = timedelta(seconds=60)
+"""Minimum time between two stored times of a robot whose reports do not change."""
 
 
 class Robots:
@@ -121,8 +124,19 @@ class Robots:
             if not deleted_count:
                 raise NotFound(f"no robot {robot[:80]!r} has reported in {environment}")
 
+    def present_robots(self) -> set[str]:
+        """Return the names of the robots that are stored as being on the bus."""
+        table = tables.presence
+        with self._database.read() as connection:
+            return set(connection.execute(select(table.c.robot).where(table.c.there)).scalars())
+
+    def renew_presence(self, now: datetime) -> None:
+        """Store that the robots on the bus are still there."""
+        with self._database.write(notify=False, upkeep=True) as connection:
+            connection.execute(update(tables.server).values(presence_checked=now))
+
     def note_presence(self, present_robots: Collection[str], absent_robots: Collection[str], now: datetime) -> None:
-        """Store the robots that are on the bus, and those that have left it."""
+        """Store the robots that have come to the bus, and those that have left it."""
         table = tables.presence
         with self._database.write(notify=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
@@ -157,6 +171,8 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     }
     values: dict[str, Any] = {**report_columns, "said": report.reported_at, "time": received.time}
     again = row is not None and all(getattr(row, name) == value for name, value in report_columns.items())
+    if row is not None and again and _is_recent(connection, received, row):
+        return None
     if row is not None and not again and _is_duplicate_report(connection, environment_id, received, report_columns):
         connection.execute(
             update(table).where(*conditions).values(time=received.time, vouched=row.vouched or received.vouched)
@@ -179,6 +195,24 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     if not again:
         _remember(connection, environment_id, received, report_columns)
     return None
+
+
+def _is_recent(connection: Connection, received: ReceivedReport, row: Row[Any]) -> bool:
+    """Return whether a repeated report has nothing to store: the robot's last time is recent.
+
+    A failure is stored each time: a rollout counts those after its begin. So is the first report after the robot has
+    left the bus, which shows that it is online without it.
+    """
+    presence = tables.presence
+    report = received.report
+    changes = report.place is not None or (received.vouched and not row.vouched) or report.state == "failed"
+    changes = changes or (report.state != "active" and report.holds is not None)
+    if changes or not timedelta(0) <= received.time - row.time < LAST_SEEN:
+        return False
+    left = select(presence.c.robot).where(
+        presence.c.robot == received.robot, ~presence.c.there, presence.c.time >= row.time
+    )
+    return connection.execute(left).first() is None
 
 
 def _is_delayed(report: RobotReport, row: Row[Any] | None) -> bool:
@@ -243,10 +277,17 @@ def _remember(
 def _robots() -> Select[Any]:
     table, owner, presence = tables.robot, tables.environment, tables.presence
     return (
-        select(table, owner.c.name.label("environment"), presence.c.there, presence.c.time.label("seen"))
+        select(table, owner.c.name.label("environment"), presence.c.there, presence_seen().label("seen"))
         .join(owner, owner.c.id == table.c.environment_id)
         .outerjoin(presence, presence.c.robot == table.c.robot)
     )
+
+
+def presence_seen() -> ColumnElement[datetime]:
+    """SQL expression: when a robot's presence was last checked, or else changed. NULL if it was never on the bus."""
+    presence = tables.presence
+    checked = select(tables.server.c.presence_checked).scalar_subquery()
+    return case((presence.c.there & (checked > presence.c.time), checked), else_=presence.c.time)
 
 
 def channel_robots(connection: Connection, environment_id: str, channel: str) -> list[Robot]:

@@ -5,14 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import exc, inspect, text
+from sqlalchemy import Connection, exc, inspect, select, text, update
 
 from app.errors import Unavailable
 from app.store.database import Database
-from app.store.tables import metadata
+from app.store.tables import metadata, server
 
 if TYPE_CHECKING:
     from alembic.config import Config
+    from alembic.script import ScriptDirectory
+
+RECORDED_SINCE = "0016"
+"""First revision that states its ``min_compatible``: the revision of the oldest release that can use the schema."""
 
 LOCK = 4_820_117_001
 """Key of PostgreSQL's advisory lock: two servers that start together migrate one after the other."""
@@ -57,17 +61,50 @@ def newest() -> str:
     return max(path.name.partition("_")[0] for path in (folder() / "versions").glob("[0-9]*_*.py"))
 
 
-def _present(database: Database) -> str | None:
-    """Return the revision of the database's schema, None without one. (Alembic's own query takes ten times as long.)"""
+def _present(database: Database) -> tuple[str | None, str]:
+    """Return the revision of the database's schema (None without one) and the oldest one that is compatible with it.
+
+    Alembic's own query takes ten times as long.
+    """
     with database.connection() as connection:
-        if not inspect(connection).has_table("alembic_version"):
-            return None
-        return connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+        inspector = inspect(connection)
+        if not inspector.has_table("alembic_version"):
+            return None, ""
+        present = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+        compatible = None
+        if present is not None and present >= RECORDED_SINCE:
+            compatible = connection.execute(select(server.c.min_compatible)).scalar_one_or_none()
+    return present, compatible or present or ""
+
+
+def note_compatibility(connection: Connection, script: ScriptDirectory) -> None:
+    """Store, at the end of a migration, the oldest revision whose release can use the schema. It never decreases."""
+    present = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+    if present is None or present < RECORDED_SINCE:
+        return
+    declared = [
+        revision.module.min_compatible
+        for revision in script.iterate_revisions(present, "base")
+        if revision.revision >= RECORDED_SINCE
+    ]
+    connection.execute(update(server).values(min_compatible=max(declared)))
+
+
+def is_empty(database: Database) -> bool:
+    """Return whether the database has no schema yet."""
+    return _present(database)[0] is None
 
 
 def upgrade(database: Database) -> None:
-    """Migrate the database to the newest schema."""
-    if _present(database) == newest():
+    """Migrate the database to the newest schema. A compatible newer one stays as it is.
+
+    Raises Unavailable if this release cannot use it.
+    """
+    present, compatible = _present(database)
+    if present == newest():
+        return
+    if present is not None and present > newest():
+        _check_compatible(present, compatible)
         return
     from alembic import command
     from alembic.util import CommandError
@@ -81,11 +118,8 @@ def upgrade(database: Database) -> None:
                     connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCK})")
                 settings.attributes["connection"] = connection
                 command.upgrade(settings, "head")
-        except CommandError as error:
-            raise Unavailable(
-                "the database was created by a newer release of this server: run that release, or restore a backup of "
-                "the database from this release"
-            ) from error
+        except CommandError as error:  # a newer release has migrated it in the meantime
+            raise Unavailable("another server is migrating the database: start this one again") from error
         except exc.ProgrammingError as error:
             raise Unavailable(
                 f"the database cannot be migrated: {str(error.orig).splitlines()[0]}. On PostgreSQL PostGIS must be "
@@ -94,9 +128,19 @@ def upgrade(database: Database) -> None:
 
 
 def check(database: Database) -> None:
-    """Raise Unavailable unless the schema is the newest."""
-    present = _present(database)
-    if present != newest():
+    """Raise Unavailable unless this release can use the schema: it is the newest, or a newer one that is compatible."""
+    present, compatible = _present(database)
+    if present is None or present < newest():
         raise Unavailable(
             f"the database's schema is {present or 'missing'}, this release needs {newest()}: run fleetmap migrate"
+        )
+    _check_compatible(present, compatible)
+
+
+def _check_compatible(present: str, compatible: str) -> None:
+    if newest() < compatible:
+        raise Unavailable(
+            f"the database was migrated by a newer release of this server: its schema is {present}, which requires a "
+            f"release with schema {compatible} or newer, and this one has {newest()}: run that release, or restore a "
+            "backup of the database from this release"
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sqlalchemy import select
 
+from app.backends.notify import CommitCounter
 from app.errors import DatabaseDamaged
 from app.store import schema, tables
 from app.store.audit import Audit, record
@@ -15,9 +16,9 @@ from app.store.base import utcnow
 from app.store.blobs import Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks
-from app.store.commit_counter import CommitCounter
 from app.store.content import ContentReader
 from app.store.database import Database
+from app.store.documents import StoredDocument
 from app.store.drafts import Drafts
 from app.store.environments import Environments
 from app.store.garbage_collection import GarbageCollector
@@ -32,6 +33,7 @@ from app.store.sessions import Sessions
 from app.store.tokens import Tokens
 from app.store.verify import Progress, Verifier
 from app.store.versions import Versions
+from app.store.wrong_tokens import WrongTokens
 
 ABANDONED_SECONDS = 24 * 3600.0
 """Age in seconds of packs without a row that are removed: a running upload writes the row right after the pack."""
@@ -74,6 +76,7 @@ class Store:
         self.search = Search(database, self.chunks)
         self.tokens = Tokens(database)
         self.sessions = Sessions(database, self.tokens)
+        self.wrong_tokens = WrongTokens(database)
         self.jobs = Jobs(database)
         self.audit = Audit(database)
         self.garbage = GarbageCollector(database, self.chunks, self.blobs)
@@ -87,8 +90,13 @@ class Store:
         self.blobs.prepare()
         self.areas.refresh()
 
+    def initialise(self) -> None:
+        """Create the schema in an empty database, and migrate an SQLite database. For the start of a server."""
+        if self._database.sqlite or schema.is_empty(self._database):
+            self.migrate()
+
     def check(self) -> None:
-        """Raise Unavailable unless the database answers, has no known damage, and its schema is this release's."""
+        """Raise Unavailable unless the database answers, has no known damage, and its schema suits this release."""
         schema.check(self._database)
         self._database.check()
 
@@ -126,6 +134,15 @@ class Store:
     def recover(self) -> None:
         """Remove the remains of killed uploads, at start. Safe beside other running processes."""
         self.blobs.recover(ABANDONED_SECONDS)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether several servers may use the database."""
+        return not self._database.sqlite
+
+    def document(self, name: str) -> StoredDocument:
+        """Return a document in the database, for what several servers share."""
+        return StoredDocument(self._database, self.generation, name)
 
     def epoch(self) -> int:
         """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""

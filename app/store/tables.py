@@ -457,8 +457,42 @@ server = Table(
     metadata,
     Column("id", Integer, primary_key=True, autoincrement=False),
     Column("epoch", BigInteger, nullable=False),
+    Column("min_compatible", String(32), nullable=True),
+    Column("presence_checked", UtcDateTime, nullable=True),
 )
-"""One row. epoch: rises when the database is restored from a backup, so that robots accept lower sequences again."""
+"""One row. epoch: rises when the database is restored from a backup, so that robots accept lower sequences again.
+
+min_compatible: newest revision of the oldest release that can use this schema. presence_checked: when the robots that
+``presence`` has as present were last seen all together.
+"""
+
+lead = Table(
+    "lead",
+    metadata,
+    Column("name", String(32), primary_key=True),
+    Column("term", BigInteger, nullable=False),
+    Column("holder", Text, nullable=False),
+    Column("since", UtcDateTime, nullable=False),
+)
+"""Tasks that one process of all servers does at a time, see ``app.backends.lead``. term: of the last election."""
+
+document = Table(
+    "document",
+    metadata,
+    Column("name", String(32), primary_key=True),
+    Column("content", LargeBinary, nullable=False),
+    Column("revision", BigInteger, nullable=False),
+)
+"""Small files of a data folder, on PostgreSQL: keys, secrets of links, state of checks. revision: number of changes."""
+
+wrong_token = Table(
+    "wrong_token",
+    metadata,
+    Column("source", String(64), primary_key=True),
+    Column("count", Integer, nullable=False),
+    Column("since", UtcDateTime, nullable=False),
+)
+"""Wrong tokens that all servers counted, by network. since: begin of the period that the count is of."""
 
 overlay = Table(
     "overlay",
@@ -494,7 +528,7 @@ presence = Table(
     Column("there", Boolean, nullable=False),
     Column("time", UtcDateTime, nullable=False),
 )
-"""Robots' liveliness on the bus. time: of the last change, and while they are present of the last check."""
+"""Robots' liveliness on the bus. time: of the last change; see also ``server.presence_checked``."""
 
 place = Table(
     "place",

@@ -20,6 +20,7 @@ import pytest
 
 from app import links
 from app.api.http.auth import Credentials
+from app.backends.documents import FileDocument
 from app.errors import ExpiredLink, InvalidLink
 from app.links import LinkSecrets
 from tests.api import samples
@@ -73,12 +74,12 @@ def test_signature_covers_path_parameters_expiry_and_environment() -> None:
 
 def test_genuine_link_ends_at_its_expiry_and_stays_expired(tmp_path: Path) -> None:
     """This includes other processes, and a clock that is set back."""
-    secrets = LinkSecrets(tmp_path)
+    secrets = LinkSecrets(FileDocument(tmp_path / "links.json"))
     link, later = (signed(secrets.newest(), "/maps/farm/kml", int(NOW) + life) for life in (9, 90))
     secrets.check(link, NOW + 8.9)
     for clock in (9.0, 10.0, 8.0, -1e6):
         with pytest.raises(ExpiredLink, match="request a new one"):
-            LinkSecrets(tmp_path).check(link, NOW + clock)
+            LinkSecrets(FileDocument(tmp_path / "links.json")).check(link, NOW + clock)
     secrets.check(later, NOW)
 
 
@@ -86,7 +87,7 @@ def test_links_made_after_the_clock_was_set_back_are_valid(tmp_path: Path, caplo
     """This includes new links that expire before links that were seen to have expired, which end permanently, with
     their secret.
     """
-    secrets = LinkSecrets(tmp_path)
+    secrets = LinkSecrets(FileDocument(tmp_path / "links.json"))
     old, other = (signed(secrets.newest(), "/maps/farm/kml", int(NOW) + life) for life in (900, 1000))
     with pytest.raises(ExpiredLink):
         secrets.check(old, NOW + 1e7)
@@ -97,7 +98,7 @@ def test_links_made_after_the_clock_was_set_back_are_valid(tmp_path: Path, caplo
     secrets.check(new, NOW)
     for link in (old, other):
         with pytest.raises(InvalidLink):
-            LinkSecrets(tmp_path).check(link, NOW)
+            LinkSecrets(FileDocument(tmp_path / "links.json")).check(link, NOW)
 
 
 @pytest.mark.parametrize("expires", ["", "x", "-1", "1e9", "١٢٣", "1" * 13, None])
@@ -119,7 +120,8 @@ def test_query_without_signature_is_not_a_link() -> None:
 
 
 def test_secrets_are_shared_and_read_by_their_owner_only(tmp_path: Path) -> None:
-    one, two = LinkSecrets(tmp_path / "keys"), LinkSecrets(tmp_path / "keys")
+    file = FileDocument(tmp_path / "keys" / "links.json")
+    one, two = LinkSecrets(file), LinkSecrets(file)
     with ThreadPoolExecutor(8) as pool:
         assert len(set(pool.map(lambda k: (one, two)[k % 2].newest(), range(32)))) == 1
     assert len(one.newest()) == 32
@@ -127,7 +129,7 @@ def test_secrets_are_shared_and_read_by_their_owner_only(tmp_path: Path) -> None
 
 
 def test_rotated_secret_stays_valid_until_its_links_have_ended(tmp_path: Path) -> None:
-    one, two = LinkSecrets(tmp_path), LinkSecrets(tmp_path)
+    one, two = LinkSecrets(FileDocument(tmp_path / "links.json")), LinkSecrets(FileDocument(tmp_path / "links.json"))
     old = one.newest()
     one.rotate(NOW, 60)
     new = two.newest()

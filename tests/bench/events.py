@@ -27,10 +27,10 @@ from zenoh import ext
 
 from app import native
 from app.agent.agent import Agent, AgentOptions
+from app.backends.notify import CommitCounter
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
-from app.store.commit_counter import CommitCounter
 from tests.bench import changes, http
 
 SESSIONS = 100
@@ -122,7 +122,7 @@ def latency() -> list[dict[str, Any]]:
     """Measure the median delivery time of an event at 100 sessions after its commit.
 
     The reference is a bare session that puts the same bytes to plain subscribers of the same sessions. The time of the
-    commit is the last change of the store's commit counter (``app.store.commit_counter``) before the first delivery.
+    commit is the last change of the store's commit counter (``app.backends.notify``) before the first delivery.
     """
     port, zenoh_port = http.free_port(), http.free_port()
     with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:

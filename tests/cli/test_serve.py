@@ -184,7 +184,8 @@ def test_migrate_brings_a_database_up_and_hides_its_password(offline: Fleetmap, 
 def test_database_of_newer_release_is_not_changed(offline: Fleetmap, tmp_path: Path) -> None:
     assert offline("migrate", "--data-dir", tmp_path / "data").status == 0
     with contextlib.closing(sqlite3.connect(tmp_path / "data" / "fleetmap.sqlite3")) as database:
-        database.execute("UPDATE alembic_version SET version_num = 'of-tomorrow'")
+        database.execute("UPDATE alembic_version SET version_num = '9999'")
+        database.execute("UPDATE server SET min_compatible = '9998'")
         database.commit()
     for command in ("serve", "migrate"):
         result = offline(command, "--data-dir", tmp_path / "data", *(["--port", "0"] if command == "serve" else []))

@@ -7,11 +7,14 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
+from app.backends.lead import LocalLead
 from app.errors import Unavailable
 from app.fleet import ReportQueue
 from app.store.store import Store
@@ -107,7 +110,16 @@ def test_robot_lost_with_router_is_offline(api: Api, port: int) -> None:
         stays.close()  # type: ignore[no-untyped-call]
 
 
-def test_reports_wait_while_database_is_unavailable(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def lead(tmp_path: Path) -> Iterator[LocalLead]:
+    """The lead of the process that stores reports from Zenoh."""
+    new_lead = LocalLead(tmp_path, "reports")
+    assert new_lead.try_acquire()
+    yield new_lead
+    new_lead.release()
+
+
+def test_reports_wait_while_database_is_unavailable(api: Api, lead: LocalLead, monkeypatch: pytest.MonkeyPatch) -> None:
     store: Store = api.app.state.services.store
     store.environments.create("farm")
     note, calls = store.robots.note_reports, []
@@ -119,7 +131,7 @@ def test_reports_wait_while_database_is_unavailable(api: Api, monkeypatch: pytes
         return note(batch)
 
     monkeypatch.setattr(store.robots, "note_reports", away)
-    intake = ReportQueue(store)
+    intake = ReportQueue(store, lead)
     intake.start()
     intake.enqueue_status("farm", "r1", status_payload(1))
     intake.enqueue_status("farm", "r1", status_payload(2))
@@ -131,12 +143,12 @@ def test_reports_wait_while_database_is_unavailable(api: Api, monkeypatch: pytes
 
 
 def test_dropped_reports_are_logged(
-    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    api: Api, lead: LocalLead, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.fleet.report_queue.QUEUE_SIZE", 2)
     store: Store = api.app.state.services.store
     store.environments.create("farm")
-    intake = ReportQueue(store)
+    intake = ReportQueue(store, lead)
     for n in range(5):
         intake.enqueue_status("farm", "r1", status_payload(n))
     intake.start()
@@ -146,13 +158,13 @@ def test_dropped_reports_are_logged(
 
 
 def test_flooding_robot_displaces_no_other(
-    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    api: Api, lead: LocalLead, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.fleet.report_queue.MAX_QUEUED_PER_ROBOT", 3)
     monkeypatch.setattr("app.fleet.report_queue.QUEUE_SIZE", 20)
     store: Store = api.app.state.services.store
     store.environments.create("farm")
-    intake = ReportQueue(store)
+    intake = ReportQueue(store, lead)
     for n in range(100):
         intake.enqueue_status("farm", "loud", status_payload(n))
         intake.enqueue_status("nowhere", "lost", status_payload(n))
@@ -172,13 +184,14 @@ def test_flooding_robot_displaces_no_other(
 
 
 def test_invalid_reports_do_not_delay_presence_refresh(
-    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    api: Api, lead: LocalLead, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Who was there stays there while somebody else never stops."""
     monkeypatch.setattr("app.fleet.report_queue.PRESENCE_REFRESH_SECONDS", 0.2)
     store: Store = api.app.state.services.store
-    intake, renewed, stop = ReportQueue(store), [], threading.Event()
-    monkeypatch.setattr(store.robots, "note_presence", lambda on_bus, absent, now: renewed.append(on_bus))
+    intake, renewed, stop = ReportQueue(store, lead), [], threading.Event()
+    monkeypatch.setattr("app.fleet.report_queue.SETTLE_SECONDS", 0.0)
+    monkeypatch.setattr(store.robots, "renew_presence", renewed.append)
     intake.set_presence("calm", on_bus=True)
 
     def shout() -> None:
@@ -194,7 +207,7 @@ def test_invalid_reports_do_not_delay_presence_refresh(
         stop.set()
         loud.join()
         intake.close()
-    assert all(on_bus == {"calm"} for on_bus in renewed)
+    assert store.robots.present_robots() == {"calm"}
     lines = [r for r in caplog.records if "must be a JSON object" in r.getMessage()]
     assert "others)" in caplog.text
     assert lines

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import pytest
 import zenoh
 
+from app.backends.lead import LocalLeads
 from app.errors import Invalid, Unavailable
 from app.events.bus import Bus, BusOptions, router_configuration
 from app.events.messages import Event, RobotStatus
@@ -217,10 +218,10 @@ def test_database_outage_is_logged_once(
 
     monkeypatch.setattr(store.events, "relay_position", away)
     bus = Deaf()
-    relay = Relay(store, bus, tmp_path)  # type: ignore[arg-type]
+    relay = Relay(store, bus, tmp_path, LocalLeads(tmp_path))  # type: ignore[arg-type]
     relay.start()
     try:
-        eventually(lambda: relay_state(tmp_path, "router") == {"state": "connected"})
+        eventually(lambda: relay_state(tmp_path, "router") == {"state": "connected", "leader": True})
         assert bus.put == [1]
         assert caplog.text.count("event relay: down: the database is away") == 1
     finally:

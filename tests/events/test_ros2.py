@@ -23,6 +23,7 @@ import yaml
 import zenoh
 from zenoh import ext
 
+from app.backends.lead import LocalLeads
 from app.errors import Unavailable
 from app.events import cdr, ros_names
 from app.events.bus import BusOptions, router_configuration
@@ -482,6 +483,7 @@ def test_ros2_keeps_last_map_and_retries_when_content_is_unavailable(
         Ros2Options((EnvironmentSelector("farm", "/"),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
+        LocalLeads(tmp_path),
         generation=lambda: 0,
         look=lambda: {"farm": version("farm", str(state["root"]))},
         fetch=fetch,
@@ -517,6 +519,7 @@ def test_ros2_error_of_one_environment_does_not_affect_others(
         Ros2Options((EnvironmentSelector("*", None),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
+        LocalLeads(tmp_path),
         generation=lambda: 0,
         look=lambda: {name: version(name, "r") for name in ("bad", "good")},
         fetch=fetch,
@@ -542,6 +545,7 @@ def test_ros2_reports_missing_router_and_connects_later(tmp_path: Path, monkeypa
         Ros2Options((EnvironmentSelector("farm", "/"),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
+        LocalLeads(tmp_path),
         generation=lambda: 0,
         look=lambda: {"farm": version("farm", "r")},
         fetch=lambda _: TopicContent({None: SMALL}, None),
@@ -573,6 +577,7 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
         Ros2Options((EnvironmentSelector("a?b", None),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
+        LocalLeads(tmp_path),
         generation=lambda: 0,
         look=lambda: {name: version(name, "r") for name in content},
         fetch=lambda request: content[request.environment],
@@ -581,6 +586,7 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
         Ros2Options((EnvironmentSelector("a?b", None),), ("ros2dds",)),
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
+        LocalLeads(tmp_path),
         generation=lambda: 0,
         look=lambda: {"a-b": version("a-b", "r")},
         fetch=lambda _: TopicContent({None: replace(SMALL, resolution=3.0)}, None),

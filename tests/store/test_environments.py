@@ -260,8 +260,11 @@ def test_outbox_lists_last_events_of_all_environments(store: Store):
     end = store.events.last_position()
 
     def last(each: int, limit: int, position: int = end) -> list[tuple[str, int]]:
-        events = store.events.last(position, each, limit)
-        assert [e.position for e in events] == sorted(e.position for e in events)
+        ranges = store.events.history(position, each, limit)
+        pages = [store.events.last(chosen, each, position) for chosen in ranges]
+        assert [page[-1].position for page in pages] == sorted((p[-1].position for p in pages), reverse=True)
+        assert all([e.sequence for e in page] == sorted(e.sequence for e in page) for page in pages)
+        events = sorted((e for page in pages for e in page), key=lambda e: e.position)
         return [(e.environment, e.sequence) for e in events]
 
     begun = [("busy", n) for n in range(1, 7)] + [("calm", 1), ("calm", 2), ("gone", 1), ("gone", 2)]

@@ -13,10 +13,10 @@ import ipaddress
 import re
 import threading
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 from ipaddress import IPv4Network, IPv6Network
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -45,6 +45,9 @@ FRESH_SECONDS = 1.0
 WINDOW_SECONDS = 60.0
 MAX_CACHED_TOKENS = 4096
 MAX_SOURCES = 10_000
+MAX_SHARED = 500
+"""Maximum number of networks whose wrong tokens are shared with other servers in one transaction."""
+
 MAX_TOKEN = 512
 
 OPEN = frozenset({"/", "/icon.svg", "/service-worker.js", "/healthz", "/readyz", "/docs", "/openapi.json"})
@@ -69,6 +72,9 @@ BASIC_CHALLENGE = 'Basic realm="Fleet Map Server"'
 _BASIC = b"basic "
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps|ogc)/([^/]+)(?:/.*)?", re.DOTALL)
+
+
+ShareFailures = Callable[[Mapping[str, int], timedelta], Mapping[str, tuple[int, datetime]]]
 
 
 class Credentials(NamedTuple):
@@ -232,6 +238,8 @@ class Authenticator:
         find: returns a token by its secret, None if it is unknown.
         find_session: returns a session by its secret, None if it has ended.
         anonymous: networks whose clients may read without credentials.
+        share: adds to the counts of wrong tokens by network; returns the sums of all servers and since when they count.
+            None: each process counts for itself.
 
     is_invalidated: number of revocations and ended sessions in this process.
     """
@@ -243,6 +251,7 @@ class Authenticator:
         failures: int,
         find_session: Callable[[str], Session | None] = lambda _: None,
         anonymous: Sequence[IPv4Network | IPv6Network] = (),
+        share: ShareFailures | None = None,
         insecure: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -251,6 +260,7 @@ class Authenticator:
         self.insecure = insecure
         self._cache: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
         self._sources: OrderedDict[str, deque[float]] = OrderedDict()
+        self._share, self._unshared, self._blocked = share, Counter[str](), dict[str, float]()
         self._lock = threading.Lock()
         self.is_invalidated = 0
 
@@ -349,15 +359,38 @@ class Authenticator:
             times = self._sources.setdefault(source, deque(maxlen=self._failures))
             while times and times[0] < now - WINDOW_SECONDS:
                 times.popleft()
-            if len(times) >= self._failures:
+            if len(times) >= self._failures or now < self._blocked.get(source, 0.0):
                 raise Throttled(
                     "too many wrong tokens or signatures from your address: wait a minute, or send a valid "
                     "token, which is always accepted"
                 )
             times.append(now)
+            if self._share is not None:
+                self._unshared[source] += 1
             self._sources.move_to_end(source)
             while len(self._sources) > MAX_SOURCES:
                 self._sources.popitem(last=False)
+
+    def share_failures(self) -> None:
+        """Share the counts of wrong tokens since the last call, in one transaction; without any it writes nothing.
+
+        Networks beyond the first MAX_SHARED by their number of failures wait for the next call. Raises Unavailable.
+        """
+        with self._lock:
+            if self._share is None or not self._unshared:
+                return
+            counts = dict(self._unshared.most_common(MAX_SHARED))
+            self._unshared -= Counter(counts)
+            while len(self._unshared) > MAX_SOURCES:
+                self._unshared.popitem()
+        sums = self._share(counts, timedelta(seconds=WINDOW_SECONDS))
+        wall, now = datetime.now(UTC), self._clock()
+        with self._lock:
+            self._blocked = {source: until for source, until in self._blocked.items() if now < until}
+            for source, (count, since) in sums.items():
+                left = min(WINDOW_SECONDS, WINDOW_SECONDS - (wall - since).total_seconds())
+                if count >= self._failures and left > 0:
+                    self._blocked[source] = now + left
 
 
 def _token(header: bytes) -> str:

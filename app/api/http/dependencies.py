@@ -19,6 +19,7 @@ from app.api.http.response_cache import ResponseCache
 from app.api.http.schemas import IdempotencyKey, IfMatch
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
+from app.backends.lead import Leads
 from app.convert.maps import Maps
 from app.convert.preview import Previews
 from app.convert.tiles import Tiles
@@ -28,7 +29,7 @@ from app.fleet import ReportQueue as FleetIntake
 from app.ingest import CommitRequest, Ingest
 from app.limits import Limits
 from app.pool import Pool
-from app.signing import Keys
+from app.signing import SigningKeys
 from app.store.store import Store
 
 WRITABLE_SECONDS = 2.0
@@ -112,12 +113,13 @@ class Services:
     response_cache: ResponseCache
     intake: UploadSpool
     metrics: Metrics
-    keys: Keys
+    keys: SigningKeys
     links: SignedLinks
     deltas: Deltas
     tiles: Tiles
     previews: Previews
     views: Views
+    leads: Leads
     fleet: FleetIntake
     writability: Writability
     prepared: threading.Event = field(default_factory=threading.Event)

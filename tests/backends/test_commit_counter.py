@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from app.store.commit_counter import CommitCounter
+from app.backends.notify import CommitCounter
 from app.store.store import Store
 
 
@@ -27,7 +27,7 @@ def test_commit_counter_changes_with_writes_only(tmp_path: Path) -> None:
 def test_commit_counter_is_shared_between_processes(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path)
     before = counter()
-    code = "from pathlib import Path; from app.store.commit_counter import CommitCounter; "
+    code = "from pathlib import Path; from app.backends.notify import CommitCounter; "
     code += f"CommitCounter(Path({str(tmp_path)!r})).change()"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert counter() != before

@@ -1,0 +1,111 @@
+"""Periodic tasks of a server: some in each process, others in one process of all servers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from datetime import UTC, datetime, timedelta
+
+from starlette.concurrency import run_in_threadpool
+
+from app.api.http import problems
+from app.api.http.auth import WINDOW_SECONDS
+from app.api.http.conversions import HEARTBEAT_SECONDS
+from app.api.http.dependencies import Services
+from app.backends.lead import LeadLostError
+from app.errors import FleetMapError
+from app.fleet import next_step
+
+log = logging.getLogger(__name__)
+
+NAME = "housekeeping"
+TICK_SECONDS = 1.0
+"""Interval of housekeeping, and so the maximum delay of a planned channel move."""
+
+CLOCK_TOLERANCE = timedelta(seconds=60)
+"""Maximum backward step of the clock that is not logged."""
+
+COLLECT_EVERY = timedelta(hours=24)
+COLLECT_GRACE = timedelta(hours=6)
+"""Minimum age of unreferenced data that the daily garbage collection removes; uploads may still use younger data."""
+
+
+@contextlib.asynccontextmanager
+async def running(services: Services) -> AsyncIterator[None]:
+    """Run the periodic tasks of this process."""
+    ticker = asyncio.create_task(_Housekeeping(services).run())
+    try:
+        yield
+    finally:
+        ticker.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await ticker
+
+
+class _Housekeeping:
+    """Periodic tasks of one process."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._lead = services.leads.lead(NAME)
+        self._newest = datetime.now(UTC)
+        self._collect_at = self._newest + COLLECT_EVERY
+
+    async def run(self) -> None:
+        """Run the tasks every TICK_SECONDS, until cancelled."""
+        beat = 0.0
+        while True:
+            await asyncio.sleep(TICK_SECONDS)
+            beat += TICK_SECONDS
+            is_beat = beat >= HEARTBEAT_SECONDS
+            beat = 0.0 if is_beat else beat
+            try:
+                self._services.response_cache.flush_counters()
+                await run_in_threadpool(self._run_in_each_process, is_beat)
+                if await run_in_threadpool(self._lead.try_acquire):
+                    await run_in_threadpool(self._run_as_leader, is_beat)
+            except LeadLostError as error:
+                log.info("housekeeping: %s", error.detail)
+            except FleetMapError as error:
+                log.warning("housekeeping: skipped, will retry: %s", error.detail)
+            except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
+                log.error("housekeeping: failed, will retry: %s", problems.describe(error))  # noqa: TRY400  a trace shows paths
+
+    def _run_in_each_process(self, is_beat: bool) -> None:
+        services, store = self._services, self._services.store
+        self._newest = _note_time(self._newest)
+        store.tokens.store_uses()
+        store.sessions.store_uses()
+        services.access.share_failures()
+        if is_beat:
+            services.jobs.send_heartbeats()
+
+    def _run_as_leader(self, is_beat: bool) -> None:
+        """Run the tasks of which one process of all servers is enough. Another leader's transactions fail."""
+        store = self._services.store
+        with self._lead.fenced():
+            store.tokens.end_expired()
+            store.channels.apply_due_moves(datetime.now(UTC))
+            store.channels.advance_rollouts(datetime.now(UTC), next_step)
+            store.overlays.end_due(datetime.now(UTC))
+            store.versions.remove_expired_dry_runs()
+            store.drafts.remove_expired()
+            if is_beat:
+                store.sessions.sweep()
+            if datetime.now(UTC) >= self._collect_at:
+                self._collect_at = datetime.now(UTC) + COLLECT_EVERY
+                store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))
+                store.garbage.collect(COLLECT_GRACE)
+
+
+def _note_time(newest: datetime) -> datetime:
+    """Return the current time; log a warning if the clock was set back."""
+    now = datetime.now(UTC)
+    if newest - now > CLOCK_TOLERANCE:
+        log.warning(
+            "clock: set back by %d s; expired tokens and links stay expired, replace those that expired too early",
+            (newest - now).total_seconds(),
+        )
+    return now
