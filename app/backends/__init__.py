@@ -1,0 +1,1 @@
+"""Ports to what several servers share, each with a local and a shared adapter; nothing else opens its files."""
