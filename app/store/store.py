@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 
 from app.backends.notify import CommitCounter
 from app.errors import DatabaseDamaged
@@ -130,6 +131,10 @@ class Store:
                 if problem is not None:
                     self._database.report_damage(problem)
                 yield table, size // len(tables), problem
+
+    def transaction(self) -> AbstractContextManager[Connection]:
+        """Begin a transaction that changes nothing that is versioned, for the queue of all servers."""
+        return self._database.write(notify=False, upkeep=True)
 
     def recover(self) -> None:
         """Remove the remains of killed uploads, at start. Safe beside other running processes."""

@@ -400,7 +400,16 @@ job = Table(
     Column("owner", Text, nullable=False),
     Column("created", UtcDateTime, nullable=False),
     Column("updated", UtcDateTime, nullable=False),
+    Column("task", String(64), nullable=True),
+    Column("location", Text, nullable=True),
+    Column("outcome", JSON(none_as_null=True), nullable=True),
+    Column("followed", Boolean, nullable=False, server_default=true()),
+    Index("ix_job_task", "task"),
 )
+"""Jobs. task: key of the task in the queue of all servers, which sets the state of all jobs that wait for it.
+
+location: address of what the task makes. outcome: of the task, for servers. followed: whether a client was told of it.
+"""
 
 
 def _report() -> list[Column[Any]]:
