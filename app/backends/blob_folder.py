@@ -11,6 +11,7 @@ import re
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from io import BufferedReader
 from pathlib import Path
 from typing import Final
 
@@ -66,6 +67,13 @@ class FolderFiles:
         for folder in folders:
             _sync(folder)
 
+    def open(self, key: str) -> BufferedReader:
+        """Open a file. Raises FileNotFoundError, another OSError if its storage is broken, Unreadable."""
+        try:
+            return (self._folder / key).open("rb")
+        except OSError as error:
+            raise _converted(error) from error
+
     def stream(self, key: str, start: int = 0, size: int | None = None) -> Iterator[bytes]:
         """Read a file in pieces."""
         try:
@@ -76,9 +84,7 @@ class FolderFiles:
                     left = None if left is None else left - len(block)
                     yield block
         except OSError as error:
-            if isinstance(error, FileNotFoundError) or error.errno in BROKEN_STORAGE_ERRNOS:
-                raise
-            raise unreadable_error(error) from error
+            raise _converted(error) from error
 
     def delete(self, keys: Iterable[str]) -> None:
         """Remove files."""
@@ -119,6 +125,12 @@ class FolderFiles:
         """Remove the workspaces of ended processes."""
         self.prepare()
         return self._workspaces.recover()
+
+
+def _converted(error: OSError) -> Exception:
+    if isinstance(error, FileNotFoundError) or error.errno in BROKEN_STORAGE_ERRNOS:
+        return error
+    return unreadable_error(error)
 
 
 def _synced(data: bytes | Path, workspace: Path) -> Path:

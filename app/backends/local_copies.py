@@ -29,9 +29,14 @@ class LocalCopies:
         self._lock = threading.Lock()
         self._size: int | None = None
 
+    @staticmethod
+    def key(sha256: str) -> str:
+        """Return the name of a copy in the folder: also that of a plain blob in a blob store."""
+        return f"{sha256[:2]}/{sha256}"
+
     def path(self, sha256: str) -> Path:
         """Return where the copy of a content is, if there is one."""
-        return self._folder / sha256[:2] / sha256
+        return self._folder / self.key(sha256)
 
     def get(self, sha256: str) -> bytes | None:
         """Read a copy; None if there is none. A damaged one is removed."""

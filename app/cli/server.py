@@ -333,14 +333,14 @@ def with_demo_token(settings: Settings) -> Settings:
 def _store(settings: Settings) -> Any:
     from contextlib import closing
 
-    from app.store.store import Store
+    from app.main import open_store
 
     try:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         settings.blob_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"{error.filename}: {error.strerror}: use another folder with --data-dir") from error
-    return closing(Store(settings.database, settings.blob_dir))
+    return closing(open_store(settings))
 
 
 def _without_password(url: str) -> str:

@@ -21,7 +21,7 @@ from app.convert import files as direct
 from app.convert import losses, site
 from app.convert import recipe as recipes
 from app.convert import worker as making
-from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap
+from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap, SharedMaps
 from app.convert.recipe import Recipe
 from app.convert.report import LayerLine, Report, all_credits, merge_reports, unsupported_layers
 from app.convert.trials import Trials
@@ -76,11 +76,15 @@ class Maps:
         *,
         cache_bytes: int = 4 * 2**30,
         run_trial: Run | None = None,
+        shared: SharedMaps | None = None,
     ) -> None:
-        """Create the service. run_trial: as ``run``, for jobs that must not wait for conversions; default: ``run``."""
+        """Create the service.
+
+        shared: maps of all servers. run_trial: as ``run``, for jobs that must not wait for conversions.
+        """
         self._store, self._run, self._limits = store, run, limits
         self._run_trial = run_trial or run
-        self.cache = Cache(cache_dir, cache_bytes)
+        self.cache = Cache(cache_dir, cache_bytes, shared)
         self._trials = Trials(cache_dir / "trials")
         self._crossings_cache: dict[Any, list[Problem]] = {}
         self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
@@ -175,7 +179,7 @@ class Maps:
         """Convert exactly this recipe and cache failures: that of a step which finds nothing to use, for all maps."""
         try:
             if recipe.members:
-                return self.get_cached(recipe) or self._assemble(recipe, stop)
+                return self.cache.get_or_fetch(recipe.key) or self._assemble(recipe, stop)
             return self.cache.get_or_make(recipe.key, lambda: self._run_conversion(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # otherwise the member stores it
