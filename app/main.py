@@ -35,6 +35,7 @@ from app.api.http.metrics import Metrics
 from app.api.http.middleware import Guard
 from app.api.http.protocol import BoundedProtocol, tls_context
 from app.api.http.response_cache import ResponseCache
+from app.api.http.shared_work import SharedWork
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.backends.blob_s3 import S3Files
@@ -42,6 +43,7 @@ from app.backends.blobs import BlobFiles
 from app.backends.documents import FileDocument
 from app.backends.lead import open_leads
 from app.backends.notify import Listener
+from app.backends.shared_queue import SharedQueue
 from app.config import Settings
 from app.convert.maps import Maps
 from app.convert.preview import Previews
@@ -288,7 +290,13 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     def count(name: str, result: str) -> None:
         metrics.conversions.labels(name, result).inc()
 
+    work = None
+    if settings.shares_maps:
+        queue = SharedQueue(store.transaction, waiting=settings.conversion_queue)
+        work = SharedWork(store, queue, service)
     tiles = Tiles(store, service.cache)
+    jobs = ConversionJobs(store, service, settings.job_seconds, count, work=work, is_busy=lambda: pool.is_busy)
+    metrics.queue = jobs.figures
     return Services(
         options=_api_options(settings),
         store=store,
@@ -297,7 +305,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         ingest=Ingest(store, run, settings.limits, imagery_provider(settings)),
         maps=service,
         access=access,
-        jobs=ConversionJobs(store, service, settings.job_seconds, count),
+        jobs=jobs,
+        work=work,
         response_cache=ResponseCache(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,

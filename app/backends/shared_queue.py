@@ -72,7 +72,7 @@ _CANCEL = text(
     " WHERE lock = :key AND status IN ('todo', 'doing')"
 )
 _FIGURES = text(
-    "SELECT queue_name, status::text AS status, count(*) AS count, extract(epoch FROM now() - min(event.at)) AS oldest"
+    "SELECT queue_name, status::text AS status, count(*) AS number, extract(epoch FROM now() - min(event.at)) AS oldest"
     " FROM procrastinate_jobs job LEFT JOIN procrastinate_events event"
     " ON event.job_id = job.id AND event.type = 'deferred'"
     " WHERE status IN ('todo', 'doing') GROUP BY queue_name, status"
@@ -125,8 +125,8 @@ class SharedQueue:
             rows = connection.execute(_FIGURES).all()
             workers = connection.execute(_WORKERS, {"seconds": STALLED_SECONDS}).scalar_one()
         waiting: dict[Urgency, int] = {"robot": 0, "person": 0}
-        waiting |= {row.queue_name: row.count for row in rows if row.status == "todo"}
-        running = sum(row.count for row in rows if row.status == "doing")
+        waiting |= {row.queue_name: row.number for row in rows if row.status == "todo"}
+        running = sum(row.number for row in rows if row.status == "doing")
         oldest = max((float(row.oldest or 0) for row in rows if row.status == "todo"), default=0.0)
         return QueueFigures(waiting, running, oldest, workers)
 
@@ -209,7 +209,7 @@ class QueueWorker:
         """Stop: take no more tasks, finish the running ones or give them back."""
         self._stopping.set()
         if self._worker is not None:
-            self._worker.stop()
+            self._worker.stop()  # type: ignore[no-untyped-call]
 
     @property
     def is_connected(self) -> bool:
@@ -241,7 +241,7 @@ class QueueWorker:
             if self._stopping.is_set():
                 return
             try:
-                await self._worker.run()
+                await self._worker.run()  # type: ignore[no-untyped-call]
             finally:
                 self._worker = None
 

@@ -107,10 +107,12 @@ class Maps:
         as in a manifest: files are named as those of the whole site, and no zip is created.
         """
         plan = self._planner(version, name, values or {}, derive=derive, file=file, listed=listed)
+        mode = None if version.closures is None else version.closures.mode
+        order = recipes.MapOrder(version.ref, name, dict(values or {}), derive, file, listed, mode)
 
         def check(recipe: Recipe, failed: Sequence[ChainFailure]) -> Recipe:
             self._check_known_failure(recipe)
-            return replace(recipe, failed=tuple(failed), replan=plan)
+            return replace(recipe, failed=tuple(failed), replan=plan, order=order)
 
         return first_working(plan, check)
 
@@ -153,6 +155,12 @@ class Maps:
     def get_cached(self, recipe: Recipe) -> CachedMap | None:
         """Return the map if it is cached."""
         return self.cache.get(recipe.key)
+
+    def get_made(self, recipe: Recipe, failed: Sequence[ChainFailure]) -> tuple[Recipe, CachedMap] | None:
+        """Return a map that another server has made, after these derivations of its recipe found nothing to use."""
+        planned = recipe.without(failed)
+        cached_map = self.cache.get_or_fetch(planned.key)
+        return None if cached_map is None else (planned, cached_map)
 
     def get_or_convert(self, recipe: Recipe, stop: CancelHandle | None = None) -> tuple[Recipe, CachedMap]:
         """Return the map and its recipe, which differs from the given one if a step of that finds nothing to use.

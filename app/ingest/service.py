@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ from app.ingest.prepare import Mode, PreparedUpload, datum_moved_warnings, prepa
 from app.ingest.templates import TemplateUpdate
 from app.limits import Limits
 from app.model.frame import Datum
-from app.pool import WorkerDied
+from app.pool import CancelHandle, WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
 from app.store.pending import as_prepared
 from app.store.store import Store
@@ -78,6 +79,10 @@ class Ingest:
         self._store, self._run, self._limits = store, run, limits
         self.provider = provider
         self.drafts = DraftEditor(store, self._run_in_worker)
+
+    def stopped_by(self, stop: CancelHandle) -> Ingest:
+        """Return the same service, whose work can be stopped from another thread; it then raises Cancelled."""
+        return Ingest(self._store, partial(self._run, stop=stop), self._limits, self.provider)
 
     def upload(self, environment: str, upload: Upload, commit: CommitRequest) -> CommitResult:
         """Commit uploaded files as one version, or none of them.

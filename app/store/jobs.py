@@ -36,11 +36,22 @@ class Jobs:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def create(self, owner: str = "", detail: str = "", *, task: str | None = None, location: str | None = None) -> Job:
-        """Add a queued job. task: the task that it waits for; without an owner no client is told of it yet."""
+    def create(
+        self,
+        owner: str = "",
+        detail: str = "",
+        *,
+        task: str | None = None,
+        location: str | None = None,
+        followed: bool = True,
+    ) -> Job:
+        """Add a queued job.
+
+        task: that it waits for. location: address of what that makes. followed: whether a client is told of the job.
+        """
         now = self._database.now()
         new = secrets.token_hex(16)
-        with self._database.write() as connection:
+        with self._database.write(upkeep=task is not None) as connection:
             connection.execute(
                 insert(tables.job).values(
                     id=new,
@@ -54,7 +65,7 @@ class Jobs:
                     updated=now,
                     task=task,
                     location=location,
-                    followed=task is None or bool(owner),
+                    followed=followed,
                 )
             )
         return self.get(new)
@@ -91,9 +102,16 @@ class Jobs:
         """Give a task's job that has no owner to a client. Returns False if another one has it."""
         table = tables.job
         values = {"owner": checked_text(owner, "an owner"), "location": location, "followed": True}
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             mine = update(table).where(table.c.id == id, table.c.owner == "").values(**values)
             return bool(connection.execute(mine).rowcount)
+
+    def detach(self, id: str) -> None:
+        """Let a job no longer wait for its task; delete it if no client was told of it."""
+        table = tables.job
+        with self._database.write(upkeep=True) as connection:
+            connection.execute(delete(table).where(table.c.id == id, table.c.owner == ""))
+            connection.execute(update(table).where(table.c.id == id).values(task=None))
 
     def start_task(self, task: str) -> bool:
         """Mark the jobs that wait for a task as running. Returns False if none does: all were cancelled."""
