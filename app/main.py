@@ -399,7 +399,8 @@ def start_scrub(settings: Settings, services: Services) -> Scrub | None:
         return None
     sample = partial(services.maps.cache.sample, CACHE_SHARE)
     rate = settings.scrub_bytes_per_second
-    scrub = Scrub(services.store, sample, every=settings.scrub_hours * 3600, rate=rate)
+    lead = services.leads.lead("scrub") if services.store.is_shared else None
+    scrub = Scrub(services.store, sample, every=settings.scrub_hours * 3600, rate=rate, lead=lead)
     scrub.start()
     return scrub
 

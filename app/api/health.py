@@ -67,14 +67,14 @@ async def readyz(
         "reads", alias="for", description="What to check: `writes` also requires free disk space."
     ),
 ) -> Response:
-    """Check that the database responds, is not known to be damaged, and has this release's schema.
+    """Check that the database responds, is not known to be damaged, and has a schema that this release can use.
 
     - `status`: `ready`, or `read-only` if maps are served but nothing can be stored. `writes` then gives the reason,
       and `?for=writes` returns 503.
     - `cache`: why maps are currently not cached on disk, or `ok`.
-    - `events`: whether events are published over Zenoh, and where robots find the router (`connect`, `prefix`). Maps
-      are served even if events are not.
-    - `ros2`: number of published topics, if the ROS 2 publisher is enabled.
+    - `events`: whether this server is connected to Zenoh, whether it is the one that publishes events (`leader`), and
+      where robots find the router (`connect`, `prefix`). Maps are served even if events are not published.
+    - `ros2`: number of published topics, if the ROS 2 publisher is enabled; `standby`: another server publishes them.
     """
     services: Services = request.app.state.services
     try:
@@ -116,6 +116,6 @@ async def metrics(services: ServicesDep, _: ServerViewer) -> Response:
     Requires a token for all environments.
     """
     services.response_cache.flush_counters()
-    response = Response(await run_in_threadpool(services.metrics.render, services.store))
+    response = Response(await run_in_threadpool(services.metrics.render, services.store, services.leads))
     response.headers["content-type"] = CONTENT_TYPE
     return response

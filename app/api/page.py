@@ -18,8 +18,8 @@ from app.api.http.caching import none_match
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import problem_responses
-from app.config import basemap_origin
 from app.errors import NotFound, Unavailable
+from app.setting_values import basemap_origin
 
 FOLDER = Path(__file__).resolve().parents[1] / "web" / "dist"
 

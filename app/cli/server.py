@@ -277,7 +277,8 @@ def _warn_unknown(settings: Iterable[str], file: Path) -> None:
 def with_flags(function: Callable[..., None]) -> Callable[..., None]:
     """Return ``serve`` with an option for each setting of ``app.config.Settings``."""
     local.require_server_python("serve")
-    from app.config import Settings, format_size
+    from app.config import Settings
+    from app.setting_values import format_size
 
     def command(**values: Any) -> None:
         function(**values)

@@ -53,6 +53,11 @@ RESTART_SECONDS = 8.0
 
 CONNECT_SECONDS = 10.0
 
+SESSION_LEASE_MILLISECONDS = 3000
+"""Silence after which routers drop the server's session: late joiners wait that long for the cache of a server that has
+stopped. Zenoh's default is 10 seconds.
+"""
+
 Mode = Literal["router", "client", "off"]
 
 
@@ -126,6 +131,7 @@ def session_configuration(options: BusOptions) -> str:
     _set(config, "connect/endpoints", [part.strip() for part in endpoints.split(",") if part.strip()])
     _set(config, "connect/timeout_ms", int(CONNECT_SECONDS * 1000))
     _set(config, "connect/exit_on_failure", True)
+    _set(config, "transport/link/tx/lease", SESSION_LEASE_MILLISECONDS)
     _set(config, "connect/retry", {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2})
     _set(config, "listen/endpoints", [])
     _set(config, "scouting/multicast/enabled", False)

@@ -125,7 +125,10 @@ class LeaderThread(ABC):
 
 
 def read_state(data_dir: Path, name: str) -> dict[str, Any]:
-    """Read the state of a leader thread for /readyz: ``starting``, ``connected``, or ``down`` with the reason."""
+    """Read the state of a leader thread for /readyz.
+
+    It is ``starting``, ``connected``, ``standby``, or ``down`` with the reason.
+    """
     try:
         state: dict[str, Any] = json.loads(_state_file(data_dir, name).read_text())
     except (OSError, ValueError):

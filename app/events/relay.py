@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +51,13 @@ class Relay(LeaderThread):
         self._store, self._bus = store, bus
         self._replayed_for = 0
         self._history: deque[HistoryRange] = deque()
+        self._chooser = ThreadPoolExecutor(1, thread_name_prefix="fleetmap-history")
+        self._choice: Future[list[HistoryRange]] | None = None
         self._checked = 0.0
 
     def _release(self) -> None:
         self._bus.close()
+        self._chooser.shutdown(wait=False, cancel_futures=True)
 
     def _is_able(self) -> bool:
         return self._bus.ensure_connected()
@@ -61,7 +65,8 @@ class Relay(LeaderThread):
     def _stand_by(self) -> None:
         """Stay connected without publishers, so that late joiners ask only the leader for history."""
         if self._replayed_for and not self._lead.is_held:
-            self._replayed_for = 0
+            self._replayed_for, self._choice = 0, None
+            self._history.clear()
             self._bus.close_publishers()
         state = self._bus.state
         if state["state"] != "connected":
@@ -80,8 +85,10 @@ class Relay(LeaderThread):
         self._publish_new()
         if self._replayed_for != self._bus.opened:
             position = self._store.events.relay_position()
-            self._history = deque(self._store.events.history(position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS))
+            history = self._store.events.history
+            self._choice = self._chooser.submit(history, position, EVENT_CACHE_SIZE, MAX_REPLAYED_EVENTS)
             self._replayed_for = self._bus.opened
+        self._take_choice()
         self._publish_state({**self._bus.state, "leader": True})  # only now: without the database nothing is published
         if self._history:
             self._replay()
@@ -89,7 +96,8 @@ class Relay(LeaderThread):
         # Also return periodically: a notification may have been lost, and the session must be checked.
         last_read = time.monotonic()
         while self._lead.is_held and not self._stopping.wait(COMMIT_POLL_SECONDS):
-            if self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS:
+            is_chosen = self._choice is not None and self._choice.done()
+            if is_chosen or self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS:
                 return
 
     def _publish_new(self) -> None:
@@ -105,6 +113,17 @@ class Relay(LeaderThread):
                 position = event.position
             with self._lead.fenced():
                 self._store.events.set_relayed(position)
+
+    def _take_choice(self) -> None:
+        """Begin to republish the history once it is chosen, which may take a second with a long log."""
+        if self._choice is None or not self._choice.done():
+            return
+        choice, self._choice = self._choice, None
+        try:
+            self._history = deque(choice.result())
+        except Exception:
+            self._replayed_for = 0
+            raise
 
     def _replay(self) -> None:
         """Publish the last events of some environments again, also those that were new just now."""

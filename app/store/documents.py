@@ -29,8 +29,11 @@ class StoredDocument:
             content = connection.execute(select(table.c.content).where(table.c.name == self._name)).scalar_one_or_none()
         return None if content is None else bytes(content)
 
-    def update(self, change: Change) -> bytes:
-        """Replace the content in one transaction, with the row locked. Raises Unavailable."""
+    def update(self, change: Change, *, notify: bool = True) -> bytes:
+        """Replace the content in one transaction, with the row locked. Raises Unavailable.
+
+        notify: whether other servers have to read it again.
+        """
         if self.read() is None:
             try:
                 return self._insert(change(None))
@@ -38,7 +41,7 @@ class StoredDocument:
                 pass
         table = tables.document
         row = table.c.name == self._name
-        with self._database.write(upkeep=True) as connection:
+        with self._database.write(notify=notify, upkeep=True) as connection:
             present = connection.execute(select(table.c.content).where(row).with_for_update()).scalar_one()
             content = change(bytes(present))
             connection.execute(update(table).where(row).values(content=content, revision=table.c.revision + 1))

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
+from app.backends.lead import Lead
 from app.errors import FleetMapError, Unavailable, system_reason
 from app.store.store import Store
 from app.store.verify import KINDS, Kind, check_root
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 
 LOCK: Final = ".scrub.lock"
 STATE: Final = ".scrub.json"
+DOCUMENT: Final = "scrub"
 POLL_SECONDS: Final = 60.0
 SAVE_SECONDS: Final = 10.0
 THING_BYTES: Final = 4096
@@ -54,22 +56,45 @@ class ScrubState:
 def read_state(folder: Path) -> ScrubState:
     """Read the state that the scrubbing process stored in a blob folder."""
     try:
-        members = json.loads((folder / STATE).read_bytes())
+        return _parse_state((folder / STATE).read_bytes())
+    except OSError:
+        return ScrubState()
+
+
+def current_state(store: Store) -> ScrubState:
+    """Read the state of a store's scrub: from the database if several servers share it. Raises Unavailable."""
+    if store.is_shared:
+        return _parse_state(store.document(DOCUMENT).read() or b"{}")
+    return read_state(store.blob_dir)
+
+
+def _parse_state(content: bytes) -> ScrubState:
+    try:
+        members = json.loads(content)
         field_names = {f.name for f in fields(ScrubState)}
         return ScrubState(**{name: value for name, value in members.items() if name in field_names})
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (ValueError, TypeError, AttributeError):
         return ScrubState()
 
 
 class Scrub:
     """Passes over a store in a thread of its own. every: seconds from one pass to the next. rate: bytes per second.
 
-    delay: seconds before the first pass, so that it does not slow down the start of the server.
+    lead: lead among several servers; None with one. delay: seconds before the first pass, so that it does not slow down
+    the start of the server.
     """
 
     def __init__(
-        self, store: Store, check_cache: CheckCache, *, every: float, rate: int, delay: float = POLL_SECONDS
+        self,
+        store: Store,
+        check_cache: CheckCache,
+        *,
+        every: float,
+        rate: int,
+        lead: Lead | None = None,
+        delay: float = POLL_SECONDS,
     ) -> None:
+        self._lead = lead
         self._store, self._check_cache = store, check_cache
         self._every, self._rate, self._delay = every, rate, delay
         self._stopped = threading.Event()
@@ -96,7 +121,8 @@ class Scrub:
                 with (self._store.blob_dir / LOCK).open("w") as handle:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     while not self._stopped.is_set():
-                        self.pass_if_due()
+                        if self._lead is None or self._lead.try_acquire():
+                            self.pass_if_due()
                         self._reason = ""
                         self._stopped.wait(POLL_SECONDS)
             except BlockingIOError:
@@ -116,7 +142,7 @@ class Scrub:
 
     def pass_if_due(self) -> None:
         """Continue a pass, or begin one if the last is long enough ago."""
-        self._state = read_state(self._store.blob_dir)
+        self._state = current_state(self._store)
         if not self._state.started and time.time() - self._state.completed < self._every:
             return
         if not self._state.started:
@@ -129,7 +155,7 @@ class Scrub:
             if step in restarting:
                 self._state.found.pop(restarting[step], None)  # the step restarts and finds it again
             step()
-            if self._stopped.is_set():
+            if self._stopped.is_set() or (self._lead is not None and not self._lead.is_held):
                 self._save()
                 return
             self._state.step, self._state.after = self._state.step + 1, ""
@@ -180,7 +206,7 @@ class Scrub:
         if self._debt > 0.05:  # one long sleep instead of many of a microsecond
             self._stopped.wait(self._debt)
             self._debt = 0.0
-        return not self._stopped.is_set()
+        return not self._stopped.is_set() and (self._lead is None or self._lead.is_held)
 
     def _note(self, kind: Kind, name: str, problem: str) -> None:
         state = self._state
@@ -193,6 +219,12 @@ class Scrub:
 
     def _save(self) -> None:
         self._saved = time.monotonic()
+        if self._store.is_shared:
+            content = json.dumps(asdict(self._state)).encode()
+            fence = contextlib.nullcontext() if self._lead is None else self._lead.fenced()
+            with contextlib.suppress(Unavailable), fence:
+                self._store.document(DOCUMENT).update(lambda _: content, notify=False)
+            return
         path = self._store.blob_dir / STATE
         temporary = path.with_suffix(f".{os.getpid()}")
         with contextlib.suppress(OSError):  # a full disk must not stop the scrub

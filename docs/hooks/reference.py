@@ -35,16 +35,18 @@ from typer.main import get_command
 from app import derive, generate
 from app.api.http import problems
 from app.api.http.auth import RequireRole
-from app.api.http.metrics import Metrics, _HeadVersionCollector, _Scrubs
+from app.api.http.metrics import Metrics, _HeadVersionCollector, _Leaders, _Scrubs
 from app.api.http.responses import API
+from app.backends.lead import LocalLeads
 from app.cli import commands
-from app.config import Settings, format_size
+from app.config import Settings
 from app.derive import Derivation
 from app.errors import FleetMapError
 from app.event_types import EVENT_TYPES, describe
 from app.formats import Format, all_formats
 from app.generate import Generator
 from app.main import create_app
+from app.setting_values import format_size
 from app.store import encode, tree
 
 FORMATS = "reference/formats"
@@ -399,8 +401,8 @@ def metrics() -> str:
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
-        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder))
-        for collector in (_HeadVersionCollector(empty), _Scrubs(empty)):
+        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder), is_shared=False)
+        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), _Leaders(LocalLeads(Path(folder)))):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
                 rows.append((code(family.name), family.type, codes(labels), family.documentation))

@@ -15,7 +15,7 @@ revision = "0016"
 down_revision = "0015"
 branch_labels = None
 depends_on = None
-min_compatible = "0016"
+min_compatible = "0016"  # earlier releases require exactly their own schema
 
 
 def upgrade() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from app.api.page import POLICY, policy_for
-from app.config import basemap_origin
+from app.setting_values import basemap_origin
 from tests.api.conftest import API, running, settings_for
 
 URL = "https://tiles.example.org:8443/base/{z}/{x}/{y}.png?key=k%20"

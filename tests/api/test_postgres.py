@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import psycopg
 import pytest
 
 from app.errors import Unavailable
-from app.main import open_services
+from app.main import close_services, open_services
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
@@ -32,9 +33,13 @@ def api(postgres_url: str, tmp_path: Path) -> Iterator[Api]:
         yield api
 
 
-def test_server_does_not_start_before_migrate(postgres_url: str, tmp_path: Path) -> None:
-    with pytest.raises(Unavailable, match="fleetmap migrate"):
-        open_services(settings_for(tmp_path, database_url=postgres_url))
+def test_server_creates_schema_but_does_not_change_an_older_one(postgres_url: str, tmp_path: Path) -> None:
+    settings = settings_for(tmp_path, database_url=postgres_url)
+    close_services(open_services(settings))
+    with psycopg.connect(postgres_url.replace("+psycopg", ""), autocommit=True) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '0015'")
+    with pytest.raises(Unavailable, match=r"schema is 0015, this release needs .*: run fleetmap migrate"):
+        open_services(settings)
 
 
 def test_postgres_serves_the_whole_interface(api: Api) -> None:

@@ -16,7 +16,8 @@ from typer.main import get_command
 
 from app.cli import completion, groups, variables
 from app.cli.commands import ALIASES, PANELS, build, needed_command
-from app.config import Settings, format_size, parse_size
+from app.config import Settings
+from app.setting_values import format_size, parse_size
 from tests.cli.conftest import TOKEN, Fleetmap
 
 

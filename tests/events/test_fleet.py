@@ -211,3 +211,77 @@ def test_invalid_reports_do_not_delay_presence_refresh(
     lines = [r for r in caplog.records if "must be a JSON object" in r.getMessage()]
     assert "others)" in caplog.text
     assert lines
+
+
+def test_reports_are_stored_by_the_leader_only_and_by_its_successor(api: Api, lead: LocalLead, tmp_path: Path) -> None:
+    store: Store = api.app.state.services.store
+    store.environments.create("farm")
+    successor = LocalLead(tmp_path, "reports")
+    intakes = [ReportQueue(store, one) for one in (lead, successor)]
+    for intake in intakes:
+        intake.start()
+
+    def publish(number: int) -> None:
+        for intake in intakes:
+            intake.enqueue_status("farm", "r1", status_payload(number))
+
+    try:
+        publish(1)
+        eventually(lambda: len(store.robots.history("farm", "r1")) == 1)
+        lead.release()
+        publish(2)
+        threading.Event().wait(0.3)
+        assert len(store.robots.history("farm", "r1")) == 1, "nobody leads"
+        assert successor.try_acquire()
+        eventually(lambda: len(store.robots.history("farm", "r1")) == 2)
+        publish(3)
+        eventually(lambda: len(store.robots.history("farm", "r1")) == 3)
+        assert [r.version for _, r in store.robots.history("farm", "r1")] == [3, 2, 1]
+    finally:
+        for intake in intakes:
+            intake.close()
+        successor.release()
+
+
+def test_presence_is_written_when_it_changes_and_by_the_leader(
+    api: Api, lead: LocalLead, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server that takes over stores what changed while no server led."""
+    monkeypatch.setattr("app.fleet.report_queue.SETTLE_SECONDS", 0.2)
+    monkeypatch.setattr("app.fleet.report_queue.PRESENCE_REFRESH_SECONDS", 0.3)
+    store: Store = api.app.state.services.store
+    written: list[int] = []
+    note = store.robots.note_presence
+    monkeypatch.setattr(
+        store.robots,
+        "note_presence",
+        lambda came, left, now: (written.append(len(came) + len(left)), note(came, left, now)),
+    )
+    successor = LocalLead(tmp_path, "reports")
+    intakes = [ReportQueue(store, one) for one in (lead, successor)]
+    for intake in intakes:
+        intake.start()
+
+    def appear(*robots: str, on_bus: bool = True) -> None:
+        for robot in robots:
+            for intake in intakes:
+                intake.set_presence(robot, on_bus)
+
+    try:
+        appear("a", "b", "c")
+        eventually(lambda: store.robots.present_robots() == {"a", "b", "c"})
+        checks = [store.robots.present_robots() and threading.Event().wait(0.5) for _ in range(4)]
+        assert len(checks) == 4
+        assert sum(written) == 3, "the others are renewed by one time"
+        lead.release()
+        appear("a", on_bus=False)
+        appear("d")
+        threading.Event().wait(0.5)
+        assert store.robots.present_robots() == {"a", "b", "c"}
+        assert successor.try_acquire()
+        eventually(lambda: store.robots.present_robots() == {"b", "c", "d"})
+        assert sum(written) == 5
+    finally:
+        for intake in intakes:
+            intake.close()
+        successor.release()

@@ -301,3 +301,30 @@ def test_robot_is_online_by_presence_or_recent_report(
         sqlite_store.robots.note_presence({"r"} if present else set(), set() if present else {"r"}, at)
     (robot,) = sqlite_store.robots.all()
     assert is_online(robot, NOW) is online
+
+
+def test_repeated_report_is_stored_once_a_minute(farm: Store):
+    """Unless it says more: a failure, a place, or that a robot without the bus is online."""
+
+    def stored_time(minutes: float, **more: Any) -> datetime:
+        report = replace(received_report("r", 0).report, **more)
+        farm.robots.note_reports([ReceivedReport("farm", "r", report, NOW + timedelta(minutes=minutes))])
+        return farm.robots.all(robot="r")[0].time
+
+    assert stored_time(0) == NOW
+    assert stored_time(0.5) == NOW
+    assert stored_time(1) == NOW + timedelta(minutes=1)
+    farm.robots.note_presence(set(), {"r"}, NOW + timedelta(minutes=1.1))
+    assert stored_time(1.2) == NOW + timedelta(minutes=1.2), "it is online without the bus"
+    assert stored_time(1.3) == NOW + timedelta(minutes=1.2)
+    for minutes in (1.4, 1.5):
+        assert stored_time(minutes, state="failed") == NOW + timedelta(minutes=minutes)
+
+
+def test_presence_is_renewed_for_all_robots_at_once(farm: Store):
+    farm.robots.note_reports([received_report("r1", -10), received_report("r2", -10)])
+    farm.robots.note_presence({"r1"}, {"r2"}, NOW)
+    later = NOW + timedelta(minutes=5)
+    farm.robots.renew_presence(later)
+    assert [(r.on_bus, r.presence_at) for r in farm.robots.all()] == [(True, later), (False, NOW)]
+    assert [is_online(r, later) for r in farm.robots.all()] == [True, False]

@@ -17,9 +17,9 @@ from app.errors import Unavailable
 from app.main import startup_lock
 from app.store.database import Database
 from app.store.fleet_values import ReceivedReport, RobotReport
-from app.store.schema import comparison, config, newest
+from app.store.schema import RECORDED_SINCE, comparison, config, newest
 from app.store.store import Store
-from app.store.tables import metadata
+from app.store.tables import metadata, server
 
 
 def test_models_and_migrations_are_equal(store: Store, database_url: str):
@@ -108,6 +108,37 @@ def test_postgres_has_gist_indexes_and_uncompressed_chunks(postgres_url: str, tm
 
 def test_newest_revision_follows_from_migration_files() -> None:
     assert newest() == ScriptDirectory.from_config(config()).get_current_head()
+
+
+def test_migrations_declare_what_they_are_compatible_with() -> None:
+    script = ScriptDirectory.from_config(config())
+    declared = {
+        revision.revision: revision.module.min_compatible
+        for revision in script.walk_revisions()
+        if revision.revision >= RECORDED_SINCE
+    }
+    assert declared
+    assert all(RECORDED_SINCE <= compatible <= revision for revision, compatible in declared.items())
+    for revision, compatible in declared.items():
+        text = Path(script.get_revision(revision).path).read_text().partition("def downgrade")[0]
+        removes = any(word in text for word in ("op.drop_", "op.rename_", "DROP ", "RENAME "))
+        assert not removes or compatible == revision, f"{revision} removes what older releases may use"
+
+
+def test_release_uses_newer_schema_that_is_compatible(store: Store, database_url: str) -> None:
+    database = Database(database_url, readonly=False)
+    with database.write() as connection:
+        assert connection.execute(sa.select(server.c.min_compatible)).scalar_one() == RECORDED_SINCE
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    store.check()
+    store.migrate()
+    store.initialise()
+    with database.write() as connection:
+        connection.execute(sa.update(server).values(min_compatible="9998"))
+    for refused in (store.check, store.migrate):
+        with pytest.raises(Unavailable, match="requires a release with schema 9998 or newer, and this one has"):
+            refused()
+    database.close()
 
 
 def test_concurrent_servers_create_one_administrator(empty_database_url: str, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
 from app.store.changes import Changes
 from app.store.chunks import insert
 from app.store.encode import compress, digest
-from app.store.scrub import LOCK, Scrub, figures, read_state
+from app.store.scrub import LOCK, Scrub, current_state, figures, read_state
 from app.store.store import Store
 from app.store.values import Source
 from tests.store.samples import GRID, everything, grid, replaces, save
@@ -113,22 +113,22 @@ def test_scrub_finds_damage_resumes_and_reports_age(store: Store) -> None:
     entry = store.versions.get("farm", 1).part(GRID)
     assert entry is not None
     spoil_chunk(store, entry.hash)
-    assert figures(read_state(store.blob_dir))["age"] == float("inf")
+    assert figures(current_state(store))["age"] == float("inf")
     cache = [("00", 10, True), ("01", 0, False)]
     scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
     scrub._stopped.set()  # stopped within the first step
     scrub.pass_if_due()
-    begun = read_state(store.blob_dir)
+    begun = current_state(store)
     assert begun.started
     assert not begun.completed
     scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
     scrub.pass_if_due()
-    state = read_state(store.blob_dir)
+    state = current_state(store)
     assert state.findings == {"chunk": 1, "cache": 1}
     assert state.size > 100_000
     assert 0 <= figures(state)["age"] < 60
     scrub.pass_if_due()
-    assert read_state(store.blob_dir) == state, "the next pass is not due yet"
+    assert current_state(store) == state, "the next pass is not due yet"
 
 
 def test_scrub_checks_sqlite_by_table_with_pauses(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

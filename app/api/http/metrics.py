@@ -15,8 +15,9 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from app.backends.lead import Leads
 from app.backends.queue import QueueFigures
-from app.store.scrub import figures, read_state
+from app.store.scrub import current_state, figures
 from app.store.store import Store
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -66,7 +67,7 @@ class Metrics:
                 with contextlib.suppress(OSError), path.open("r+b") as file:
                     os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
 
-    def render(self, store: Store) -> bytes:
+    def render(self, store: Store, leads: Leads) -> bytes:
         """Write all metrics in the text format of Prometheus."""
         registry = self.registry
         if os.environ.get("PROMETHEUS_MULTIPROC_DIR"):
@@ -77,6 +78,7 @@ class Metrics:
         heads.register(_Scrubs(store))
         if self.queue is not None:
             heads.register(QueueCollector(self.queue))
+        heads.register(_Leaders(leads))
         return generate_latest(registry) + generate_latest(heads)
 
 
@@ -100,6 +102,23 @@ class _HeadVersionCollector(Collector):
         yield GaugeMetricFamily("fleetmap_environments", "Environments that are not deleted.", value=count)
 
 
+class _Leaders(Collector):
+    """Tasks that one server at a time does."""
+
+    def __init__(self, leads: Leads) -> None:
+        self._leads = leads
+
+    def collect(self) -> Iterable[Metric]:
+        gauge = GaugeMetricFamily(
+            "fleetmap_leader",
+            "Whether this server does a task that one server at a time does, by task.",
+            labels=["task"],
+        )
+        for name, leads in sorted(self._leads.roles().items()):
+            gauge.add_metric([name], leads)
+        yield gauge
+
+
 class _Scrubs(Collector):
     """Age and findings of the last complete check of stored data."""
 
@@ -107,7 +126,7 @@ class _Scrubs(Collector):
         self._store = store
 
     def collect(self) -> Iterable[Metric]:
-        state = figures(read_state(self._store.blob_dir))
+        state = figures(current_state(self._store))
         age = "Seconds since the last complete check of all stored data; +Inf before the first one."
         yield GaugeMetricFamily("fleetmap_scrub_age_seconds", age, value=state["age"])
         yield GaugeMetricFamily(
