@@ -159,9 +159,9 @@ def _reason(error: Exception) -> str:
         return "no such bucket: create it"
     if any(word in text for word in _FULL):
         return "it is full"
+    if any(word in text for word in ("kind: Timeout", "TimedOut", "timed out")):
+        return "it answers too slowly"
     if "kind: Connect" in text or "error sending request" in text:
         return "it does not answer: check AWS_ENDPOINT_URL, and whether it runs"
-    if "timed out" in text or "kind: Timeout" in text:
-        return "it answers too slowly"
     code = text.partition("status code: ")[2].partition(":")[0]
     return f"it answered {code}" if code else type(error).__name__

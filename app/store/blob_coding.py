@@ -29,6 +29,9 @@ MAX_PATCHED: Final = 64 * 2**20
 PAYS: Final = 0.9
 """Share of the size that a compressed blob may have, else it is kept as it is."""
 
+CLEARLY: Final = 1000
+"""How many times smaller than its content a difference is that no other kind is tried for."""
+
 LEVEL: Final = 3
 _OPTIONS: Final[dict[int, int]] = {
     zstd.CompressionParameter.compression_level: LEVEL,
@@ -59,7 +62,12 @@ def compress_file(source: bytes | Path, target: Path) -> int:
 
 
 def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
-    """Return the smallest difference of a content from another."""
+    """Return the smaller difference of a content from another."""
+    best: tuple[Coding, bytes] | None = None
+    if len(base) == len(content):
+        best = "xor", zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
+        if len(best[1]) * CLEARLY < len(content):
+            return best
     options: dict[int, int] = {
         zstd.CompressionParameter.compression_level: LEVEL,
         zstd.CompressionParameter.window_log: _WINDOW,
@@ -67,12 +75,8 @@ def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
         zstd.CompressionParameter.checksum_flag: 0,
     }
     dictionary = zstd.ZstdDict(base, is_raw=True)
-    patch = zstd.compress(content, options=options, zstd_dict=dictionary.as_prefix)
-    best: tuple[Coding, bytes] = ("patch", zstd.compress(patch))
-    if len(base) == len(content):
-        xor = zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
-        best = min(best, ("xor", xor), key=lambda one: len(one[1]))
-    return best
+    patch = zstd.compress(zstd.compress(content, options=options, zstd_dict=dictionary.as_prefix))
+    return ("patch", patch) if best is None or len(patch) < len(best[1]) else best
 
 
 def _xor(one: bytes | memoryview, other: bytes) -> bytes:

@@ -138,9 +138,9 @@ class Blobs:
     ) -> tuple[BlobRow, bytes | Path]:
         """Choose the smallest form of a file, and write it to the workspace."""
         plain, packed = workspace / name, workspace / f"{name}.zst"
-        size = _copy(data, plain)
-        if not isinstance(data, bytes) and _hash(plain) != name:
-            raise OSError(f"{data.name} changed while it was stored")
+        size, digest = _copy(data, plain)
+        if digest != name:
+            raise OSError(f"{plain.name} changed while it was stored")
         compressed = blob_coding.compress_file(plain, packed)
         difference = self._difference(plain, name, size, compressed, similar)
         if difference is None and compressed >= size * blob_coding.PAYS:
@@ -280,13 +280,19 @@ class Blobs:
     def _decoded(self, row: BlobRow) -> Iterator[bytes]:
         stored = self.files.stream(row.key, row.start, None if row.pack is None else row.stored)
         first = next(stored, b"")  # a worker finds that the file is not on this machine before it looks for its base
-        base = b"" if row.base is None else self.get(row.base)
         size = 0
-        for piece in blob_coding.decoded(chain((first,), stored), row.coding, base):
+        for piece in blob_coding.decoded(chain((first,), stored), row.coding, self._base(row)):
             size += len(piece)
             if size > row.size:
                 raise Undecodable("it is longer than its content")
             yield piece
+
+    def _base(self, row: BlobRow) -> bytes:
+        """Read what a blob is the difference from. It is not hashed: the hash of the blob itself shows any damage."""
+        if row.base is None:
+            return b""
+        copy = self._copies.get(row.base) if self.files.remote else None
+        return b"".join(self._decoded(self._row(row.base))) if copy is None else copy
 
     def _add_copy(self, row: BlobRow, pieces: Iterator[bytes]) -> bool:
         """Keep a copy on this machine; False if its disk cannot be written."""
@@ -402,11 +408,13 @@ def _hash(data: bytes | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _copy(data: bytes | Path, target: Path) -> int:
+def _copy(data: bytes | Path, target: Path) -> tuple[int, str]:
+    digest = hashlib.sha256()
     with target.open("wb") as out:
         for piece in blob_coding.pieces(data):
             out.write(piece)
-        return out.tell()
+            digest.update(piece)
+        return out.tell(), digest.hexdigest()
 
 
 __all__ = ["Blobs", "Unreadable"]

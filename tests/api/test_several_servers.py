@@ -15,13 +15,15 @@ import pytest
 from app.config import Settings
 from app.main import open_store
 from tests.api import samples
-from tests.api.conftest import Api, running, settings_for
+from tests.api.conftest import Api, parts, running, settings_for
 from tests.postgres import postgres_cluster, postgres_url
-from tests.seaweed import s3_url, seaweed
+from tests.seaweed import Seaweed, s3_url, seaweed
 
 __all__ = ["postgres_cluster", "postgres_url", "s3_url", "seaweed"]
 
 pytestmark = pytest.mark.postgres
+
+YARD = Path(__file__).resolve().parents[1] / "samples" / "gazebo" / "yard"
 
 
 @pytest.fixture(params=["folder", "s3"])
@@ -85,14 +87,22 @@ def test_delta_of_another_server_is_as_small(servers: list[Api]) -> None:
 def test_sources_are_read_where_they_were_not_uploaded(servers: list[Api]) -> None:
     a, b = servers
     a.post("environments", {"name": "farm"})
-    mesh = random.Random(3).randbytes(9_000_000)
-    a.upload("farm", {"models/barn.dae": mesh, "models/small.mtl": b"newmtl red\n"})
-    for name, data in (("models/barn.dae", mesh), ("models/small.mtl", b"newmtl red\n")):
+    pixels = bytes(random.Random(3).choices((0, 205, 254), k=3000 * 3100))
+    grid = {"map.pgm": b"P5\n3000 3100\n255\n" + pixels, "map.yaml": samples.grid()["map.yaml"]}
+    a.upload("farm", grid)
+    for name, data in grid.items():
         assert b.get(f"environments/farm/versions/1/sources/{name}").content == data
-        part = b.get(f"environments/farm/versions/1/sources/{name}", 206, headers={"Range": "bytes=3-7"})
-        assert part.content == data[3:8]
-    # a worker has no network: its server gets the files for it
-    assert b.get("/maps/farm/environment").content == a.get("/maps/farm/environment").content
+        part = b.get(f"environments/farm/versions/1/sources/{name}", 206, headers={"Range": "bytes=30-70"})
+        assert part.content == data[30:71]
+
+
+def test_workers_read_files_that_their_server_gets_for_them(servers: list[Api]) -> None:
+    a, b = servers
+    a.post("environments", {"name": "yard"})
+    a.upload("yard", {p.relative_to(YARD).as_posix(): p.read_bytes() for p in YARD.rglob("*") if p.is_file()})
+    made = b.get("/maps/yard/gazebo")
+    assert conversions([a]) == 0
+    assert made.content == a.get("/maps/yard/gazebo").content
 
 
 def test_lost_shared_map_is_made_again(servers: list[Api]) -> None:
@@ -122,3 +132,38 @@ def test_unused_shared_maps_are_collected(servers: list[Api]) -> None:
     assert b.get("/maps/farm/tmap2").content == made.content, "converted again"
     store.garbage.collect(timedelta(0))
     assert len(list(store.blobs.files.list("made/"))) == 1
+
+
+def test_server_serves_what_it_has_without_the_store_and_recovers(
+    postgres_url: str, tmp_path: Path, seaweed: Seaweed, s3_url: str
+) -> None:
+    settings = settings_for(tmp_path, database_url=postgres_url, blob_url=s3_url)
+    settings.blob_dir.mkdir(parents=True)
+    store = open_store(settings)
+    store.migrate()
+    store.close()
+    with running(settings) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()})
+        made = api.get("/maps/farm/tmap2")
+        api.app.state.services.writability.forget()
+        assert api.get("/readyz?for=writes").json()["status"] == "ready"
+        seaweed.stop()
+        try:
+            api.app.state.services.writability.forget()
+            assert api.get("/readyz").json()["status"] == "read-only"
+            assert "does not answer" in api.problem("GET", "/readyz?for=writes", 503)["detail"]
+            assert api.get("/maps/farm/tmap2").content == made.content
+            other = api.get("/maps/farm/geojson")
+            assert other.json()["features"], "converted, and not shared"
+            refused = api("POST", "environments/farm/versions", 503, files=parts(samples.grid()))
+            assert "nothing was stored" in refused.json()["detail"]
+            assert api.get("environments/farm").json()["version"] == 1
+        finally:
+            seaweed.start()
+        api.app.state.services.writability.forget()
+        assert api.get("/readyz").json()["status"] == "ready"
+        assert api.upload("farm", samples.grid()).json()["version"] == 2
+        sources = api.get("environments/farm/versions/2").json()["sources"]
+        assert {s["name"] for s in sources} == {"map.pgm", "map.yaml"}
+        assert api.app.state.services.store.blob_upkeep.verify() == []

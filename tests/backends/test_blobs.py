@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import random
+import threading
 import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -13,8 +16,8 @@ from app.backends.blob_folder import FolderFiles
 from app.backends.blob_s3 import S3Files
 from app.backends.blobs import BlobFiles, Unreadable
 from app.backends.local_copies import LocalCopies
-from app.errors import Unavailable
-from tests.seaweed import Seaweed, s3_url, seaweed
+from app.errors import NoRoom, Unavailable
+from tests.seaweed import ACCESS, Seaweed, s3_url, seaweed
 
 __all__ = ["s3_url", "seaweed"]
 
@@ -122,6 +125,65 @@ def test_store_that_is_gone_comes_back(seaweed: Seaweed, s3_url: str, tmp_path: 
         seaweed.start()
     assert read(files, "ab/x") == b"x"
     assert [f.key for f in files.list()] == ["ab/x"]
+
+
+class FailingStore(BaseHTTPRequestHandler):
+    """S3 server that answers every request with one status, after a while."""
+
+    status, seconds = 507, 0.0
+
+    def answer(self) -> None:
+        self.rfile.read(int(self.headers.get("content-length") or 0))
+        time.sleep(type(self).seconds)
+        self.send_response(type(self).status)
+        self.send_header("content-length", "0")
+        self.end_headers()
+
+    do_GET = do_PUT = do_POST = do_DELETE = answer
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[S3Files]:
+    """A blob store on a server that fails as ``FailingStore`` says."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), FailingStore)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    for name, value in {**ACCESS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("app.backends.blob_s3.STALL_SECONDS", 1)
+    monkeypatch.setattr("app.backends.blob_s3.CONNECT_SECONDS", 1)
+    files = S3Files("s3://maps/x", tmp_path)
+    files.prepare()
+    yield files
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("status", "seconds", "error", "reason"),
+    [
+        (507, 0.0, NoRoom, "space"),
+        (403, 0.0, Unavailable, "AWS_SECRET_ACCESS_KEY"),
+        (500, 0.0, Unavailable, "500"),
+        (200, 5.0, Unavailable, "slow"),
+    ],
+)
+def test_failing_store_is_named_with_its_reason(
+    failing: S3Files, monkeypatch: pytest.MonkeyPatch, status: int, seconds: float, error: type[Exception], reason: str
+) -> None:
+    monkeypatch.setattr(FailingStore, "status", status)
+    monkeypatch.setattr(FailingStore, "seconds", seconds)
+    with pytest.raises(error, match=reason) as caught:
+        failing.check()
+    assert "127.0.0.1" not in str(caught.value)
+    with pytest.raises(error, match=reason):
+        failing.write({"ab/x": b"x"})
+    with pytest.raises(Unreadable):
+        read(failing, "ab/x")
 
 
 def test_copies_are_bounded_and_checked(tmp_path: Path) -> None:
