@@ -45,8 +45,15 @@ class Settings(BaseSettings):
     )
     blob_url: str | None = Field(
         default=None,
-        description="Folder for uploaded files, as a path or `file://` URL; all workers must share it. Default: "
-        "`blobs` in the data folder.",
+        description="Where uploaded files are kept: a folder, as a path or `file://` URL, or `s3://bucket/prefix` with "
+        "the usual `AWS_*` variables. Servers with one PostgreSQL database must share it. Default: `blobs` in the data "
+        "folder, for one server.",
+    )
+    blob_cache_bytes: int = Field(
+        default=4 * 2**30,
+        ge=0,
+        description="Size limit of the copies of stored files in the data folder, if `blob_url` is in S3; the least "
+        "recently used go first.",
     )
     host: str = Field(default="127.0.0.1", description="Address to listen on; `0.0.0.0` for all IPv4 addresses.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
@@ -406,9 +413,11 @@ class Settings(BaseSettings):
 
     @field_validator("blob_url")
     @classmethod
-    def _is_folder(cls, value: str | None) -> str | None:
-        if value is not None and "://" in value and not value.startswith("file://"):
-            raise ValueError("unsupported scheme: use a path or a file:// URL")
+    def _is_blob_url(cls, value: str | None) -> str | None:
+        if value is not None and "://" in value and not value.startswith(("file://", "s3://")):
+            raise ValueError("unsupported scheme: use a path, a file:// URL or s3://bucket/prefix")
+        if value is not None and value.startswith("s3://") and not urlsplit(value).netloc:
+            raise ValueError("no bucket: use s3://bucket or s3://bucket/prefix")
         return value
 
     @model_validator(mode="after")
@@ -532,12 +541,17 @@ class Settings(BaseSettings):
 
     @property
     def blob_dir(self) -> Path:
-        """Folder of uploaded files, with its default."""
-        if self.blob_url is None:
+        """Folder of uploaded files, with its default; of their copies on this machine if they are in S3."""
+        if self.blob_url is None or self.blob_url.startswith("s3://"):
             return self.data_dir / "blobs"
         if self.blob_url.startswith("file://"):
             return Path(unquote(urlsplit(self.blob_url).path))
         return Path(self.blob_url)
+
+    @property
+    def shares_maps(self) -> bool:
+        """Whether other servers may use this one's database and files."""
+        return self.blob_url is not None and not self.database.startswith("sqlite")
 
     @property
     def cache_dir(self) -> Path:

@@ -158,5 +158,16 @@ class Damaged(FleetMapError):
     """Stored bytes that do not match their hash; never served."""
 
 
+class LostBlobs(Damaged):
+    """Stored files that are not where they are read; ``names`` are their hashes. Workers get them and try again."""
+
+    def __init__(self, detail: str, problems: Sequence[Problem] = (), names: Sequence[str] = ()) -> None:
+        super().__init__(detail, problems)
+        self.names = tuple(names)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.detail, self.problems, self.names)
+
+
 class Untrusted(FleetMapError):
     """Data that a robot must reject: a foreign signature, an old or expired manifest, wrong bytes."""

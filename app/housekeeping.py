@@ -94,6 +94,7 @@ class _Housekeeping:
             store.drafts.remove_expired()
             if is_beat:
                 store.sessions.sweep()
+                self._services.jobs.sweep()
             if datetime.now(UTC) >= self._collect_at:
                 self._collect_at = datetime.now(UTC) + COLLECT_EVERY
                 store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))

@@ -35,17 +35,22 @@ from app.api.http.metrics import Metrics
 from app.api.http.middleware import Guard
 from app.api.http.protocol import BoundedProtocol, tls_context
 from app.api.http.response_cache import ResponseCache
+from app.api.http.shared_work import SharedWork
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
+from app.backends.blob_s3 import S3Files
+from app.backends.blobs import BlobFiles
 from app.backends.documents import FileDocument
 from app.backends.lead import open_leads
 from app.backends.notify import Listener
+from app.backends.shared_queue import SharedQueue
 from app.config import Settings
 from app.convert.maps import Maps
 from app.convert.preview import Previews
+from app.convert.shared_maps import SharedMaps
 from app.convert.tiles import Tiles
 from app.convert.views import Views
-from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
+from app.errors import Conflict, DatabaseDamaged, FleetMapError, LostBlobs, NoRoom, Unavailable
 from app.events import bus, relay
 from app.events.bus import Bus, BusOptions
 from app.events.credentials import ZenohCredentials
@@ -170,11 +175,24 @@ def _has_uvloop() -> bool:
     return True
 
 
+def open_store(settings: Settings, *, readonly: bool = False) -> Store:
+    """Open the database and the blob store of the settings."""
+    url = settings.blob_url or ""
+    files: BlobFiles | None = S3Files(url, settings.blob_dir) if url.startswith("s3://") else None
+    return Store(
+        settings.database,
+        settings.blob_dir,
+        readonly=readonly,
+        files=files,
+        copies_bytes=settings.blob_cache_bytes,
+    )
+
+
 def open_services(settings: Settings) -> Services:
     """Open the store and start the workers. Blocks. Raises Unavailable if the schema is not that of this release."""
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     settings.blob_dir.mkdir(parents=True, exist_ok=True)
-    store = Store(settings.database, settings.blob_dir)
+    store = open_store(settings)
     pools: list[Pool] = []
     try:
         with startup_lock(settings.data_dir):
@@ -235,18 +253,30 @@ def sandbox_policy(settings: Settings) -> SandboxPolicy:
 
 def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake: UploadSpool) -> Services:
     def run(function: Callable[..., Any], *args: Any, by: Pool = pool, **more: Any) -> Any:
-        try:
-            return by.run(function, *args, **more)
-        except DatabaseDamaged as error:  # found by a worker
-            store.note_damage(error)
-            raise
+        fetched: set[str] = set()
+        while True:
+            try:
+                return by.run(function, *args, **more)
+            except DatabaseDamaged as error:  # found by a worker
+                store.note_damage(error)
+                raise
+            except LostBlobs as error:  # a worker has no network: it reads what is on this machine
+                if fetched.issuperset(error.names) or not store.blobs.fetch(error.names):
+                    raise
+                fetched.update(error.names)
 
     def run_trial(function: Callable[..., Any], *args: Any) -> Any:
         return run(function, *args, by=spare if pool.is_busy else pool)
 
     metrics = Metrics()
     service = Maps(
-        store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes, run_trial=run_trial
+        store,
+        run,
+        settings.cache_dir,
+        settings.limits,
+        cache_bytes=settings.cache_bytes,
+        run_trial=run_trial,
+        shared=SharedMaps(store.made_maps) if settings.shares_maps else None,
     )
     service.cache.on_damage = metrics.cache_damaged.inc
     access = _authenticator(settings, store)
@@ -260,7 +290,13 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     def count(name: str, result: str) -> None:
         metrics.conversions.labels(name, result).inc()
 
+    work = None
+    if settings.shares_maps:
+        queue = SharedQueue(store.transaction, waiting=settings.conversion_queue)
+        work = SharedWork(store, queue, service)
     tiles = Tiles(store, service.cache)
+    jobs = ConversionJobs(store, service, settings.job_seconds, count, work=work, is_busy=lambda: pool.is_busy)
+    metrics.queue = jobs.figures
     return Services(
         options=_api_options(settings),
         store=store,
@@ -269,7 +305,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         ingest=Ingest(store, run, settings.limits, imagery_provider(settings)),
         maps=service,
         access=access,
-        jobs=ConversionJobs(store, service, settings.job_seconds, count),
+        jobs=jobs,
+        work=work,
         response_cache=ResponseCache(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,

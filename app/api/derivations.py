@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import derive, parameters
-from app.api.http.auth import Viewer
+from app.api.http.auth import Editor, Viewer
+from app.api.http.conversions import STARTED, Prefer, responds_async, work_response
 from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
@@ -86,10 +87,18 @@ def list_derivations(services: ServicesDep, _: Viewer) -> Response:
     responses={
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
         **UNCHANGED_OR_DRY_RUN,
+        **STARTED,
     },
     summary="Derive a layer and commit it",
 )
-def create_derivation(env: EnvironmentPath, body: DerivationBody, services: ServicesDep, commit: CommitDep) -> Response:
+def create_derivation(
+    env: EnvironmentPath,
+    body: DerivationBody,
+    services: ServicesDep,
+    principal: Editor,
+    commit: CommitDep,
+    prefer: Prefer = None,
+) -> Response:
     """Create a version whose provenance records the derivation, its parameters and its inputs.
 
     The layer becomes stale when the inputs change.
@@ -100,8 +109,13 @@ def create_derivation(env: EnvironmentPath, body: DerivationBody, services: Serv
     """
     request = DerivationRequest(body.method, body.parameters, body.replace)
     try:
-        carry_out = services.ingest.fetch_imagery if body.method == online.METHOD else services.ingest.derive
-        outcome = carry_out(env, request, commit.with_message(body.message).as_dry_run(body.dry_run))
+        described = commit.with_message(body.message).as_dry_run(body.dry_run)
+        if body.method == online.METHOD:
+            return commit_response(services.ingest.fetch_imagery(env, request, described))
+        if services.work is not None and services.work.has_workers():
+            wait = not responds_async(prefer)
+            return work_response(services.work.commit("derive", env, request, described, principal.id, wait=wait))
+        outcome = services.ingest.derive(env, request, described)
     except NotFound as error:
         if body.method in derive.all_derivations():
             raise

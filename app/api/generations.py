@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
 from app import generate
-from app.api.http.auth import Viewer
+from app.api.http.auth import Editor, Viewer
+from app.api.http.conversions import STARTED, Prefer, responds_async, work_response
 from app.api.http.dependencies import CommitDep, ServicesDep
 from app.api.http.responses import api_router, commit_response, json_response
 from app.api.http.schemas import (
@@ -73,10 +74,18 @@ def list_generators(_: Viewer) -> Response:
     responses={
         **problem_responses(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
         **UNCHANGED_OR_DRY_RUN,
+        **STARTED,
     },
     summary="Generate a synthetic site and commit it",
 )
-def create_generation(env: EnvironmentPath, body: GenerationBody, services: ServicesDep, commit: CommitDep) -> Response:
+def create_generation(
+    env: EnvironmentPath,
+    body: GenerationBody,
+    services: ServicesDep,
+    principal: Editor,
+    commit: CommitDep,
+    prefer: Prefer = None,
+) -> Response:
     """Create a version whose provenance records generator, seed and parameters. The same values give the same layers.
 
     Layers that were generated before are replaced. Returns 409 if a layer was uploaded or edited, unless `replace` is
@@ -84,7 +93,11 @@ def create_generation(env: EnvironmentPath, body: GenerationBody, services: Serv
     """
     order = GenerationRequest(body.generator, body.seed, body.parameters, body.replace)
     try:
-        outcome = services.ingest.generate(env, order, commit.with_message(body.message).as_dry_run(body.dry_run))
+        described = commit.with_message(body.message).as_dry_run(body.dry_run)
+        if services.work is not None and services.work.has_workers():
+            wait = not responds_async(prefer)
+            return work_response(services.work.commit("generate", env, order, described, principal.id, wait=wait))
+        outcome = services.ingest.generate(env, order, described)
     except NotFound as error:
         if body.generator in generate.all_generators():
             raise

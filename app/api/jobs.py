@@ -81,7 +81,7 @@ def delete_job(id: JobPath, services: ServicesDep, principal: Viewer) -> Respons
     job = _require_job_owner(services, principal, id)
     if job_as_json(job)["state"] in ("queued", "running"):
         services.store.jobs.update(id, state="cancelled", detail="cancelled")
-        services.jobs.cancel(id)  # if another process runs it, that process notices within seconds
+        services.jobs.cancel(id)  # another process that runs it notices within seconds
     else:
         services.store.jobs.delete(id)
     return Response(status_code=204)

@@ -1,1 +1,1 @@
-"""Ports to what servers share, each with two adapters: local (one data folder) and shared (several servers)."""
+"""Ports to what several servers share, each with a local and a shared adapter; nothing else opens its files."""

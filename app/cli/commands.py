@@ -54,6 +54,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
     ),
     "Server": (
         ("serve", "server:serve"),
+        ("worker", "server:worker"),
         ("demo", "server:demo"),
         ("token", "tokens:commands"),
         ("keys", "keys:commands"),

@@ -41,6 +41,9 @@ its value. Not a setting itself, since settings are read from there.
 START_SECONDS = 60.0
 """Maximum time that the demo waits until the server is ready."""
 
+WORKER_PORT = 8001
+"""Port of a worker's health, beside a server's."""
+
 PANELS: Mapping[str, str] = {
     **dict.fromkeys(("data", "database", "blob", "cache", "memory"), "Data"),
     **dict.fromkeys(
@@ -117,6 +120,57 @@ def _compile(folder: Path) -> None:
         target=native.fill_quietly, args=(Path(cache_path),), daemon=True
     )
     process.start()
+
+
+def worker(
+    host: Annotated[
+        str | None, typer.Option("--host", help="Address for /healthz, /readyz and /metrics [default: FLEETMAP_HOST].")
+    ] = None,
+    port: Annotated[int | None, typer.Option("--port", min=0, max=65535, help="Their port [default: 8001].")] = None,
+    conversion_workers: Annotated[
+        int | None,
+        typer.Option("--conversion-workers", min=1, max=256, help="Number of tasks at once [default: processors]."),
+    ] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="Folder for caches [default: FLEETMAP_DATA_DIR].")
+    ] = None,
+) -> None:
+    """Do the long work of several servers: conversions, derivations and generations.
+
+    Set FLEETMAP_DATABASE_URL and FLEETMAP_BLOB_URL as for the servers. It runs in the foreground. On SIGTERM it
+    finishes its tasks, and gives those back that take over 20 seconds more.
+
+    Example: `fleetmap worker --port 8001 --conversion-workers 4`
+    """
+    local.require_server_python("worker")
+    given = {"host": host, "conversion_workers": conversion_workers, "data_dir": data_dir}
+    settings = load_settings({**given, "port": WORKER_PORT if port is None else None})
+    if port is not None:
+        settings = settings.model_copy(update={"port": port})
+    settings = settings.model_copy(update={"workers": 1, "zenoh_mode": "off"})
+    import uvicorn
+
+    from app import logs
+    from app.pool import preload_in_background
+    from app.worker import create_worker
+
+    app = create_worker(settings)
+    listener = listen(settings.host, settings.port)
+    preload_in_background()
+    check(settings)
+    _compile(settings.data_dir / "native")
+    output.print_result(f"Fleet Map Server's worker: {local_address(listener)}/readyz")
+    sys.stdout.flush()
+    for signal_number in (signal.SIGTERM, signal.SIGINT):  # uvicorn raises it again after its shutdown
+        signal.signal(signal_number, lambda *_: None)
+    log_config = logs.config(settings.log_level, settings.log_format)
+    config = uvicorn.Config(app, lifespan="on", log_config=log_config, access_log=False, server_header=False, ws="none")
+    try:
+        uvicorn.Server(config).run(sockets=[listener])
+    except SystemExit as error:  # it did not start; uvicorn has logged why
+        raise typer.Exit(1) from error
+    finally:
+        listener.close()
 
 
 def migrate(
@@ -334,14 +388,14 @@ def with_demo_token(settings: Settings) -> Settings:
 def _store(settings: Settings) -> Any:
     from contextlib import closing
 
-    from app.store.store import Store
+    from app.main import open_store
 
     try:
         settings.data_dir.mkdir(parents=True, exist_ok=True)
         settings.blob_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"{error.filename}: {error.strerror}: use another folder with --data-dir") from error
-    return closing(Store(settings.database, settings.blob_dir))
+    return closing(open_store(settings))
 
 
 def _without_password(url: str) -> str:

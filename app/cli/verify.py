@@ -42,7 +42,9 @@ DatabaseUrl = Annotated[str | None, typer.Option("--database-url", help="Databas
 DataDir = Annotated[
     Path | None, typer.Option("--data-dir", help="Data folder of the server [default: FLEETMAP_DATA_DIR].")
 ]
-BlobUrl = Annotated[str | None, typer.Option("--blob-url", help="Folder of stored files [default: FLEETMAP_BLOB_URL].")]
+BlobUrl = Annotated[
+    str | None, typer.Option("--blob-url", help="Folder or s3:// address of stored files [default: FLEETMAP_BLOB_URL].")
+]
 
 
 def verify(
@@ -71,7 +73,7 @@ def verify(
     if sources and not repair:
         raise typer.BadParameter("--from requires --repair")
     settings = load_settings({"database_url": database_url, "data_dir": data_dir, "blob_url": blob_url})
-    if not settings.blob_dir.is_dir():
+    if not settings.blob_dir.is_dir() and not (settings.blob_url or "").startswith("s3://"):
         raise Invalid(
             f"folder of stored files {settings.blob_dir} not found: set the server's data folder with --data-dir"
         )
@@ -106,9 +108,9 @@ def verify(
 
 
 def _open(settings: Settings, *, readonly: bool) -> Store:
-    from app.store.store import Store
+    from app.main import open_store
 
-    return Store(settings.database, settings.blob_dir, readonly=readonly)
+    return open_store(settings, readonly=readonly)
 
 
 def _check(store: Store) -> VerifyResult:

@@ -27,7 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from uuid import uuid4
 
 import orjson
@@ -136,14 +136,28 @@ STALE_AFTER_SECONDS = 3600.0
 """Age in seconds after which an unfinished entry counts as left behind by a killed process."""
 
 
+class SharedMaps(Protocol):
+    """Maps that several servers share."""
+
+    def publish(self, key: str, made: CachedMap) -> None:
+        """Share a map that this server has made."""
+
+    def load(self, key: str) -> ConvertedMap | None:
+        """Get a map that any server has made."""
+
+    def find(self, sha256: str, max_bytes: int) -> bytes | None:
+        """Return a made file by its hash; None if there is none of at most ``max_bytes``."""
+
+
 class Cache:
     """Cache of at most ``limit`` bytes that evicts the least recently used maps. damaged: number of damaged entries.
 
-    on_damage: called for each of them. problem: why maps cannot be written to disk now, or None.
+    shared: the maps of all servers, which this folder is a cache of. on_damage: called for each damaged entry. problem:
+    why maps cannot be written to disk now, or None.
     """
 
-    def __init__(self, folder: Path, limit: int) -> None:
-        self._folder, self._limit = folder, limit
+    def __init__(self, folder: Path, limit: int, shared: SharedMaps | None = None) -> None:
+        self._folder, self._limit, self._shared = folder, limit, shared
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
         self._checked: OrderedDict[str, tuple[int, int, int]] = OrderedDict()
@@ -272,12 +286,21 @@ class Cache:
             self.hits += 1
             return cached_map
         with self._key_lock(key):
-            cached_map = self.get(key)
+            cached_map = self.get_or_fetch(key)
             if cached_map is not None:
                 self.hits += 1
                 return cached_map
             self.misses += 1
-            return replace(self._store(key, maker()), fresh=True)
+            made = self._store(key, maker())
+            if self._shared is not None:
+                self._shared.publish(key, made)
+            return replace(made, fresh=True)
+
+    def get_or_fetch(self, key: str) -> CachedMap | None:
+        """Return the map if it is cached, or if another server has made it."""
+        cached_map = self.get(key)
+        made = self._shared.load(key) if cached_map is None and self._shared is not None else None
+        return cached_map if made is None else self._store(key, made)
 
     @contextlib.contextmanager
     def hold_files(self) -> Iterator[Callable[[CachedMap], CachedMap]]:
@@ -415,15 +438,17 @@ class Cache:
                 self._in_memory.clear()
 
     def find_by_hash(self, sha256: str, max_bytes: int) -> bytes | None:
-        """Return the content of a cached file by its SHA-256; None if it is not cached or larger than ``max_bytes``."""
+        """Return the content of a made file by its SHA-256; None if there is none of at most ``max_bytes``."""
         try:
             path = self._folder / self._hash_path(sha256).read_text()
             if path.stat().st_size > max_bytes:
                 return None
             data = path.read_bytes()
+            if hashlib.sha256(data).hexdigest() == sha256:
+                return data
         except OSError:
-            return None
-        return data if hashlib.sha256(data).hexdigest() == sha256 else None
+            pass
+        return None if self._shared is None else self._shared.find(sha256, max_bytes)
 
     def _note_hash(self, file: CachedFile) -> None:
         path = self._hash_path(file.sha256)

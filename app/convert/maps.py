@@ -21,7 +21,7 @@ from app.convert import files as direct
 from app.convert import losses, site
 from app.convert import recipe as recipes
 from app.convert import worker as making
-from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap
+from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap, SharedMaps
 from app.convert.recipe import Recipe
 from app.convert.report import LayerLine, Report, all_credits, merge_reports, unsupported_layers
 from app.convert.trials import Trials
@@ -76,11 +76,15 @@ class Maps:
         *,
         cache_bytes: int = 4 * 2**30,
         run_trial: Run | None = None,
+        shared: SharedMaps | None = None,
     ) -> None:
-        """Create the service. run_trial: as ``run``, for jobs that must not wait for conversions; default: ``run``."""
+        """Create the service.
+
+        shared: maps of all servers. run_trial: as ``run``, for jobs that must not wait for conversions.
+        """
         self._store, self._run, self._limits = store, run, limits
         self._run_trial = run_trial or run
-        self.cache = Cache(cache_dir, cache_bytes)
+        self.cache = Cache(cache_dir, cache_bytes, shared)
         self._trials = Trials(cache_dir / "trials")
         self._crossings_cache: dict[Any, list[Problem]] = {}
         self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
@@ -103,10 +107,12 @@ class Maps:
         as in a manifest: files are named as those of the whole site, and no zip is created.
         """
         plan = self._planner(version, name, values or {}, derive=derive, file=file, listed=listed)
+        mode = None if version.closures is None else version.closures.mode
+        order = recipes.MapOrder(version.ref, name, dict(values or {}), derive, file, listed, mode)
 
         def check(recipe: Recipe, failed: Sequence[ChainFailure]) -> Recipe:
             self._check_known_failure(recipe)
-            return replace(recipe, failed=tuple(failed), replan=plan)
+            return replace(recipe, failed=tuple(failed), replan=plan, order=order)
 
         return first_working(plan, check)
 
@@ -150,6 +156,12 @@ class Maps:
         """Return the map if it is cached."""
         return self.cache.get(recipe.key)
 
+    def get_made(self, recipe: Recipe, failed: Sequence[ChainFailure]) -> tuple[Recipe, CachedMap] | None:
+        """Return a map that another server has made, after these derivations of its recipe found nothing to use."""
+        planned = recipe.without(failed)
+        cached_map = self.cache.get_or_fetch(planned.key)
+        return None if cached_map is None else (planned, cached_map)
+
     def get_or_convert(self, recipe: Recipe, stop: CancelHandle | None = None) -> tuple[Recipe, CachedMap]:
         """Return the map and its recipe, which differs from the given one if a step of that finds nothing to use.
 
@@ -175,7 +187,7 @@ class Maps:
         """Convert exactly this recipe and cache failures: that of a step which finds nothing to use, for all maps."""
         try:
             if recipe.members:
-                return self.get_cached(recipe) or self._assemble(recipe, stop)
+                return self.cache.get_or_fetch(recipe.key) or self._assemble(recipe, stop)
             return self.cache.get_or_make(recipe.key, lambda: self._run_conversion(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # otherwise the member stores it

@@ -19,6 +19,7 @@ from app.convert import closures as applied_closures
 from app.derive import ChainFailure, Step
 from app.errors import Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
+from app.model.closures import ClosureMode
 from app.model.features import Features
 from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
 from app.model.names import did_you_mean
@@ -99,6 +100,23 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
+class MapOrder:
+    """Request for a map as values, from which any server plans the same recipe. closures: their mode, None for none."""
+
+    ref: int | str
+    format: str
+    values: Mapping[str, str]
+    derive: bool
+    file: str | None
+    listed: bool
+    closures: ClosureMode | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Convert the order to JSON."""
+        return {**dataclasses.asdict(self), "values": dict(self.values)}
+
+
+@dataclass(frozen=True, slots=True)
 class Recipe:
     """Recipe of one map of one version: all inputs of the conversion, and the key of its result.
 
@@ -107,7 +125,8 @@ class Recipe:
     create a zip of those. file: name of the requested file in the map, if any. failed: cheaper chains that the content
     does not allow; not part of the key either. replan: plans this request without these derivations (see
     ``derive.first_working``); None if there is no alternative. compared: the recipe of the map, if this one is for what
-    the map loses (``app.convert.losses``).
+    the map loses (``app.convert.losses``). order: the request that it was planned for; None if no other server can plan
+    it.
     """
 
     version: Version
@@ -123,6 +142,7 @@ class Recipe:
     failed: tuple[ChainFailure, ...] = ()
     replan: Callable[[frozenset[str]], Recipe] | None = field(default=None, compare=False, repr=False)
     compared: Recipe | None = field(default=None, compare=False, repr=False)
+    order: MapOrder | None = field(default=None, compare=False, repr=False)
 
     @property
     def etag(self) -> str:
@@ -133,6 +153,22 @@ class Recipe:
     def steps(self) -> tuple[Step, ...]:
         """Derivations of the chain, in order."""
         return self.chain.steps
+
+    @property
+    def is_derived(self) -> bool:
+        """Whether any part of the map has to be derived."""
+        return bool(self.steps) or any(member.recipe.steps for member in self.members)
+
+    def without(self, failed: Sequence[ChainFailure]) -> Recipe:
+        """Plan the same request without derivations that found nothing to use. Raises MissingLayer."""
+        if self.replan is None or {one.step for one in failed} == {one.step for one in self.failed}:
+            return self
+        return replace(
+            self.replan(frozenset(one.step for one in failed)),
+            failed=tuple(failed),
+            replan=self.replan,
+            order=self.order,
+        )
 
 
 @dataclass(frozen=True, slots=True)

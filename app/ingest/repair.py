@@ -93,6 +93,8 @@ def repair(
             healed["blob", store.blobs.put(data)] = origin
         store.chunks.heal(rebuilt.chunks)
         healed |= {("chunk", name): origin for name in rebuilt.chunks}
+    if healed:
+        store.garbage.look_at_everything()  # what was lost is not known to be part of versions
     return healed
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ from app.ingest.prepare import Mode, PreparedUpload, datum_moved_warnings, prepa
 from app.ingest.templates import TemplateUpdate
 from app.limits import Limits
 from app.model.frame import Datum
-from app.pool import WorkerDied
+from app.pool import CancelHandle, WorkerDied
 from app.store.changes import KEEP, Changes, Prepared
 from app.store.pending import as_prepared
 from app.store.store import Store
@@ -79,6 +80,10 @@ class Ingest:
         self.provider = provider
         self.drafts = DraftEditor(store, self._run_in_worker)
 
+    def stopped_by(self, stop: CancelHandle) -> Ingest:
+        """Return the same service, whose work can be stopped from another thread; it then raises Cancelled."""
+        return Ingest(self._store, partial(self._run, stop=stop), self._limits, self.provider)
+
     def upload(self, environment: str, upload: Upload, commit: CommitRequest) -> CommitResult:
         """Commit uploaded files as one version, or none of them.
 
@@ -93,7 +98,7 @@ class Ingest:
             proposal: PreparedUpload = self._run_in_worker(
                 prepare_upload, base, paths, upload.hints, upload.mode, self._limits
             )
-            sources = self._store_sources(upload, proposal)
+            sources = self._store_sources(environment, upload, proposal)
             return self._commit(environment, base, proposal.prepared, commit, key, proposal.warnings, sources)
 
         return self._commit_on_head(environment, key, commit.if_match, once, "commit the upload")
@@ -402,13 +407,14 @@ class Ingest:
         same = fingerprint.startswith(UNCHANGED)
         return CommitResult("unchanged" if same else "replayed", version, version.as_dict())
 
-    def _store_sources(self, upload: Upload, proposal: PreparedUpload) -> list[Source]:
+    def _store_sources(self, environment: str, upload: Upload, proposal: PreparedUpload) -> list[Source]:
         """Store the uploaded files byte for byte, before the version that refers to them."""
         notes = {n.name: n for n in proposal.notes}
         names = [f.name for f in upload.files] + list(proposal.members)
         contents: list[bytes | Path] = [f.path for f in upload.files]
         contents += list(proposal.members.values())
-        digests = self._store.blobs.put_many(contents)
+        similar = self._store.versions.sources_by_name(environment, names)
+        digests = self._store.blobs.put_many(contents, [similar.get(name) for name in names])
         sizes = [f.size for f in upload.files] + [len(data) for data in proposal.members.values()]
         return [
             Source(name, size, digest, notes[name].format, notes[name].used)

@@ -62,7 +62,7 @@ class Chunks:
             if digest(raw).hex() != name:
                 raise Damaged(f"the replacement does not match the hash of chunk {name}")
         with self._database.write() as connection:
-            insert(connection, {name: compress(raw) for name, raw in chunks.items()})
+            insert(connection, {name: compress(raw) for name, raw in chunks.items()}, kept=True)
 
     def remove_damaged(self, hashes: Iterable[str], before: float) -> set[str]:
         """Remove damaged chunks (hashes in hex) that were last used before this second; returns the removed ones."""
@@ -139,20 +139,23 @@ def problem(name: bytes, data: bytes) -> str | None:
         return "damaged"
 
 
-def insert(connection: Connection, chunks: Mapping[str, bytes], now: float | None = None) -> None:
-    """Write chunks (hash in hex -> stored bytes); an existing one counts as used now.
+def insert(
+    connection: Connection, chunks: Mapping[str, bytes], now: float | None = None, *, kept: bool = False
+) -> None:
+    """Write chunks (hash in hex -> stored bytes); an existing one counts as used now. kept: a version refers to them.
 
     An existing row gets these bytes too, which repairs a damaged one. Chunks are written in the order of their hashes,
     so that two uploads with common chunks wait for each other instead of deadlocking.
     """
     used = int(time.time() if now is None else now)
-    rows = [(bytes.fromhex(h), chunks[h], used) for h in sorted(chunks)]
+    rows = [(bytes.fromhex(h), chunks[h], used, kept) for h in sorted(chunks)]
     if not rows:
         return
     mark = "?" if connection.dialect.name == "sqlite" else "%s"
     connection.exec_driver_sql(
-        f"INSERT INTO chunk (hash, data, used) VALUES ({mark}, {mark}, {mark}) "  # noqa: S608 - only marks
-        "ON CONFLICT (hash) DO UPDATE SET used = excluded.used, data = excluded.data",
+        f"INSERT INTO chunk (hash, data, used, kept) VALUES ({mark}, {mark}, {mark}, {mark}) "  # noqa: S608 - only marks
+        "ON CONFLICT (hash) DO UPDATE SET used = excluded.used, data = excluded.data, "
+        "kept = chunk.kept OR excluded.kept",
         rows,
     )
 
@@ -169,19 +172,21 @@ def select_rows(connection: Connection, hashes: Sequence[bytes]) -> Iterator[tup
         yield from ((bytes(name), bytes(data)) for name, data in rows.fetchall())
 
 
-def delete(connection: Connection, hashes: Iterable[bytes], before: int) -> list[bytes]:
-    """Remove the chunks that were last used before this second; returns the removed ones."""
+def delete(connection: Connection, hashes: Iterable[bytes], before: int, *, young: bool = False) -> list[bytes]:
+    """Remove the chunks that were last used before this second (young: and are not kept); returns the removed ones."""
     out: list[bytes] = []
+    further = " AND kept IS false" if young else ""
     for batch in _batches(sorted(hashes)):
         if connection.dialect.name == "sqlite":
             marks = ",".join("?" * len(batch))
             rows = connection.exec_driver_sql(
-                f"DELETE FROM chunk WHERE hash IN ({marks}) AND used < ? RETURNING hash",  # noqa: S608 - only marks
+                f"DELETE FROM chunk WHERE hash IN ({marks}) AND used < ?{further} RETURNING hash",  # noqa: S608 - only marks
                 (*batch, before),
             )
         else:
             rows = connection.exec_driver_sql(
-                "DELETE FROM chunk WHERE hash = ANY(%s) AND used < %s RETURNING hash", (batch, before)
+                f"DELETE FROM chunk WHERE hash = ANY(%s) AND used < %s{further} RETURNING hash",  # noqa: S608
+                (batch, before),
             )
         out += [bytes(name) for (name,) in rows.fetchall()]
     return out

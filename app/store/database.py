@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
-import secrets
 import shutil
 import sqlite3
 import threading
@@ -22,6 +20,7 @@ from sqlalchemy.engine import make_url
 
 from app.backends.lead import check_fence
 from app.backends.notify import LocalNotifier, Notifier, SharedNotifier, new_number
+from app.backends.room import ROOM_BYTES, check_room
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
 from app.store.base import utcnow
 
@@ -31,9 +30,6 @@ BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
 RECHECK_SECONDS = 60.0
 """Seconds between two checks of a database that was found damaged."""
-
-ROOM_BYTES = 2**20
-"""Free space in bytes below which a folder is not writable, and an I/O error of SQLite means a full disk."""
 
 REPAIR = "stop the server, run `fleetmap verify`, and restore a backup of the database"
 _CORRUPT = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
@@ -369,13 +365,3 @@ def _short(error: exc.SQLAlchemyError) -> str:
     """Return the first line of the driver's message, without the statement and without URLs (secrets)."""
     original = getattr(error, "orig", None)
     return (str(original or error).splitlines() or ["no reason given"])[0][:200]
-
-
-def check_room(folder: Path) -> None:
-    """Raise OSError unless a file of 1 MiB can be written to a folder."""
-    probe = folder / f".room-{secrets.token_hex(8)}"
-    try:
-        with probe.open("wb") as file:
-            os.posix_fallocate(file.fileno(), 0, ROOM_BYTES)
-    finally:
-        probe.unlink(missing_ok=True)

@@ -1,4 +1,8 @@
-"""Garbage collection: mark what versions, dry runs and drafts refer to, sweep what was not used in the grace period.
+"""Garbage collection: remove what no version, dry run or draft refers to and what was not used in the grace period.
+
+Most runs cost what was written since the last one: they walk the versions since then, mark what these contain as kept,
+and look only at what is not kept. Content of versions goes only when an environment is purged; the run after that, and
+one a month, looks at everything, also for files without a row.
 
 It never races an upload. The chunks that a version in progress relies on are part of its base version, which exists
 while it is marked (else the commit fails), or were written or used again within the grace period. Rows are removed with
@@ -8,15 +12,19 @@ a condition on that time, in the statement that finds them.
 from __future__ import annotations
 
 import time
-from datetime import timedelta
+from collections.abc import Collection, Container, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Final
 
-from sqlalchemy import delete, select
+from sqlalchemy import ColumnElement, Connection, Table, delete, select, update
 
 from app.store import chunks, drafts, dry_runs, parts, tables
+from app.store.blob_upkeep import BlobUpkeep
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
+from app.store.made_maps import MadeMaps
 from app.store.manifest import unpack_manifest
 from app.store.robots import presence_seen
 
@@ -26,58 +34,133 @@ JOB_DAYS: Final = 7
 OVERLAY_DAYS: Final = 30
 ROBOT_DAYS: Final = 90
 """Days without a report after which a robot is removed."""
+COMPLETE_SECONDS: Final = 30 * 24 * 3600
+"""Seconds after which a run looks at everything again."""
+OVERLAP_SECONDS: Final = 3600
+"""Seconds by which a run overlaps the one before: servers' clocks differ, and a commit takes time."""
 PAGE: Final = 500
+
+
+@dataclass(frozen=True, slots=True)
+class _References:
+    """Chunks and blobs that something refers to."""
+
+    chunks: set[bytes]
+    blobs: set[str]
+
+    def __or__(self, other: _References) -> _References:
+        return _References(self.chunks | other.chunks, self.blobs | other.blobs)
+
+
+class _KeptChunks:
+    """All chunks but the young ones: a walk goes no further there, since a kept chunk's are kept, too."""
+
+    def __init__(self, young: Collection[bytes]) -> None:
+        self._young = young
+
+    def __contains__(self, name: object) -> bool:
+        return name not in self._young
 
 
 class GarbageCollector:
     """Garbage collector of one store."""
 
-    def __init__(self, database: Database, chunks: Chunks, blobs: Blobs) -> None:
-        self._database, self._chunks, self._blobs = database, chunks, blobs
+    def __init__(
+        self, database: Database, chunks: Chunks, blobs: Blobs, upkeep: BlobUpkeep, made_maps: MadeMaps
+    ) -> None:
+        self._database, self._chunks, self._blobs, self._upkeep = database, chunks, blobs, upkeep
+        self._made_maps = made_maps
 
     def collect(self, grace: timedelta) -> dict[str, int]:
         """Remove chunks and blobs that no version, dry run or draft refers to, unless written or used within ``grace``.
 
         Returns ``{chunks, blobs, bytes, temporary}``: numbers of removed objects, bytes of the blobs. Also removes
         expired dry runs and drafts (before all else), old idempotency keys (7 days), finished jobs (7 days), silent
-        robots (90 days), settled overlays and events of purged environments (30 days).
+        robots (90 days), settled overlays, events of purged environments, and made maps without use (30 days).
 
         ``grace`` must be longer than any upload takes. Raises Damaged if a chunk of a version is damaged; nothing is
-        removed then. Run it in one process at a time.
+        removed then. Safe on several servers at once, but in vain.
         """
-        self._chunks.forget()
-        before = int(time.time() - grace.total_seconds()) + (1 if not grace else 0)
+        started = int(time.time())
+        before = int(started - grace.total_seconds()) + (1 if not grace else 0)
         dry_runs.remove_expired(self._database)
         drafts.remove_expired(self._database)
-        live_chunks, live_blobs = self._live()
-        removed = self._sweep(live_chunks, before)
-        blobs, size = self._blobs.collect(live_blobs, before)
-        temporary = self._blobs.recover(max(grace.total_seconds(), 0.0))
+        with self._database.read() as connection:
+            state = connection.execute(select(tables.collection)).one()
+        complete = state.purges != state.collected or started - state.complete > COMPLETE_SECONDS
+        if complete:
+            counts = self._collect_all(before)
+        else:
+            counts = self._collect_young(before, since=state.time - OVERLAP_SECONDS)
+        temporary = self._blobs.files.recover()
+        self._made_maps.collect()
         self._tidy()
-        return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": temporary}
+        done = {"time": started, **({"complete": started, "collected": state.purges} if complete else {})}
+        with self._database.write(notify=False, upkeep=True) as connection:
+            connection.execute(update(tables.collection).values(done))
+        return {**counts, "temporary": counts["temporary"] + temporary}
 
-    def _live(self) -> tuple[set[bytes], set[str]]:
-        """Return every chunk and blob that a version, dry run or draft refers to. Equal parts are walked once.
+    def look_at_everything(self) -> None:
+        """Have the next run look at everything, since content of versions was removed or stored again."""
+        with self._database.write(notify=False, upkeep=True) as connection:
+            connection.execute(update(tables.collection).values(purges=tables.collection.c.purges + 1))
 
-        An expired one counts as long as its row exists: a commit of it may have begun before it expired.
-        """
-        hashes: dict[str, None] = {}
+    def _collect_all(self, before: int) -> dict[str, int]:
+        self._chunks.forget()
         # one snapshot: else content could be missed if it is cloned and its origin purged during the walk
         with self._database.snapshot() as connection:
-            for table in (tables.version, tables.dry_run, tables.draft):
-                rows = connection.execution_options(stream_results=True).execute(select(table.c.manifest))
-                for some in rows.partitions(PAGE):
-                    for (manifest,) in some:
-                        hashes.update((entry.hash, None) for entry in unpack_manifest(bytes(manifest))[2])
-            blobs = set(connection.execute(select(tables.source.c.sha256).distinct()).scalars())
-            for sources in connection.execute(select(tables.dry_run.c.sources)).scalars():
-                blobs.update(source["sha256"] for source in sources)
+            kept_roots = _roots(connection, [tables.version])
+            sources = set(connection.execute(select(tables.source.c.sha256).distinct()).scalars())
+            pending_roots, pending_sources = _roots(connection, _PENDING), _pending_sources(connection)
+        kept = self._walk(kept_roots) | _References(set(), sources)
+        live = kept | self._walk(pending_roots, kept.chunks) | _References(set(), pending_sources)
+        removed = self._sweep(live.chunks, before)
+        self._keep(kept.chunks)
+        self._upkeep.keep(kept.blobs)
+        blobs, size = self._upkeep.collect_all(live.blobs, before)
+        return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": self._upkeep.remove_strays(before)}
+
+    def _collect_young(self, before: int, since: int) -> dict[str, int]:
+        table, version = tables.chunk, tables.version
+        recent = version.c.time >= datetime.fromtimestamp(max(since, 0), UTC)
+        with self._database.snapshot() as connection:
+            query = select(table.c.hash, table.c.used).where(table.c.kept.is_(False))
+            young = {bytes(name): used for name, used in connection.execute(query)}
+            kept_roots = _roots(connection, [version], recent)
+            pending_roots, pending_sources = _roots(connection, _PENDING), _pending_sources(connection)
+        kept = self._walk(kept_roots, _KeptChunks(young))
+        self._keep(kept.chunks & young.keys())
+        self._upkeep.keep(kept.blobs)
+        live = kept | self._walk(pending_roots, _KeptChunks(young)) | _References(set(), pending_sources)
+        idle = sorted(name for name, used in young.items() if used < before and name not in live.chunks)
+        removed = self._delete(idle, before, young=True)
+        blobs, size = self._upkeep.collect_young(live.blobs, before)
+        return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": 0}
+
+    def _walk(self, roots: Iterable[bytes], skipped: Container[bytes] = ()) -> _References:
+        """Return every chunk and blob below parts, except below ``skipped`` chunks. Equal parts are walked once."""
         live: set[bytes] = set()
-        for name in hashes:
-            chunks_of, files = parts.all_chunks(self._chunks.stage(), bytes.fromhex(name), live)
-            live |= chunks_of
-            blobs |= files
-        return live, blobs
+        files: set[str] = set()
+        for root in roots:
+            if root in skipped:
+                continue
+            stage = self._chunks.stage()
+            names, blobs = parts.all_chunks(stage, root, _Either(live, skipped))
+            live |= names
+            files |= blobs
+        return _References(live, files)
+
+    def _keep(self, names: Collection[bytes]) -> None:
+        """Note that versions contain these chunks, so that the next runs do not look at them."""
+        table = tables.chunk
+        listed = sorted(names)
+        for start in range(0, len(listed), PAGE):
+            young = table.c.hash.in_(listed[start : start + PAGE]), table.c.kept.is_(False)
+            with self._database.read() as connection:
+                some = list(connection.execute(select(table.c.hash).where(*young)).scalars())
+            if some:
+                with self._database.write(upkeep=True) as connection:
+                    connection.execute(update(table).where(table.c.hash.in_(some)).values(kept=True))
 
     def _sweep(self, live: set[bytes], before: int) -> int:
         table = tables.chunk
@@ -88,12 +171,17 @@ class GarbageCollector:
             with self._database.read() as connection:
                 rows = connection.execute(query.limit(PAGE * 10)).all()
             idle = [bytes(h) for h, used in rows if used < before and bytes(h) not in live]
-            if idle:
-                with self._database.write(upkeep=True) as connection:
-                    count += len(chunks.delete(connection, idle, before))
+            count += self._delete(idle, before, young=False)
             if len(rows) < PAGE * 10:
                 return count
             last = bytes(rows[-1].hash)
+
+    def _delete(self, names: list[bytes], before: int, *, young: bool) -> int:
+        count = 0
+        for start in range(0, len(names), PAGE * 10):
+            with self._database.write(upkeep=True) as connection:
+                count += len(chunks.delete(connection, names[start : start + PAGE * 10], before, young=young))
+        return count
 
     def _tidy(self) -> None:
         now = self._database.now()
@@ -115,3 +203,36 @@ class GarbageCollector:
                     events.c.environment_id.not_in(select(tables.environment.c.id)),
                 )
             )
+
+
+_PENDING: Final = (tables.dry_run, tables.draft)
+
+
+class _Either:
+    """What is in one of two containers."""
+
+    def __init__(self, one: Container[bytes], other: Container[bytes]) -> None:
+        self._one, self._other = one, other
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._one or name in self._other
+
+
+def _roots(connection: Connection, of: Iterable[Table], *conditions: ColumnElement[bool]) -> list[bytes]:
+    """Return the parts of versions, dry runs or drafts, each once.
+
+    An expired one counts as long as its row exists: a commit of it may have begun before it expired.
+    """
+    hashes: dict[str, None] = {}
+    for table in of:
+        query = select(table.c.manifest).where(*conditions)
+        rows = connection.execution_options(stream_results=True).execute(query)
+        for some in rows.partitions(PAGE):
+            for (manifest,) in some:
+                hashes.update((entry.hash, None) for entry in unpack_manifest(bytes(manifest))[2])
+    return [bytes.fromhex(name) for name in hashes]
+
+
+def _pending_sources(connection: Connection) -> set[str]:
+    listed = connection.execute(select(tables.dry_run.c.sources)).scalars()
+    return {source["sha256"] for sources in listed for source in sources}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Mapping
+from datetime import timedelta
 from typing import Any
 
-from sqlalchemy import Row, delete, insert, select, update
+from sqlalchemy import Row, bindparam, delete, insert, select, text, update
 
 from app.errors import NotFound
 from app.store import tables
@@ -13,18 +15,43 @@ from app.store.base import checked_text, storable_text
 from app.store.database import Database
 from app.store.values import Job, State
 
+ACTIVE = ("queued", "running")
+
+KEPT = timedelta(days=7)
+"""How long a finished job of a task is kept for its client; one that no client was told of: FORGOTTEN."""
+
+FORGOTTEN = timedelta(minutes=1)
+
+_LOST = text(
+    "SELECT task FROM job WHERE task IS NOT NULL AND state IN ('queued', 'running') AND updated < :before"
+    " AND NOT EXISTS (SELECT 1 FROM procrastinate_jobs entry WHERE entry.lock = job.task"
+    " AND entry.status IN ('todo', 'doing'))"
+).bindparams(bindparam("before", type_=tables.UtcDateTime))
+"""Tasks of jobs that wait for one that is not in the queue."""
+
 
 class Jobs:
-    """Store of the job queue."""
+    """Store of jobs."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def create(self, owner: str = "", detail: str = "") -> Job:
-        """Add a queued job."""
+    def create(
+        self,
+        owner: str = "",
+        detail: str = "",
+        *,
+        task: str | None = None,
+        location: str | None = None,
+        followed: bool = True,
+    ) -> Job:
+        """Add a queued job.
+
+        task: that it waits for. location: address of what that makes. followed: whether a client is told of the job.
+        """
         now = self._database.now()
         new = secrets.token_hex(16)
-        with self._database.write() as connection:
+        with self._database.write(upkeep=task is not None) as connection:
             connection.execute(
                 insert(tables.job).values(
                     id=new,
@@ -36,6 +63,9 @@ class Jobs:
                     owner=checked_text(owner, "an owner"),
                     created=now,
                     updated=now,
+                    task=task,
+                    location=location,
+                    followed=followed,
                 )
             )
         return self.get(new)
@@ -68,6 +98,72 @@ class Jobs:
                 connection.execute(update(table).where(table.c.id == id).values(updated=self._database.now(), **values))
             return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
 
+    def claim(self, id: str, owner: str, location: str) -> bool:
+        """Give a task's job that has no owner to a client. Returns False if another one has it."""
+        table = tables.job
+        values = {"owner": checked_text(owner, "an owner"), "location": location, "followed": True}
+        with self._database.write(upkeep=True) as connection:
+            mine = update(table).where(table.c.id == id, table.c.owner == "").values(**values)
+            return bool(connection.execute(mine).rowcount)
+
+    def detach(self, id: str) -> None:
+        """Let a job no longer wait for its task; delete it if no client was told of it."""
+        table = tables.job
+        with self._database.write(upkeep=True) as connection:
+            connection.execute(delete(table).where(table.c.id == id, table.c.owner == ""))
+            connection.execute(update(table).where(table.c.id == id).values(task=None))
+
+    def start_task(self, task: str) -> bool:
+        """Mark the jobs that wait for a task as running. Returns False if none does: all were cancelled."""
+        return bool(self._update_task(task, {"state": "running"}))
+
+    def release_task(self, task: str) -> None:
+        """Mark the jobs that wait for a task as queued again: its worker stops."""
+        self._update_task(task, {"state": "queued", "progress": 0.0})
+
+    def note_progress(self, task: str, progress: float) -> None:
+        """Store how much of a task is done, 0 to 1."""
+        self._update_task(task, {"progress": min(1.0, max(0.0, progress))}, notify=False)
+
+    def finish_task(
+        self,
+        task: str,
+        *,
+        outcome: Mapping[str, Any] | None = None,
+        location: str | None = None,
+        problem: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Finish all jobs that wait for a task. outcome: for the servers. location: address of what was made."""
+        values: dict[str, Any] = {"state": "done", "progress": 1.0} if problem is None else {"state": "failed"}
+        values |= {"outcome": outcome, "problem": problem}
+        self._update_task(task, values if location is None else {**values, "location": location})
+
+    def _update_task(self, task: str, values: Mapping[str, Any], *, notify: bool = True) -> int:
+        table = tables.job
+        change = update(table).where(table.c.task == task, table.c.state.in_(ACTIVE))
+        with self._database.write(notify=notify, upkeep=True) as connection:
+            return connection.execute(change.values(updated=self._database.now(), **values)).rowcount
+
+    def is_awaited(self, task: str) -> bool:
+        """Return whether a job waits for a task."""
+        table = tables.job
+        query = select(table.c.id).where(table.c.task == task, table.c.state.in_(ACTIVE)).limit(1)
+        with self._database.read() as connection:
+            return connection.execute(query).first() is not None
+
+    def lost_tasks(self, age: timedelta) -> list[str]:
+        """List the tasks that jobs wait for and that are not in the queue (PostgreSQL)."""
+        with self._database.read() as connection:
+            return list(connection.execute(_LOST, {"before": self._database.now() - age}).scalars())
+
+    def sweep(self) -> int:
+        """Delete finished jobs of tasks, some time after their end; returns how many."""
+        table, now = tables.job, self._database.now()
+        done = table.c.task.is_not(None) & table.c.state.not_in(ACTIVE)
+        old = (table.c.updated < now - KEPT) | (~table.c.followed & (table.c.updated < now - FORGOTTEN))
+        with self._database.write(notify=False, upkeep=True) as connection:
+            return connection.execute(delete(table).where(done, old)).rowcount
+
     def get(self, id: str) -> Job:
         """Read a job. Raises NotFound."""
         with self._database.read() as connection:
@@ -93,14 +189,17 @@ class Jobs:
 
 
 def _as_job(row: Row[Any]) -> Job:
+    made = {"location": row.location} if row.state == "done" and row.location is not None else None
     return Job(
         row.id,
         row.state,
         row.progress,
         row.detail,
-        row.result,
+        row.result or made,
         row.problem,
         row.created,
         row.updated,
         row.owner,
+        row.task,
+        row.outcome,
     )

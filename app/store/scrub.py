@@ -181,7 +181,7 @@ class Scrub:
                 return
 
     def _blobs(self) -> None:
-        for name, size, problem in self._store.blobs.iterate_checks(self._state.after, self._skip):
+        for name, size, problem in self._store.blob_upkeep.iterate_checks(self._state.after, self._skip):
             if not self._note_checked("blob", name, size, problem):
                 return
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 
+from app.backends.blobs import BlobFiles
 from app.backends.notify import CommitCounter
 from app.errors import DatabaseDamaged
 from app.store import schema, tables
 from app.store.audit import Audit, record
 from app.store.base import utcnow
-from app.store.blobs import Blobs
+from app.store.blob_upkeep import BlobUpkeep
+from app.store.blobs import COPIES_BYTES, Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks
 from app.store.content import ContentReader
@@ -24,6 +27,7 @@ from app.store.environments import Environments
 from app.store.garbage_collection import GarbageCollector
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
+from app.store.made_maps import MadeMaps
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
@@ -35,16 +39,14 @@ from app.store.verify import Progress, Verifier
 from app.store.versions import Versions
 from app.store.wrong_tokens import WrongTokens
 
-ABANDONED_SECONDS = 24 * 3600.0
-"""Age in seconds of packs without a row that are removed: a running upload writes the row right after the pack."""
-
 
 class Store:
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process.
 
     database_url: ``sqlite:///PATH`` or ``postgresql+psycopg://…`` (with PostGIS). readonly: the database itself rejects
-    writes; ``versions.prepare`` and all reading work. ``generation()`` is a number that changes with every committed
-    write on this host.
+    writes; ``versions.prepare`` and all reading work. files: the blob store, by default that folder; with one on
+    another machine ``blob_dir`` has copies of at most ``copies_bytes`` bytes. ``generation()`` is a number that changes
+    with every committed write on this host.
     """
 
     def __init__(
@@ -54,6 +56,8 @@ class Store:
         *,
         readonly: bool = False,
         clock: Callable[[], datetime] = utcnow,
+        files: BlobFiles | None = None,
+        copies_bytes: int = COPIES_BYTES,
     ) -> None:
         self.database_url = database_url
         self.blob_dir = Path(blob_dir)
@@ -62,7 +66,8 @@ class Store:
             database_url, readonly=readonly, written=self.generation.change, record=record, clock=clock
         )
         self.chunks = Chunks(database)
-        self.blobs = Blobs(database, self.blob_dir, readonly=readonly)
+        self.blobs = Blobs(database, self.blob_dir, readonly=readonly, files=files, copies_bytes=copies_bytes)
+        self.blob_upkeep = BlobUpkeep(database, self.blobs)
         self.environments = Environments(database, self.chunks)
         self.versions = Versions(database, self.chunks, self.blobs)
         self.drafts = Drafts(database)
@@ -79,7 +84,8 @@ class Store:
         self.wrong_tokens = WrongTokens(database)
         self.jobs = Jobs(database)
         self.audit = Audit(database)
-        self.garbage = GarbageCollector(database, self.chunks, self.blobs)
+        self.made_maps = MadeMaps(database, self.blobs.files)
+        self.garbage = GarbageCollector(database, self.chunks, self.blobs, self.blob_upkeep, self.made_maps)
 
     def migrate(self) -> None:
         """Create or migrate the database's schema, and create the blob folder.
@@ -111,7 +117,7 @@ class Store:
 
     def verifier(self, progress: Progress = lambda kind, size: None) -> Verifier:
         """Create a verifier of everything that is stored."""
-        return Verifier(self._database, self.chunks, self.blobs, progress)
+        return Verifier(self._database, self.chunks, self.blobs, self.blob_upkeep, progress)
 
     def check_pages(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
         """Check SQLite's tables after this one, each in a query of its own: (table, bytes, problem).
@@ -131,9 +137,13 @@ class Store:
                     self._database.report_damage(problem)
                 yield table, size // len(tables), problem
 
+    def transaction(self) -> AbstractContextManager[Connection]:
+        """Begin a transaction that changes nothing that is versioned, for the queue of all servers."""
+        return self._database.write(notify=False, upkeep=True)
+
     def recover(self) -> None:
         """Remove the remains of killed uploads, at start. Safe beside other running processes."""
-        self.blobs.recover(ABANDONED_SECONDS)
+        self.blobs.files.recover()
 
     @property
     def is_shared(self) -> bool:

@@ -24,6 +24,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    false,
     true,
 )
 from sqlalchemy.ext.compiler import compiles
@@ -185,7 +186,7 @@ version = Table(
     Column("parent", Integer, nullable=True),
     Column("author", Text, nullable=False),
     Column("message", Text, nullable=False),
-    Column("time", UtcDateTime, nullable=False),
+    Column("time", UtcDateTime, nullable=False, index=True),
     Column("sequence", BigInteger, nullable=False),
     Column("changes", JSON, nullable=False),
     Column("warnings", JSON, nullable=False),
@@ -260,13 +261,23 @@ chunk = Table(
     metadata,
     Column("hash", LargeBinary(32), primary_key=True),
     Column("data", LargeBinary, nullable=False),
-    Column("used", BigInteger, nullable=False, index=True),
+    Column("used", BigInteger, nullable=False),
+    Column("kept", Boolean, nullable=False, server_default=false()),
 )
 """Chunks by the hash of their canonical bytes; data is compressed.
 
-used: time of the last write or repeated write (seconds
-since 1970): garbage collection skips recent ones, which an upload in progress may rely on.
+used: time of the last write or repeated write (seconds since 1970): garbage collection skips recent ones, which an
+upload in progress may rely on. kept: known to be part of a version.
 """
+
+
+def _young(table: Table) -> None:
+    """Index what no version is known to refer to, by time of use: garbage collection looks at little else."""
+    kept = table.c.kept.is_(False)
+    Index(f"ix_{table.name}_young", table.c.used, sqlite_where=kept, postgresql_where=kept)
+
+
+_young(chunk)
 
 blob = Table(
     "blob",
@@ -275,13 +286,60 @@ blob = Table(
     Column("size", BigInteger, nullable=False),
     Column("pack", String(64), nullable=True, index=True),
     Column("start", BigInteger, nullable=False),
-    Column("used", BigInteger, nullable=False, index=True),
+    Column("used", BigInteger, nullable=False),
+    Column("kept", Boolean, nullable=False, server_default=false()),
+    Column("stored", BigInteger, nullable=True),
+    Column("coding", String(8), nullable=True),
+    Column("base", String(64), nullable=True, index=True),
+    Column("chain", Integer, nullable=False, server_default="0"),
 )
 """Files by the hash of their content.
 
-pack: the pack file that contains it, from byte ``start`` on; NULL if it is a file
-of its own.
+pack: the pack file that contains it, from byte ``start`` on; NULL if it is a file of its own. stored: number of bytes
+there, NULL if ``size``. coding: how they are kept (``app.store.blob_coding``), NULL: as they are. base: the blob that
+they are the difference from. chain: which version of a file it is. used, kept: as of a chunk.
 """
+
+_young(blob)
+
+collection = Table(
+    "collection",
+    metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("purges", BigInteger, nullable=False),
+    Column("collected", BigInteger, nullable=False),
+    Column("time", BigInteger, nullable=False),
+    Column("complete", BigInteger, nullable=False),
+)
+"""State of garbage collection: one row. purges: number of removals of content that versions referred to; collected: the
+purges whose content is removed. time, complete: of the last run, and of the last one that looked at everything.
+"""
+
+made_map = Table(
+    "made_map",
+    metadata,
+    Column("key", String(64), primary_key=True),
+    Column("object", String(64), nullable=False, index=True),
+    Column("size", BigInteger, nullable=False),
+    Column("entry", LargeBinary, nullable=False),
+    Column("used", BigInteger, nullable=False, index=True),
+)
+"""Made maps that servers share, by the key of their recipe. object: the file of the blob store with all their files;
+size: its bytes. entry: as in ``map.json`` of the cache, compressed. used: day of the last use (seconds since 1970).
+"""
+
+made_file = Table(
+    "made_file",
+    metadata,
+    Column("key", String(64), ForeignKey("made_map.key", ondelete="CASCADE"), primary_key=True),
+    Column("position", Integer, primary_key=True, autoincrement=False),
+    Column("sha256", String(64), nullable=False, index=True),
+    Column("size", BigInteger, nullable=False),
+    Column("start", BigInteger, nullable=False),
+    Column("stored", BigInteger, nullable=False),
+    Column("coding", String(8), nullable=True),
+)
+"""Files of made maps, as parts of the map's object. coding: as of a blob."""
 
 channel = Table(
     "channel",
@@ -400,7 +458,16 @@ job = Table(
     Column("owner", Text, nullable=False),
     Column("created", UtcDateTime, nullable=False),
     Column("updated", UtcDateTime, nullable=False),
+    Column("task", String(64), nullable=True),
+    Column("location", Text, nullable=True),
+    Column("outcome", JSON(none_as_null=True), nullable=True),
+    Column("followed", Boolean, nullable=False, server_default=true()),
+    Index("ix_job_task", "task"),
 )
+"""Jobs. task: key of the task in the queue of all servers, which sets the state of all jobs that wait for it.
+
+location: address of what the task makes. outcome: of the task, for servers. followed: whether a client was told of it.
+"""
 
 
 def _report() -> list[Column[Any]]:

@@ -461,7 +461,10 @@ class Idempotency:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Long-running work. progress: 0 to 1. problem: the reason of a failure, as an RFC 9457 object."""
+    """Long-running work. progress: 0 to 1. problem: the reason of a failure, as an RFC 9457 object.
+
+    task: key of the task that it waits for, if that is in the queue of all servers. outcome: of that task.
+    """
 
     id: str
     state: State
@@ -472,6 +475,8 @@ class Job:
     created: datetime
     updated: datetime
     owner: str
+    task: str | None = None
+    outcome: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from sqlalchemy import Table, select
 
 from app.errors import Damaged, Unavailable
 from app.store import tables
+from app.store.blob_upkeep import BlobUpkeep
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
@@ -84,9 +85,15 @@ class Verifier:
     """Checks of one store. It may run beside servers that write to it."""
 
     def __init__(
-        self, database: Database, chunks: Chunks, blobs: Blobs, progress: Progress = lambda kind, size: None
+        self,
+        database: Database,
+        chunks: Chunks,
+        blobs: Blobs,
+        upkeep: BlobUpkeep,
+        progress: Progress = lambda kind, size: None,
     ) -> None:
-        self._database, self._chunks, self._blobs, self._progress = database, chunks, blobs, progress
+        self._database, self._chunks, self._blobs, self._upkeep = database, chunks, blobs, upkeep
+        self._progress = progress
 
     def run(self) -> VerifyResult:
         """Check everything. Raises Unavailable if the database cannot be read at all."""
@@ -165,7 +172,7 @@ class Verifier:
 
     def _check_blobs(self, out: VerifyResult, users: Mapping[str, list[VersionName]]) -> None:
         missing = dict.fromkeys(users)
-        for name, size, problem in self._blobs.iterate_checks():
+        for name, size, problem in self._upkeep.iterate_checks():
             self._count(out, "blob", size)
             missing.pop(name, None)
             if problem is not None:

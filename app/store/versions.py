@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -10,9 +9,9 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
-from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent, Unavailable
+from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent
 from app.model.templates import template_changes
-from app.store import chunks, drafts, dry_runs, index, outbox, parts, tables
+from app.store import blob_rows, chunks, drafts, dry_runs, index, outbox, parts, tables
 from app.store.area import area_after, write_area
 from app.store.audit import skip_audit
 from app.store.base import (
@@ -32,6 +31,7 @@ from app.store.pending import check_committed
 from app.store.prepare import frame_changes, prepare, prepare_further, summarise
 from app.store.values import DRAFT_PREFIX, DRY_PREFIX, LATEST, Area, Idempotency, Pending, Source, Version
 
+NAMES_AT_ONCE = 500
 MAX_REVERT_ATTEMPTS: Final = 8
 
 
@@ -134,7 +134,7 @@ def insert_sources(
     """Write source rows; their blobs must exist and are marked as used."""
     if not sources:
         return
-    lock_blobs(connection, {s.sha256 for s in sources})
+    blob_rows.lock(connection, {s.sha256 for s in sources}, kept=True)
     connection.execute(
         insert(tables.source),
         [
@@ -151,23 +151,6 @@ def insert_sources(
             for k, s in enumerate(sources)
         ],
     )
-
-
-def lock_blobs(connection: Connection, hashes: set[str]) -> None:
-    """Mark blobs of this transaction as used, so that garbage collection skips them.
-
-    Raises Unavailable if one is missing.
-    """
-    now = int(time.time())
-    names = sorted(hashes)
-    for start in range(0, len(names), 500):
-        batch = names[start : start + 500]
-        query = select(tables.blob.c.sha256).where(tables.blob.c.sha256.in_(batch)).order_by(tables.blob.c.sha256)
-        stored_names = set(connection.execute(query.with_for_update()).scalars())
-        missing = [n for n in batch if n not in stored_names]
-        if missing:
-            raise Unavailable(f"uploaded file {missing[0]} is no longer stored: send it again")
-        connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(batch)).values(used=now))
 
 
 class Versions:
@@ -263,13 +246,13 @@ class Versions:
             now = self._database.now()
             if prepared.pending is not None:
                 _claim(connection, row, prepared.pending, now)
-            chunks.insert(connection, prepared.chunks)  # without changes: the repaired chunks
+            chunks.insert(connection, prepared.chunks, kept=True)  # without changes: the repaired chunks
             if not prepared.changed:
                 _append_sources(connection, row.id, row.head, sources)
                 _remember(connection, row.id, idempotency, row.head, now)
                 return read_version(connection, row, row.head)
             before = read_version(connection, row, row.head)
-            lock_blobs(connection, set(prepared.blobs))
+            blob_rows.lock(connection, set(prepared.blobs), kept=True)
             sequence, indexed = row.sequence + 1, row.indexed
             if prepared.index is not None and row.indexed == row.head:
                 index.apply(connection, row.id, prepared.index)
@@ -318,7 +301,7 @@ class Versions:
             row = environment_row(connection, environment, lock=True)
             _check_head(row, prepared.base)
             chunks.insert(connection, prepared.chunks)
-            lock_blobs(connection, {*prepared.blobs, *(source.sha256 for source in sources)})
+            blob_rows.lock(connection, {*prepared.blobs, *(source.sha256 for source in sources)}, kept=False)
             return dry_runs.insert(
                 connection,
                 row,
@@ -333,6 +316,21 @@ class Versions:
     def remove_expired_dry_runs(self) -> None:
         """Remove expired dry runs; the next garbage collection removes their content."""
         dry_runs.remove_expired(self._database)
+
+    def sources_by_name(self, environment: str, names: Sequence[str]) -> dict[str, str]:
+        """Return the hashes of the newest uploaded files with these names, of those that have one."""
+        table, newest = tables.source, func.max(tables.source.c.number)
+        out: dict[str, str] = {}
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            for start in range(0, len(names), NAMES_AT_ONCE):
+                some = list(names[start : start + NAMES_AT_ONCE])
+                own = (table.c.environment_id == row.id) & table.c.name.in_(some)
+                last = select(table.c.name, newest.label("number")).where(own).group_by(table.c.name).subquery()
+                same = (table.c.name == last.c.name) & (table.c.number == last.c.number)
+                query = select(table.c.name, table.c.sha256).join(last, same).where(own).order_by(table.c.position)
+                out.update({r.name: r.sha256 for r in connection.execute(query)})
+        return out
 
     def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
         """Add files of an upload without changes to a version; returns the version with all of its files."""

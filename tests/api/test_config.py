@@ -60,7 +60,7 @@ def test_empty_variable_means_none(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("blob_url", "s3://bucket"), ("port", 70000), ("workers", 0), ("max_pixels", 0)],
+    [("blob_url", "ftp://bucket"), ("blob_url", "s3:///prefix"), ("port", 70000), ("workers", 0), ("max_pixels", 0)],
 )
 def test_invalid_settings_are_refused(name: str, value: object) -> None:
     with pytest.raises(ValidationError):

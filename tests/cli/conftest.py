@@ -44,12 +44,12 @@ Fleetmap = Callable[..., Result]
 
 
 class ServerProcess:
-    """``fleetmap serve`` in a process of its own; ``lines`` is what it printed."""
+    """``fleetmap serve`` (or another command) in a process of its own; ``lines`` is what it printed."""
 
-    def __init__(self, *arguments: str, environment: Mapping[str, str], folder: Path) -> None:
+    def __init__(self, *arguments: str, environment: Mapping[str, str], folder: Path, command: str = "serve") -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "app.cli", "serve", "--port", "0", *arguments],
+            [sys.executable, "-m", "app.cli", command, "--port", "0", *arguments],
             env={
                 **clean,
                 "FLEETMAP_ZENOH_MODE": "off",

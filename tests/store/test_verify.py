@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from sqlalchemy import exc
 
+from app.backends.blobs import unreadable_error as _unreadable_error
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
 from app.ingest.repair import repair
 from app.limits import Limits
-from app.store.blobs import _unreadable_error
 from app.store.changes import Changes
 from app.store.chunks import insert
 from app.store.encode import compress, digest
@@ -174,10 +174,11 @@ def test_scrub_skips_unreadable_files(
     names = sorted(sqlite_store.blobs.put(bytes([k]) * 100) for k in range(3))
     real = sqlite_store.blobs._problem
 
-    def problem(name: str, row: Any) -> str | None:
+    def problem(row: Any) -> str | None:
+        name = row.name
         if name == names[0]:
             raise _unreadable_error(PermissionError(errno.EACCES, "refused", "/srv/data"))
-        return "damaged" if name == names[1] else real(name, row)
+        return "damaged" if name == names[1] else real(row)
 
     monkeypatch.setattr(sqlite_store.blobs, "_problem", problem)
     Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9).pass_if_due()

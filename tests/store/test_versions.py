@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import random
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -627,7 +628,11 @@ def test_garbage_collection_removes_all_unused_content(farm: Store):
     assert farm.blobs.get(digests[3]) == files[3]
     remaining_files = [p for p in farm.blob_dir.rglob("*") if p.is_file() and not p.name.startswith(".")]
     total = sum(p.stat().st_size for p in remaining_files)
-    assert total == 1000 + sum(len(v) for v in everything()[PartKey("resources", "ground", "gazebo")].files.values())  # type: ignore[union-attr]
+    with farm._database.read() as connection:
+        rows = connection.exec_driver_sql("SELECT sha256, stored FROM blob").all()
+    resources = everything()[PartKey("resources", "ground", "gazebo")].files.values()  # type: ignore[union-attr]
+    assert {name for name, _ in rows} == {digests[3], *(hashlib.sha256(data).hexdigest() for data in resources)}
+    assert total == sum(stored for _, stored in rows)
     with pytest.raises(NotFound):
         farm.blobs.get(digests[4])
     farm.environments.delete("farm")

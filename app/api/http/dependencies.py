@@ -17,6 +17,7 @@ from app.api.http.deltas import Deltas
 from app.api.http.metrics import Metrics
 from app.api.http.response_cache import ResponseCache
 from app.api.http.schemas import IdempotencyKey, IfMatch
+from app.api.http.shared_work import SharedWork
 from app.api.http.signed import SignedLinks
 from app.api.http.uploads import UploadSpool
 from app.backends.lead import Leads
@@ -100,7 +101,10 @@ class Writability:
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services that routes use. spare: worker for tasks that should not wait for ``pool``."""
+    """Services that routes use.
+
+    spare: worker for tasks that should not wait for ``pool``. work: workers of all servers, None if there are none.
+    """
 
     options: ApiOptions
     store: Store
@@ -110,6 +114,7 @@ class Services:
     maps: Maps
     access: Authenticator
     jobs: ConversionJobs
+    work: SharedWork | None
     response_cache: ResponseCache
     intake: UploadSpool
     metrics: Metrics

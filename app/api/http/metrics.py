@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest, multiprocess
@@ -16,6 +16,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from app.backends.lead import Leads
+from app.backends.queue import QueueFigures
 from app.store.scrub import current_state, figures
 from app.store.store import Store
 
@@ -51,6 +52,7 @@ class Metrics:
         )
         self.uploads = Counter("fleetmap_uploads", "Number of uploads and edits.", ["result"], registry=self.registry)
 
+        self.queue: Callable[[], QueueFigures] | None = None
         self._reserve()
 
     def _reserve(self) -> None:
@@ -74,6 +76,8 @@ class Metrics:
         heads = CollectorRegistry()
         heads.register(_HeadVersionCollector(store))
         heads.register(_Scrubs(store))
+        if self.queue is not None:
+            heads.register(QueueCollector(self.queue))
         heads.register(_Leaders(leads))
         return generate_latest(registry) + generate_latest(heads)
 
@@ -134,3 +138,26 @@ class _Scrubs(Collector):
         for kind, count in state["findings"].items():
             findings.add_metric([kind], count)
         yield findings
+
+
+class QueueCollector(Collector):
+    """State of the queue of conversions and other work: of all servers if they share one, else of this process."""
+
+    def __init__(self, figures: Callable[[], QueueFigures]) -> None:
+        self._figures = figures
+
+    def collect(self) -> Iterable[Metric]:
+        """Yield the figures."""
+        figures = self._figures()
+        waiting = GaugeMetricFamily(
+            "fleetmap_queue_waiting", "Number of tasks that wait, by who waits for them.", labels=["urgency"]
+        )
+        for urgency, count in sorted(figures.waiting.items()):
+            waiting.add_metric([urgency], count)
+        yield waiting
+        yield GaugeMetricFamily("fleetmap_queue_running", "Number of tasks that are carried out.", figures.running)
+        oldest = "Seconds that the longest waiting task has waited."
+        yield GaugeMetricFamily("fleetmap_queue_oldest_seconds", oldest, figures.oldest)
+        yield GaugeMetricFamily(
+            "fleetmap_queue_workers", "Number of live workers, or of threads without workers.", figures.workers
+        )

@@ -25,10 +25,10 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
 from app.api.http.problems import MalformedBody
+from app.backends.room import check_room
 from app.errors import DISK_FULL_ERRNOS, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.ingest import SpooledFile
 from app.limits import Limits
-from app.store.database import check_room
 
 BATCH = 2**20
 """Size of a batch that a thread parses, hashes and writes, in bytes."""

@@ -1,0 +1,167 @@
+"""Blob store in an S3 bucket, by obstore. Access is configured by the usual ``AWS_*`` environment variables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
+
+import obstore
+from obstore import exceptions
+from obstore.store import S3Store
+
+from app.backends.blobs import BLOCK, StoredFile, Unreadable, unwritable_error
+from app.backends.workspaces import Workspaces
+from app.errors import NoRoom, Unavailable
+
+if TYPE_CHECKING:
+    from obstore.store import ClientConfig, RetryConfig
+
+CONNECT_SECONDS: Final = 3
+STALL_SECONDS: Final = 10
+"""Seconds without a byte after which a request is given up."""
+REQUEST_SECONDS: Final = 600
+RETRIES: Final = 2
+PROBE: Final = "probe"
+AT_ONCE: Final = 8
+DELETED_AT_ONCE: Final = 500
+
+_FULL: Final = ("507 ", "InsufficientStorage", "QuotaExceeded", "XMinioStorageFull", "no space left", "ServiceFull")
+_REFUSED: Final = ("401 ", "403 ", "AccessDenied", "SignatureDoesNotMatch", "InvalidAccessKeyId")
+
+
+class S3Files:
+    """Files in a bucket, below the URL ``s3://bucket[/prefix]``. folder: for workspaces on this machine."""
+
+    remote = True
+
+    def __init__(self, url: str, folder: Path) -> None:
+        parts = urlsplit(url)
+        self._place = f"s3://{parts.netloc}{parts.path.rstrip('/')}"
+        self._workspaces = Workspaces(folder / "tmp")
+        self._store = _open(parts.netloc, parts.path, retries=RETRIES, stall=STALL_SECONDS)
+        self._probing = _open(parts.netloc, parts.path, retries=0, stall=CONNECT_SECONDS)
+        self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-s3")
+
+    def prepare(self) -> None:
+        """Create the folder for workspaces; the bucket must exist."""
+        self._workspaces.folder.mkdir(parents=True, exist_ok=True)
+
+    def workspace(self) -> AbstractContextManager[Path]:
+        """Create a folder for temporary files."""
+        return self._workspaces.create()
+
+    def write(self, files: Mapping[str, bytes | Path]) -> None:
+        """Store files, several at once."""
+
+        def put(item: tuple[str, bytes | Path]) -> None:
+            obstore.put(self._store, item[0], item[1])
+
+        try:
+            list(self._threads.map(put, files.items()))
+        except exceptions.BaseError as error:
+            raise self._unwritable(error) from error
+        except OSError as error:
+            raise self._unwritable(error) if _is_of_store(error) else unwritable_error(error) from error
+
+    def stream(self, key: str, start: int = 0, size: int | None = None) -> Iterator[bytes]:
+        """Read a file in pieces."""
+        if size == 0:
+            return
+        try:
+            got = obstore.get(self._store, key) if size is None and not start else self._range(key, start, size)
+            for block in got.stream(min_chunk_size=BLOCK):
+                yield bytes(block)
+        except FileNotFoundError as error:
+            if "NoSuchBucket" in str(error):
+                raise Unreadable(f"{self._place} cannot be read (no such bucket): create it") from error
+            raise
+        except (exceptions.BaseError, OSError) as error:
+            raise Unreadable(f"{self._place} cannot be read ({_reason(error)}): try again later") from error
+
+    def _range(self, key: str, start: int, size: int | None) -> obstore.GetResult:
+        if size is None:
+            return obstore.get(self._store, key, options={"range": {"offset": start}})
+        return obstore.get(self._store, key, options={"range": (start, start + size)})
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Remove files."""
+        names = list(keys)
+        try:
+            for start in range(0, len(names), DELETED_AT_ONCE):
+                obstore.delete(self._store, names[start : start + DELETED_AT_ONCE])
+        except FileNotFoundError:
+            return
+        except (exceptions.BaseError, OSError) as error:
+            raise self._unwritable(error) from error
+
+    def list(self, prefix: str = "") -> Iterator[StoredFile]:
+        """List files."""
+        try:
+            for some in obstore.list(self._store, prefix.rstrip("/") or None):
+                for one in some:
+                    if one["path"] != PROBE:
+                        yield StoredFile(one["path"], one["size"], one["last_modified"].timestamp())
+        except (exceptions.BaseError, OSError) as error:
+            raise Unreadable(f"{self._place} cannot be listed ({_reason(error)}): try again later") from error
+
+    def check(self, *, readonly: bool = False) -> None:
+        """Raise Unavailable unless a small file can be written (``readonly``: the bucket listed) within seconds."""
+        try:
+            if readonly:
+                next(iter(obstore.list(self._probing, chunk_size=1)), None)
+            else:
+                obstore.put(self._probing, PROBE, b"fleetmap")
+        except (exceptions.BaseError, OSError) as error:
+            raise self._unwritable(error) from error
+
+    def recover(self) -> int:
+        """Remove the workspaces of ended processes."""
+        self.prepare()
+        return self._workspaces.recover()
+
+    def _unwritable(self, error: Exception) -> Unavailable:
+        reason = _reason(error)
+        if any(word in str(error) for word in _FULL):
+            return NoRoom(
+                f"{self._place} has no space left ({reason}), and nothing was stored: try again when its operator has "
+                "freed space"
+            )
+        return Unavailable(f"{self._place} cannot be written ({reason}), and nothing was stored: try again later")
+
+
+def _open(bucket: str, prefix: str, *, retries: int, stall: int) -> S3Store:
+    client: ClientConfig = {
+        "allow_http": True,  # if the endpoint's address says so
+        "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
+        "read_timeout": timedelta(seconds=stall),
+        "timeout": timedelta(seconds=REQUEST_SECONDS if retries else stall),
+    }
+    retry: RetryConfig = {"max_retries": retries, "retry_timeout": timedelta(seconds=2 * STALL_SECONDS)}
+    return S3Store(bucket, prefix=prefix.strip("/") or None, client_options=client, retry_config=retry)
+
+
+def _is_of_store(error: OSError) -> bool:
+    """Whether an OSError is the store's answer (obstore uses FileNotFoundError), not one of a local file."""
+    return "Object at location" in str(error) or "S3" in str(error)
+
+
+def _reason(error: Exception) -> str:
+    """Return why a request failed, in a few words, without addresses and signatures."""
+    text = str(error)
+    if any(word in text for word in _REFUSED):
+        return "access was refused: check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and the bucket's policy"
+    if "NoSuchBucket" in text:
+        return "no such bucket: create it"
+    if any(word in text for word in _FULL):
+        return "it is full"
+    if any(word in text for word in ("kind: Timeout", "TimedOut", "timed out")):
+        return "it answers too slowly"
+    if "kind: Connect" in text or "error sending request" in text:
+        return "it does not answer: check AWS_ENDPOINT_URL, and whether it runs"
+    code = text.partition("status code: ")[2].partition(":")[0]
+    return f"it answered {code}" if code else type(error).__name__

