@@ -77,7 +77,9 @@ def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     }
     dictionary = zstd.ZstdDict(base, is_raw=True)
     patch = zstd.compress(zstd.compress(content, options=options, zstd_dict=dictionary.as_prefix))
-    return ("patch", patch) if best is None or len(patch) < len(best[1]) else best
+    if best is not None and len(best[1]) <= len(patch):
+        return best
+    return "patch", patch
 
 
 def _xor(one: bytes | memoryview, other: bytes) -> bytes:
