@@ -63,12 +63,11 @@ def compress_file(source: bytes | Path, target: Path) -> int:
 
 def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     """Return the smaller difference of a content from another."""
-    best: tuple[Coding, bytes] | None = None
+    changed: bytes | None = None
     if len(base) == len(content):
         changed = zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
-        best = ("xor", changed)
         if len(changed) * CLEARLY < len(content):
-            return best
+            return "xor", changed
     options: dict[int, int] = {
         zstd.CompressionParameter.compression_level: LEVEL,
         zstd.CompressionParameter.window_log: _WINDOW,
@@ -77,8 +76,8 @@ def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     }
     dictionary = zstd.ZstdDict(base, is_raw=True)
     patch = zstd.compress(zstd.compress(content, options=options, zstd_dict=dictionary.as_prefix))
-    if best is not None and len(best[1]) <= len(patch):
-        return best
+    if changed is not None and len(changed) <= len(patch):
+        return "xor", changed
     return "patch", patch
 
 
