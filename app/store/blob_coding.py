@@ -63,11 +63,11 @@ def compress_file(source: bytes | Path, target: Path) -> int:
 
 def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     """Return the smaller difference of a content from another."""
-    best: tuple[Coding, bytes] | None = None
+    xor: bytes | None = None
     if len(base) == len(content):
-        best = "xor", zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
-        if len(best[1]) * CLEARLY < len(content):
-            return best
+        xor = zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
+        if len(xor) * CLEARLY < len(content):
+            return "xor", xor
     options: dict[int, int] = {
         zstd.CompressionParameter.compression_level: LEVEL,
         zstd.CompressionParameter.window_log: _WINDOW,
@@ -76,7 +76,7 @@ def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     }
     dictionary = zstd.ZstdDict(base, is_raw=True)
     patch = zstd.compress(zstd.compress(content, options=options, zstd_dict=dictionary.as_prefix))
-    return ("patch", patch) if best is None or len(patch) < len(best[1]) else best
+    return ("patch", patch) if xor is None or len(patch) < len(xor) else ("xor", xor)
 
 
 def _xor(one: bytes | memoryview, other: bytes) -> bytes:

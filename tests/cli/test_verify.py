@@ -72,7 +72,7 @@ def damage_chunks(api: Api, folder: Path) -> None:
 
 def damage_blobs(folder: Path) -> None:
     for path in (folder / "blobs").rglob("*"):
-        if path.is_file() and len(path.name) == 64:
+        if path.is_file() and len(path.name.split(".")[0]) == 64:
             path.write_bytes(bytes(path.stat().st_size))
 
 
