@@ -311,7 +311,7 @@ def flip_file(files: Callable[[Path], list[Path]], site: Site) -> None:
 
 
 def blobs(data: Path) -> list[Path]:
-    return [p for p in (data / "blobs").rglob("*") if len(p.name) == 64]
+    return [p for p in (data / "blobs").rglob("*") if len(p.name.split(".")[0]) == 64]
 
 
 def flip_chunk(site: Site) -> None:

@@ -139,7 +139,7 @@ STALE_AFTER_SECONDS = 3600.0
 class SharedMaps(Protocol):
     """Maps that several servers share."""
 
-    def publish(self, key: str, made: CachedMap) -> None:
+    def publish(self, key: str, cached_map: CachedMap) -> None:
         """Share a map that this server has made."""
 
     def load(self, key: str) -> ConvertedMap | None:
@@ -291,16 +291,16 @@ class Cache:
                 self.hits += 1
                 return cached_map
             self.misses += 1
-            made = self._store(key, maker())
+            cached_map = self._store(key, maker())
             if self._shared is not None:
-                self._shared.publish(key, made)
-            return replace(made, fresh=True)
+                self._shared.publish(key, cached_map)
+            return replace(cached_map, fresh=True)
 
     def get_or_fetch(self, key: str) -> CachedMap | None:
         """Return the map if it is cached, or if another server has made it."""
         cached_map = self.get(key)
-        made = self._shared.load(key) if cached_map is None and self._shared is not None else None
-        return cached_map if made is None else self._store(key, made)
+        shared_map = self._shared.load(key) if cached_map is None and self._shared is not None else None
+        return cached_map if shared_map is None else self._store(key, shared_map)
 
     @contextlib.contextmanager
     def hold_files(self) -> Iterator[Callable[[CachedMap], CachedMap]]:

@@ -85,6 +85,9 @@ def repair(
             continue
         origin = f"the uploads of {environment} {number}"
         arguments = (store.database_url, str(store.blob_dir), environment, number, lost_chunks, lost_blobs, limits)
+        for source in store.versions.get(environment, number).sources:
+            with contextlib.suppress(FleetMapError):  # the worker has no network; it does without what is lost
+                store.blobs.fetch([source.sha256])
         try:
             rebuilt: RecoveredData = run(recover_from_uploads, *arguments)
         except FleetMapError:

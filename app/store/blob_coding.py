@@ -63,11 +63,11 @@ def compress_file(source: bytes | Path, target: Path) -> int:
 
 def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     """Return the smaller difference of a content from another."""
-    changed: bytes | None = None
+    xor: bytes | None = None
     if len(base) == len(content):
-        changed = zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
-        if len(changed) * CLEARLY < len(content):
-            return "xor", changed
+        xor = zstd.compress(zstd.compress(_xor(base, content), options=_OPTIONS))
+        if len(xor) * CLEARLY < len(content):
+            return "xor", xor
     options: dict[int, int] = {
         zstd.CompressionParameter.compression_level: LEVEL,
         zstd.CompressionParameter.window_log: _WINDOW,
@@ -76,9 +76,7 @@ def make_difference(base: bytes, content: bytes) -> tuple[Coding, bytes]:
     }
     dictionary = zstd.ZstdDict(base, is_raw=True)
     patch = zstd.compress(zstd.compress(content, options=options, zstd_dict=dictionary.as_prefix))
-    if changed is not None and len(changed) <= len(patch):
-        return "xor", changed
-    return "patch", patch
+    return ("patch", patch) if xor is None or len(patch) < len(xor) else ("xor", xor)
 
 
 def _xor(one: bytes | memoryview, other: bytes) -> bytes:

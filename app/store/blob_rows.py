@@ -38,10 +38,10 @@ class BlobRow:
         """Key of the file that contains it."""
         if self.pack is not None:
             return f"packs/{self.pack}"
-        own = f"{self.name[:2]}/{self.name}"
+        single = f"{self.name[:2]}/{self.name}"
         if self.base is not None:
-            return f"{own}.{self.base[:16]}.{self.coding}"
-        return own if self.coding is None else f"{own}.zst"
+            return f"{single}.{self.base[:16]}.{self.coding}"
+        return single if self.coding is None else f"{single}.zst"
 
 
 _COLUMNS: Final = (

@@ -16,9 +16,9 @@ from app.store.blobs import Blobs
 from app.store.database import Database
 from app.store.tables import blob, made_map, source
 
-_OWN: Final = re.compile(r"[0-9a-f]{2}/(?P<name>[0-9a-f]{64})(\..+)?")
+_SINGLE: Final = re.compile(r"[0-9a-f]{2}/(?P<name>[0-9a-f]{64})(\..+)?")
 _PACK: Final = re.compile(r"packs/(?P<name>[0-9a-f]{64})")
-_MADE: Final = re.compile(r"made/[0-9a-f]{2}/(?P<name>[0-9a-f]{64})")
+_SHARED: Final = re.compile(r"made/[0-9a-f]{2}/(?P<name>[0-9a-f]{64})")
 
 
 class BlobUpkeep:
@@ -116,18 +116,18 @@ class BlobUpkeep:
         return count + self._remove_unknown(batch)
 
     def _remove_unknown(self, keys: list[str]) -> int:
-        own = {key: match["name"] for key in keys if (match := _OWN.fullmatch(key))}
+        single = {key: match["name"] for key in keys if (match := _SINGLE.fullmatch(key))}
         packs = {key: match["name"] for key in keys if (match := _PACK.fullmatch(key))}
-        made = {key: match["name"] for key in keys if (match := _MADE.fullmatch(key))}
+        shared = {key: match["name"] for key in keys if (match := _SHARED.fullmatch(key))}
         with self._database.read() as connection:
-            rows = blob_rows.select_rows(connection, sorted({*own.values()}))
+            rows = blob_rows.select_rows(connection, sorted({*single.values()}))
             query = select(blob.c.pack).where(blob.c.pack.in_(sorted({*packs.values()}))).distinct()
             known_packs = set(connection.execute(query).scalars())
-            query = select(made_map.c.object).where(made_map.c.object.in_(sorted({*made.values()})))
-            known_made = set(connection.execute(query).scalars())
-        strays = [key for key, name in own.items() if name not in rows or rows[name].key != key]
+            query = select(made_map.c.object).where(made_map.c.object.in_(sorted({*shared.values()})))
+            known_shared = set(connection.execute(query).scalars())
+        strays = [key for key, name in single.items() if name not in rows or rows[name].key != key]
         strays += [key for key, name in packs.items() if name not in known_packs]
-        strays += [key for key, name in made.items() if name not in known_made]
+        strays += [key for key, name in shared.items() if name not in known_shared]
         self._blobs.files.delete(strays)
         return len(strays)
 

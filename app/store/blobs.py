@@ -153,10 +153,10 @@ class Blobs:
         self, plain: Path, name: str, size: int, compressed: int, similar: str | None
     ) -> tuple[BlobRow, bytes] | None:
         """Make the difference from an earlier version of a file; None if there is none, or if it is not worth it."""
-        found = None if similar in (None, name) or size > blob_coding.MAX_PATCHED else self._base_for(similar)
-        if found is None:
+        chosen = None if similar in (None, name) or size > blob_coding.MAX_PATCHED else self._base_for(similar)
+        if chosen is None:
             return None
-        base, number = found
+        base, number = chosen
         try:
             coding, patch = blob_coding.make_difference(self.get(base.name), plain.read_bytes())
         except (Damaged, NotFound):

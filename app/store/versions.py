@@ -325,10 +325,10 @@ class Versions:
             row = environment_row(connection, environment)
             for start in range(0, len(names), NAMES_AT_ONCE):
                 some = list(names[start : start + NAMES_AT_ONCE])
-                own = (table.c.environment_id == row.id) & table.c.name.in_(some)
-                last = select(table.c.name, newest.label("number")).where(own).group_by(table.c.name).subquery()
+                named = (table.c.environment_id == row.id) & table.c.name.in_(some)
+                last = select(table.c.name, newest.label("number")).where(named).group_by(table.c.name).subquery()
                 same = (table.c.name == last.c.name) & (table.c.number == last.c.number)
-                query = select(table.c.name, table.c.sha256).join(last, same).where(own).order_by(table.c.position)
+                query = select(table.c.name, table.c.sha256).join(last, same).where(named).order_by(table.c.position)
                 out.update({r.name: r.sha256 for r in connection.execute(query)})
         return out
 

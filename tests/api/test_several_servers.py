@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import random
+import subprocess
+import sys
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from datetime import timedelta
 from pathlib import Path
@@ -13,7 +18,9 @@ from pathlib import Path
 import pytest
 
 from app.config import Settings
+from app.errors import Unavailable
 from app.main import open_store
+from app.store.values import Source
 from tests.api import samples
 from tests.api.conftest import Api, parts, running, settings_for
 from tests.postgres import postgres_cluster, postgres_url
@@ -132,6 +139,71 @@ def test_unused_shared_maps_are_collected(servers: list[Api]) -> None:
     assert b.get("/maps/farm/tmap2").content == made.content, "converted again"
     store.garbage.collect(timedelta(0))
     assert len(list(store.blobs.files.list("made/"))) == 1
+
+
+def test_verify_repairs_files_wherever_they_are(settings: list[Settings], tmp_path: Path) -> None:
+    environment = {
+        **os.environ,
+        "FLEETMAP_DATABASE_URL": settings[1].database,
+        "FLEETMAP_DATA_DIR": str(settings[1].data_dir),
+        "FLEETMAP_BLOB_URL": settings[1].blob_url or "",
+    }
+    store = open_store(settings[0])
+    store.environments.create("farm")
+    data = random.Random(6).randbytes(90_000)
+    (tmp_path / "originals").mkdir()
+    (tmp_path / "originals" / "cloud.bin").write_bytes(data)
+    name = store.blobs.put(data)
+    store.versions.add_sources("farm", 0, [Source("cloud.bin", len(data), name)])
+    store.blobs.files.write({f"{name[:2]}/{name}": data[1:] + b"x"})
+    command = [sys.executable, "-m", "app.cli", "verify"]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
+    assert found.returncode == 1, found.stdout + found.stderr
+    assert name[:16] in found.stdout
+    command += ["--repair", "--from", str(tmp_path / "originals")]
+    repaired = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
+    assert repaired.returncode == 0, repaired.stdout + repaired.stderr
+    assert store.blobs.get(name) == data
+    store.close()
+
+
+def test_collection_beside_uploads_of_another_server_loses_nothing(settings: list[Settings]) -> None:
+    uploading, collecting = (open_store(one) for one in settings)
+    uploading.environments.create("farm")
+    contents = [random.Random(k).randbytes(70_000) for k in range(3)]
+    ended = threading.Event()
+
+    def collect() -> int:
+        count = 0
+        while not ended.is_set():
+            collecting.garbage.look_at_everything()
+            count += collecting.garbage.collect(timedelta(seconds=1))["blobs"]
+        return count
+
+    committed: list[str] = []
+    with ThreadPoolExecutor(1) as thread:
+        collection = thread.submit(collect)
+        try:
+            for k in range(30):
+                name = uploading.blobs.put(contents[k % 3])
+                try:
+                    uploading.versions.add_sources("farm", 0, [Source(f"f{k}", 70_000, name)])
+                except Unavailable as error:
+                    assert "send it again" in error.detail
+                else:
+                    committed.append(name)
+                    if k % 3 == 2:
+                        with uploading._database.write() as connection:  # forgotten again, so that they are collected
+                            connection.exec_driver_sql("DELETE FROM source")
+                            connection.exec_driver_sql("UPDATE blob SET kept = false, used = used - 100")
+                        committed.clear()
+                assert all(hashlib.sha256(uploading.blobs.get(one)).hexdigest() == one for one in committed)
+        finally:
+            ended.set()
+        collection.result(60)
+    assert collecting.blob_upkeep.verify() == []
+    for store in (uploading, collecting):
+        store.close()
 
 
 def test_server_serves_what_it_has_without_the_store_and_recovers(
