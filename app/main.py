@@ -287,16 +287,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         secrets.newest()
     leads = open_leads(settings.direct_database, settings.data_dir)
 
-    def count(name: str, result: str) -> None:
-        metrics.conversions.labels(name, result).inc()
-
-    work = None
-    if settings.shares_maps:
-        queue = SharedQueue(store.transaction, waiting=settings.conversion_queue)
-        work = SharedWork(store, queue, service)
+    jobs, work = _conversion_jobs(settings, store, service, pool, metrics)
     tiles = Tiles(store, service.cache)
-    jobs = ConversionJobs(store, service, settings.job_seconds, count, work=work, is_busy=lambda: pool.is_busy)
-    metrics.queue = jobs.figures
     return Services(
         options=_api_options(settings),
         store=store,
@@ -320,6 +312,23 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         fleet=FleetIntake(store, leads.lead(relay.NAME), bus_vouches=_bus_vouches(settings)),
         writability=Writability(store.check_writable, intake.check),
     )
+
+
+def _conversion_jobs(
+    settings: Settings, store: Store, service: Maps, pool: Pool, metrics: Metrics
+) -> tuple[ConversionJobs, SharedWork | None]:
+    """Create the jobs of this server, and its side of the queue of all servers if there is one."""
+
+    def count(name: str, result: str) -> None:
+        metrics.conversions.labels(name, result).inc()
+
+    work = None
+    if settings.shares_maps:
+        queue = SharedQueue(store.transaction, waiting=settings.conversion_queue)
+        work = SharedWork(store, queue, service)
+    jobs = ConversionJobs(store, service, settings.job_seconds, count, work=work, is_busy=lambda: pool.is_busy)
+    metrics.queue = jobs.figures
+    return jobs, work
 
 
 def _signing_keys(settings: Settings, store: Store) -> SigningKeys:

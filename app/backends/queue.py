@@ -146,5 +146,5 @@ def _next_tag(task: Task, waiting: Iterable[_Entry], running: Iterable[_Entry]) 
     """Return a new task's tag among the entries of its urgency."""
     waiting = list(waiting)
     first = min((entry.tag for entry in waiting), default=0)
-    own = [entry.tag for entry in (*waiting, *running) if entry.task.environment == task.environment]
-    return max([first, *(tag + 1 for tag in own)])
+    tags = [entry.tag for entry in (*waiting, *running) if entry.task.environment == task.environment]
+    return max([first, *(tag + 1 for tag in tags)])

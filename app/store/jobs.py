@@ -103,8 +103,8 @@ class Jobs:
         table = tables.job
         values = {"owner": checked_text(owner, "an owner"), "location": location, "followed": True}
         with self._database.write(upkeep=True) as connection:
-            mine = update(table).where(table.c.id == id, table.c.owner == "").values(**values)
-            return bool(connection.execute(mine).rowcount)
+            change = update(table).where(table.c.id == id, table.c.owner == "").values(**values)
+            return bool(connection.execute(change).rowcount)
 
     def detach(self, id: str) -> None:
         """Let a job no longer wait for its task; delete it if no client was told of it."""
@@ -189,13 +189,13 @@ class Jobs:
 
 
 def _as_job(row: Row[Any]) -> Job:
-    made = {"location": row.location} if row.state == "done" and row.location is not None else None
+    result = {"location": row.location} if row.state == "done" and row.location is not None else None
     return Job(
         row.id,
         row.state,
         row.progress,
         row.detail,
-        row.result or made,
+        row.result or result,
         row.problem,
         row.created,
         row.updated,

@@ -35,9 +35,10 @@ from typer.main import get_command
 from app import derive, generate
 from app.api.http import problems
 from app.api.http.auth import RequireRole
-from app.api.http.metrics import Metrics, _HeadVersionCollector, _Leaders, _Scrubs
+from app.api.http.metrics import Metrics, QueueCollector, _HeadVersionCollector, _Leaders, _Scrubs
 from app.api.http.responses import API
 from app.backends.lead import LocalLeads
+from app.backends.queue import QueueFigures
 from app.cli import commands
 from app.config import Settings
 from app.derive import Derivation
@@ -388,6 +389,10 @@ def settings() -> str:
     return table(("setting", "type", "default", "bounds", "meaning"), rows)
 
 
+def _no_tasks() -> QueueFigures:
+    return QueueFigures({"robot": 0, "person": 0}, 0, 0.0, 0)
+
+
 def metrics() -> str:
     """All metrics of ``/metrics``."""
     metrics = Metrics()
@@ -402,7 +407,8 @@ def metrics() -> str:
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
         empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder), is_shared=False)
-        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), _Leaders(LocalLeads(Path(folder)))):
+        leaders, queue = _Leaders(LocalLeads(Path(folder))), QueueCollector(_no_tasks)
+        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), leaders, queue):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
                 rows.append((code(family.name), family.type, codes(labels), family.documentation))

@@ -200,9 +200,9 @@ class ConversionJobs:
         while work is not None and self._is_shared(recipe, work):
             job = running.shared = work.submit_conversion(recipe, running.task.urgency, f"converting {_label(recipe)}")
             try:
-                made = work.finish_conversion(job, recipe, running.stop)
-                if made is not None:
-                    return made
+                finished = work.finish_conversion(job, recipe, running.stop)
+                if finished is not None:
+                    return finished
                 running.shared = None
                 break
             except Cancelled:

@@ -105,11 +105,13 @@ class SharedWork:
         request: a dataclass of JSON values. A worker that takes over from a dead one makes no second version.
         """
         key = secrets.token_hex(16)
-        named = commit if commit.idempotency_key is not None else dataclasses.replace(commit, idempotency_key=key)
+        request_commit = (
+            commit if commit.idempotency_key is not None else dataclasses.replace(commit, idempotency_key=key)
+        )
         caller = CALLER.get()
         arguments = {
             "request": dataclasses.asdict(request),
-            "commit": dataclasses.asdict(named),
+            "commit": dataclasses.asdict(request_commit),
             "caller": None if caller is None else dataclasses.asdict(caller),
         }
         task = Task(kind, key, environment, "person", arguments)

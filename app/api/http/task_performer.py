@@ -93,7 +93,7 @@ class TaskPerformer:
 
     def _convert(self, task: Task, stop: CancelHandle) -> Done:
         order = MapOrder(**task.arguments["order"])
-        known = [ChainFailure(**one) for one in task.arguments["failed"]]
+        failures = [ChainFailure(**one) for one in task.arguments["failed"]]
         recipe = self._maps.recipe(
             self._version(task.environment, order),
             order.format,
@@ -102,8 +102,8 @@ class TaskPerformer:
             file=order.file,
             listed=order.listed,
         )
-        if recipe.key != task.key and known:
-            recipe = recipe.without(known)
+        if recipe.key != task.key and failures:
+            recipe = recipe.without(failures)
         if recipe.key == task.key or recipe.failed:
             recipe, cached_map = self._maps.get_or_convert(recipe, stop)
             if cached_map.fresh:
