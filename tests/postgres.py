@@ -77,7 +77,7 @@ class Cluster:
         with self.connect() as connection:
             names = sql.Identifier(name), sql.Identifier(template)
             copy = sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(*names)
-            if connection.info.server_version >= 150_000:  # its default logs each page, which takes twice the time
+            if connection.info.server_version >= 150_000:  # its default logs each page, which takes half as long again
                 copy += sql.SQL(" STRATEGY FILE_COPY")
             connection.execute(copy)
         return name
