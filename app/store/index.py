@@ -28,6 +28,7 @@ from app.model.layers import VECTOR_LAYERS, Layer, PartKey
 from app.store import diff, tables
 from app.store.changes import IndexRows
 from app.store.chunks import Chunks
+from app.store.column_types import from_wkb
 from app.store.database import Database
 from app.store.extent import geometry as to_geometry
 from app.store.manifest import read_version
@@ -77,7 +78,7 @@ def intersects(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str)
     conditions: list[ColumnElement[bool]] = []
     for part in split_box(box):
         if dialect == "postgresql":
-            shape = tables.from_wkb(literal(to_geometry(part), LargeBinary))
+            shape = from_wkb(literal(to_geometry(part), LargeBinary))
             conditions.append(func.ST_Intersects(geometry, shape))
             continue
         west, south, east, north = part

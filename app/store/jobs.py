@@ -12,6 +12,7 @@ from sqlalchemy import Row, bindparam, delete, insert, select, text, update
 from app.errors import NotFound
 from app.store import tables
 from app.store.base import checked_text, storable_text
+from app.store.column_types import UtcDateTime
 from app.store.database import Database
 from app.store.values import Job, State
 
@@ -26,7 +27,7 @@ _LOST = text(
     "SELECT task FROM job WHERE task IS NOT NULL AND state IN ('queued', 'running') AND updated < :before"
     " AND NOT EXISTS (SELECT 1 FROM procrastinate_jobs entry WHERE entry.lock = job.task"
     " AND entry.status IN ('todo', 'doing'))"
-).bindparams(bindparam("before", type_=tables.UtcDateTime))
+).bindparams(bindparam("before", type_=UtcDateTime))
 """Tasks of jobs that wait for one that is not in the queue."""
 
 

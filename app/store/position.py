@@ -13,7 +13,7 @@ from sqlalchemy import Boolean, ColumnElement, Connection, LargeBinary, and_, fu
 
 from app.errors import Damaged, Invalid, Problem
 from app.model.geodesy import distance
-from app.store import tables
+from app.store import column_types, tables
 from app.store.area import compute_area, write_area
 from app.store.base import as_environment, datum_from_row
 from app.store.chunks import Chunks
@@ -126,7 +126,7 @@ class Areas:
             x, y = place
             return and_(area.c.south <= y, area.c.north >= y, area.c.west <= x, area.c.east >= x)
         wkb = bytes(to_wkb(np.array([shapely.Point(place)], object))[0])
-        return func.ST_Covers(area.c.geometry, tables.from_wkb(literal(wkb, LargeBinary)), type_=Boolean)
+        return func.ST_Covers(area.c.geometry, column_types.from_wkb(literal(wkb, LargeBinary)), type_=Boolean)
 
     def refresh(self) -> int:
         """Compute the areas that no commit has computed; returns how many environments were behind.

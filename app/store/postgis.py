@@ -24,8 +24,8 @@ class PlainGeometry(Geometry):
         """Return None: values stay bytes."""
 
     def bind_expression(self, bindvalue: BindParameter[Any]) -> None:
-        """Return no SQL function: ``app.store.tables.WkbGeometry`` converts, by dialect."""
+        """Return no SQL function: ``app.store.column_types.WkbGeometry`` converts, by dialect."""
 
     def column_expression(self, col: ColumnElement[Any]) -> ColumnElement[Any]:
-        """Return the column: ``app.store.tables.WkbGeometry`` converts, by dialect."""
+        """Return the column: ``app.store.column_types.WkbGeometry`` converts, by dialect."""
         return col

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 from alembic import op
 
-from app.store.tables import UtcDateTime
+from app.store.column_types import UtcDateTime
 
 revision = "0013"
 down_revision = "0012"
