@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from app.convert.recently_used import RecentlyUsed
 from app.model import geodesy
+from app.model.geodesy import WGS84, local_frame
 from app.model.imagery import LOCAL
 from app.ogc.crs import ReferenceSystem
 from app.ogc.tables import Table, TableKey, VectorLayer
@@ -112,16 +113,23 @@ def _source(name: str, key: TableKey, table: Table, one: TileMatrixSet) -> _Sour
     cached = _SOURCES.get((name, key, one.id))
     if cached is not None:
         return cached
-    rows = np.arange(len(table))
-    if one.code == LOCAL:
-        geometry = shapely.force_2d(table.in_crs(rows, ReferenceSystem("", "local")))
-    else:
-        geometry = geodesy.geometries_from_wgs84(one.code, shapely.force_2d(table.in_wgs84(rows)))
+    geometry = _planar(table, one.code)
     types = shapely.get_type_id(geometry)
     kinds = np.where(types >= 0, _KINDS[types], 0)
     with gc_paused():
         properties = encode_properties(_flat(table))
     return _SOURCES.put((name, key, one.id), _Source(geometry, shapely.bounds(geometry), kinds, properties))
+
+
+def _planar(table: Table, code: str) -> NDArray[np.object_]:
+    """Return the geometries in a CRS: all coordinates at once, as each copy of the geometries takes as long."""
+    if code == LOCAL:
+        return shapely.force_2d(table.in_crs(np.arange(len(table)), ReferenceSystem("", "local")))
+    geometry = shapely.force_2d(table.geometry) if shapely.has_z(table.geometry).any() else table.geometry.copy()
+    points, feature = shapely.get_coordinates(geometry, return_index=True)
+    local = table.local[feature]
+    points[local] = local_frame(table.datum).to_wgs84(points[local])
+    return shapely.set_coordinates(geometry, geodesy.between(WGS84, code, points))
 
 
 def _flat(table: Table) -> Iterator[dict[str, Value]]:

@@ -109,14 +109,21 @@ def layer(
     """Write a layer; the bytes of several layers are joined to a tile. rows: of each feature in ``properties``."""
     counts = properties.starts[rows + 1] - properties.starts[rows]
     tags = properties.tags[_spread(properties.starts[rows], counts)]
-    keys, key_index = np.unique(tags[:, 0], return_inverse=True)
-    values, value_index = np.unique(tags[:, 1], return_inverse=True)
+    keys, key_index = _renumbered(tags[:, 0], len(properties.keys))
+    values, value_index = _renumbered(tags[:, 1], len(properties.values))
     features = _features(kind, pieces, np.column_stack([key_index, value_index]).ravel(), 2 * counts)
     parts = [_sized(_NAME, name.encode()), features]
     parts += [properties.keys[index] for index in keys.tolist()]
     parts += [properties.values[index] for index in values.tolist()]
     parts += [_varints(np.array([_EXTENT, extent, _VERSION, VERSION])).tobytes()]
     return _sized(_TILE_LAYER, b"".join(parts))
+
+
+def _renumbered(numbers: Integers, count: int) -> tuple[Integers, Integers]:
+    """Return which of ``count`` numbers occur, ascending, and for each one its index among these."""
+    used = np.zeros(count, bool)
+    used[numbers] = True
+    return np.flatnonzero(used), (np.cumsum(used) - 1)[numbers]
 
 
 def _value(value: Value) -> bytes:
