@@ -124,13 +124,16 @@ def _source(name: str, key: TableKey, table: Table, one: TileMatrixSet) -> _Sour
 
 def _planar(table: Table, code: str) -> NDArray[np.object_]:
     """Return the geometries in a CRS: all coordinates at once, as each copy of the geometries takes as long."""
+    geometry: NDArray[np.object_]
     if code == LOCAL:
-        return shapely.force_2d(table.in_crs(np.arange(len(table)), ReferenceSystem("", "local")))
+        geometry = shapely.force_2d(table.in_crs(np.arange(len(table)), ReferenceSystem("", "local")))
+        return geometry
     geometry = shapely.force_2d(table.geometry) if shapely.has_z(table.geometry).any() else table.geometry.copy()
     points, feature = shapely.get_coordinates(geometry, return_index=True)
     local = table.local[feature]
     points[local] = local_frame(table.datum).to_wgs84(points[local])
-    return shapely.set_coordinates(geometry, geodesy.between(WGS84, code, points))
+    shapely.set_coordinates(geometry, geodesy.between(WGS84, code, points))
+    return geometry
 
 
 def _numbered(table: Table) -> Numbered:

@@ -56,6 +56,11 @@ class Spans:
     lengths: Integers
     texts: Marks
 
+    @classmethod
+    def of(cls, count: int) -> Spans:
+        """Return spans to set."""
+        return cls(np.zeros(count, np.int64), np.zeros(count, np.int64), np.ones(count, bool))
+
     def only(self, chosen: Integers | Marks) -> Spans:
         """Return some of them."""
         return Spans(self.starts[chosen], self.lengths[chosen], self.texts[chosen])
@@ -176,7 +181,7 @@ def number(maps: PackedMaps, added: Sequence[Added], others: Mapping[int, Mappin
     counts = maps.counts + len(added)
     counts[list(others)] = [len(members) for members in others.values()]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    keys, values = (Spans(*np.zeros((2, starts[-1]), np.int64), np.ones(starts[-1], bool)) for _ in range(2))
+    keys, values = (Spans.of(int(starts[-1])) for _ in range(2))
     columns = []
     for step, (rows, key, value) in enumerate(maps.steps):
         columns.append(starts[rows[fast[rows]]] + step)
@@ -192,10 +197,10 @@ def number(maps: PackedMaps, added: Sequence[Added], others: Mapping[int, Mappin
         chosen = index[rows]
         values.put(columns[-1], (begin + np.cumsum(lengths) - lengths)[chosen], lengths[chosen], True)
     for row, members in others.items():
-        for place, (name, value) in enumerate(members.items(), start=int(starts[row])):
-            text = value.encode() if isinstance(value, str) else ormsgpack.packb(value)
+        for place, (name, one) in enumerate(members.items(), start=int(starts[row])):
+            text = one.encode() if isinstance(one, str) else ormsgpack.packb(one)
             keys.put(place, tail.add(name.encode()), len(name.encode()), True)
-            values.put(place, tail.add(text), len(text), isinstance(value, str))
+            values.put(place, tail.add(text), len(text), isinstance(one, str))
     data = b"".join([*tail.parts, bytes(8)])
     (key_tags, first_keys), (value_tags, first) = (_distinct(data, spans, columns) for spans in (keys, values))
     return Numbered(data, keys.only(first_keys), values.only(first), np.column_stack([key_tags, value_tags]), starts)

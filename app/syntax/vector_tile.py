@@ -92,8 +92,7 @@ def _values(data: bytes, spans: Spans) -> tuple[NDArray[np.uint8], Integers]:
     starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     out = np.empty(int(starts[-1]), np.uint8)
     at, lengths = starts[:-1][short], spans.lengths[short]
-    for offset, byte in enumerate((_VALUE, lengths + 2, _STRING, lengths)):
-        out[at + offset] = byte
+    out[at], out[at + 1], out[at + 2], out[at + 3] = _VALUE, lengths + 2, _STRING, lengths
     out[_spread(at + 4, lengths)] = np.frombuffer(data, np.uint8)[_spread(spans.starts[short], lengths)]
     out[_spread(starts[:-1][~short], sizes[~short])] = np.frombuffer(b"".join(written), np.uint8)
     return out, starts
