@@ -23,6 +23,7 @@ from app.model.names import did_you_mean
 from app.ogc import item_pages
 from app.ogc.collections import CollectionPath, unknown_collection_error
 from app.ogc.crs import CRS84, ReferenceSystem, local_uri, parse_crs, reference_systems
+from app.ogc.examples import example_page
 from app.ogc.item_query import ItemQuery, invalid, parse_items_query, select_rows
 from app.ogc.negotiation import GEOJSON, HTML, JSONFG, PAGES, SCHEMA, Representation
 from app.ogc.routing import both, ogc_router
@@ -189,6 +190,9 @@ async def list_items(service: Service, collection: CollectionPath, f: Representa
     Further query parameters are the properties that `/queryables` lists: only features with equal values.
     """
     table = await _table(service, collection)
+    example = example_page(service, table)
+    if example is not None:
+        return example
     systems = reference_systems(service, table.datum)
     pairs = service.request.query_params.multi_items()
     if any(name not in RESERVED for name, _ in pairs):

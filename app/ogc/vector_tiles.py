@@ -18,12 +18,15 @@ from numpy.typing import NDArray
 
 from app.convert.recently_used import RecentlyUsed
 from app.model import geodesy
+from app.model.features import Properties
+from app.model.geodesy import WGS84, local_frame
 from app.model.imagery import LOCAL
 from app.ogc.crs import ReferenceSystem
 from app.ogc.tables import Table, TableKey, VectorLayer
 from app.ogc.tile_matrix_sets import TileMatrixSet
 from app.store.gc_pause import gc_paused
 from app.store.values import Box
+from app.syntax.packed_properties import Numbered, Value, number, read_maps
 from app.syntax.vector_tile import (
     LINE,
     POINT,
@@ -32,7 +35,6 @@ from app.syntax.vector_tile import (
     GeometryType,
     Integers,
     Pieces,
-    Value,
     encode_properties,
     layer,
 )
@@ -112,30 +114,51 @@ def _source(name: str, key: TableKey, table: Table, one: TileMatrixSet) -> _Sour
     cached = _SOURCES.get((name, key, one.id))
     if cached is not None:
         return cached
-    rows = np.arange(len(table))
-    if one.code == LOCAL:
-        geometry = shapely.force_2d(table.in_crs(rows, ReferenceSystem("", "local")))
-    else:
-        geometry = geodesy.geometries_from_wgs84(one.code, shapely.force_2d(table.in_wgs84(rows)))
+    geometry = _planar(table, one.code)
     types = shapely.get_type_id(geometry)
     kinds = np.where(types >= 0, _KINDS[types], 0)
     with gc_paused():
-        properties = encode_properties(_flat(table))
+        properties = encode_properties(_numbered(table))
     return _SOURCES.put((name, key, one.id), _Source(geometry, shapely.bounds(geometry), kinds, properties))
 
 
-def _flat(table: Table) -> Iterator[dict[str, Value]]:
-    """Yield the properties of each feature with its id; nested ones are JSON texts, as tiles have single values."""
-    for item, members in zip(table.ids, table.all_properties(), strict=True):
-        members["id"] = item
-        if _SINGLE.issuperset(map(type, members.values())):
-            yield members
-        else:
-            yield {
-                name: value if type(value) in _SINGLE else orjson.dumps(value).decode()
-                for name, value in members.items()
-                if value is not None
-            }
+def _planar(table: Table, code: str) -> NDArray[np.object_]:
+    """Return the geometries in a CRS: all coordinates at once, as each copy of the geometries takes as long."""
+    geometry: NDArray[np.object_]
+    if code == LOCAL:
+        geometry = shapely.force_2d(table.in_crs(np.arange(len(table)), ReferenceSystem("", "local")))
+        return geometry
+    geometry = shapely.force_2d(table.geometry) if shapely.has_z(table.geometry).any() else table.geometry.copy()
+    points, feature = shapely.get_coordinates(geometry, return_index=True)
+    local = table.local[feature]
+    points[local] = local_frame(table.datum).to_wgs84(points[local])
+    shapely.set_coordinates(geometry, geodesy.between(WGS84, code, points))
+    return geometry
+
+
+def _numbered(table: Table) -> Numbered:
+    """Number the properties of each feature, its place and its id; nested ones become JSON texts."""
+    maps = read_maps(table.packed)
+    starts, keys = zip(*table.parts, strict=True)
+    part = np.searchsorted(starts, np.arange(len(table)), side="right") - 1
+    added = (
+        ("level", [key.level for key in keys], part),
+        ("part", [key.name for key in keys], part),
+        ("id", table.ids, np.arange(len(table))),
+    )
+    other = ~maps.single
+    for name, _, _ in added:
+        other |= maps.with_key(name)
+    rows = np.flatnonzero(other).tolist()
+    return number(maps, added, {row: _flat({**table.properties(row), "id": table.ids[row]}) for row in rows})
+
+
+def _flat(members: Properties) -> dict[str, Value]:
+    return {
+        name: value if type(value) in _SINGLE else orjson.dumps(value).decode()
+        for name, value in members.items()
+        if value is not None
+    }
 
 
 def _content(source: _Source, box: Box) -> Iterator[tuple[GeometryType, Pieces, Integers]]:

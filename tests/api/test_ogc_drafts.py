@@ -66,6 +66,32 @@ def test_draft_lists_empty_collections_and_takes_their_first_feature(api: Api, g
     assert api.get(f"{at}").json()["extent"]["spatial"]["bbox"]
 
 
+OLD, NEW = "Mozilla/5.0 QGIS/34015/Linux", "Mozilla/5.0 QGIS/34400/Linux"
+
+
+@pytest.mark.parametrize(
+    ("collection", "query", "program", "shown"),
+    [
+        ("zones", "?limit=10", OLD, True),
+        ("zones", "?limit=10", NEW, False),
+        ("zones", "?limit=10", "python-httpx/0.28", False),
+        ("zones", "?limit=1000", OLD, False),
+        ("zones", "?limit=10&bbox=0,0,1,1", OLD, False),
+        ("nodes", "?limit=10", OLD, False),
+    ],
+)
+def test_only_old_versions_of_qgis_open_an_empty_collection_by_an_example(
+    api: Api, gis: Gis, collection: str, query: str, program: str, *, shown: bool
+) -> None:
+    page = api.get(f"{gis.at}/collections/{collection}/items{query}", headers={"user-agent": program}).json()
+    examples = [one for one in page["features"] if one["id"] == "example"]
+    assert len(examples) == shown
+    if shown:
+        assert page["numberMatched"] == 0
+        assert examples[0]["geometry"] == {"type": "Polygon", "coordinates": []}
+        assert examples[0]["properties"] == dict.fromkeys(("kind", "name", "level", "part"))
+
+
 def point(x: float, y: float) -> Json:
     return {"type": "Point", "coordinates": [x, y]}
 

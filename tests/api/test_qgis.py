@@ -16,7 +16,7 @@ from PIL import Image
 from app.cli import demo
 from app.cli.client import Client
 from tests import qgis
-from tests.api.conftest import ADMIN, Api, running, settings_for
+from tests.api.conftest import ADMIN, Api, create_farm, running, settings_for
 from tests.api.test_ogc_clients import metres_apart
 
 CONNECT = """
@@ -132,6 +132,25 @@ drawn = {"bend": [bend.x(), bend.y()], "node": [place.x(), place.y()]}
 answer({"problems": problems, "errors": errors, "edges": after, **drawn})
 """
 
+FIRST = """
+layers = listed()
+zones = layers["Zones"]
+kinds = {name: QgsWkbTypes.displayString(layer.wkbType()) for name, layer in layers.items()}
+before = [zones.featureCount(), len(list(zones.getFeatures()))]
+zones.startEditing()
+zone = QgsFeature(zones.fields())
+zone.setAttribute("kind", "keepout")
+zone.setAttribute("name", "pond")
+middle = next(layers["Nodes"].getFeatures()).geometry().asPoint()
+zone.setGeometry(QgsGeometry.fromRect(QgsRectangle(middle.x(), middle.y(), middle.x() + 1e-4, middle.y() + 1e-4)))
+added = zones.addFeature(zone)
+problems = None if zones.commitChanges() else zones.commitErrors()
+again = listed()["Zones"]
+after = [[f["id"], f["kind"], round(f.geometry().area() * 1e8, 3)] for f in again.getFeatures()]
+fields = [field.name() for field in zones.fields()]
+answer({"kinds": kinds, "fields": fields, "before": before, "added": added, "problems": problems, "after": after})
+"""
+
 
 @pytest.fixture(scope="module")
 def orchard(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
@@ -182,3 +201,21 @@ def test_qgis_edits_the_network_through_a_draft(orchard: Api, tmp_path: Path) ->
     # QGIS rounds the positions of new features to 6 decimals of a degree.
     assert metres_apart(np.array([node["geometry"]["coordinates"]]), np.array([result["node"]])) < 0.1
     keep(picture)
+
+
+def test_qgis_draws_the_first_zone_of_a_site_into_a_draft(orchard: Api, tmp_path: Path) -> None:
+    """QGIS 3.40 takes type and fields from features, 3.44 from the schema: both know them without a feature."""
+    farm = create_farm(orchard, "first-zone")
+    result = qgis.run(
+        CONNECT + FIRST, f"{orchard.url}/ogc/{farm}/drafts/mine/", ADMIN, tmp_path / "none.png", folder=tmp_path
+    )
+    assert (result["kinds"]["Zones"], result["kinds"]["Fence"]) == ("Polygon", "Polygon")
+    assert (result["kinds"]["Objects: points"], result["kinds"]["Objects: lines"]) == ("Point", "LineString")
+    assert {"kind", "name", "level", "part"} <= set(result["fields"])
+    assert (result["before"], result["added"], result["problems"]) == ([0, 0], True, None)
+    assert result["after"] == [["pond", "keepout", 1.0]]
+    (draft,) = orchard.get(f"environments/{farm}/drafts").json()
+    commit = f"environments/{farm}/drafts/{draft['id']}/commit"
+    orchard.post(commit, {"message": "pond"}, headers={"if-match": f'"{draft["base"]}"'})
+    (zone,) = orchard.get(f"/ogc/{farm}/collections/zones/items").json()["features"]
+    assert (zone["id"], zone["geometry"]["type"], zone["properties"]["kind"]) == ("pond", "Polygon", "keepout")
