@@ -1,5 +1,5 @@
 /** What a draft and the newest version changed differently, and which of the two wins. */
-import { useState } from "preact/hooks";
+import { useEffect, useRef, useState } from "preact/hooks";
 import { type ApiError, asApiError, online, type Schemas } from "../../api/client";
 import { expired } from "../../session";
 import { Button } from "../../ui/button";
@@ -49,6 +49,8 @@ interface Props {
 
 export function MergeConflicts({ conflicts, head, busy, onChoose }: Props) {
   const [chosen, setChosen] = useState<Prefer | null>(null);
+  const element = useRef<HTMLElement>(null);
+  useEffect(() => element.current?.scrollIntoView({ block: "nearest" }), []);
   const choose = (prefer: Prefer) => {
     setChosen(prefer);
     void onChoose(prefer);
@@ -56,7 +58,7 @@ export function MergeConflicts({ conflicts, head, busy, onChoose }: Props) {
   const isCut = !online.value || expired.value;
   const isStuck = chosen !== null && !busy;
   return (
-    <section class="merge-conflicts" role="alert" aria-label="Conflicts of the merge">
+    <section ref={element} class="merge-conflicts" role="alert" aria-label="Conflicts of the merge">
       <p>
         <b>The draft and v{head} changed the same differently.</b>{" "}
         {isStuck
@@ -67,7 +69,7 @@ export function MergeConflicts({ conflicts, head, busy, onChoose }: Props) {
         {conflicts.slice(0, SHOWN).map((one) => (
           <li key={`${one.layer} ${one.level} ${one.part} ${one.id ?? ""} ${one.fields.join()}`}>
             {LAYER_NAMES[one.layer] ?? sentence(one.layer)} {one.id ?? one.part}: {one.fields.join(", ")}
-            <small>{sentence(one.reason)}</small>
+            {isStuck && <small>{sentence(one.reason)}</small>}
           </li>
         ))}
       </ul>
