@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
@@ -16,6 +18,9 @@ from app.store.values import DRAFT_PREFIX, Draft, Version, Writer
 
 MAX_ATTEMPTS: Final = 20
 """Maximum number of attempts to store an edit without ``If-Match`` while others edit the draft."""
+
+TURNS: Final = 64
+"""Number of locks that the drafts share."""
 
 T = TypeVar("T")
 
@@ -33,6 +38,14 @@ class DraftEditor:
 
     def __init__(self, store: Store, run_in_worker: Callable[..., Any]) -> None:
         self._store, self._run_in_worker = store, run_in_worker
+        self._turns = tuple(threading.RLock() for _ in range(TURNS))
+
+    def turn(self, id: str) -> AbstractContextManager[object]:
+        """Let only this thread edit a draft, else the slowest of several writers finds its edit stale every time.
+
+        Writers of other processes do not wait: what they store meanwhile is still found by compare-and-swap.
+        """
+        return self._turns[hash(id) % TURNS]
 
     def edit(
         self,
@@ -95,13 +108,14 @@ class DraftEditor:
         check_writer(self._store.drafts.get(environment, id), writer)
         attempts = MAX_ATTEMPTS if if_match in (None, "*") else 1
         for attempt in range(attempts):
-            current = self._store.versions.get(environment, DRAFT_PREFIX + id)
-            check_draft_match(if_match, current)
-            try:
-                return once(current)
-            except StaleParent:
-                if attempt == attempts - 1:
-                    raise
+            with self.turn(id):
+                current = self._store.versions.get(environment, DRAFT_PREFIX + id)
+                check_draft_match(if_match, current)
+                try:
+                    return once(current)
+                except StaleParent:
+                    if attempt == attempts - 1:
+                        raise
         raise AssertionError("unreachable")
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
@@ -172,11 +172,7 @@ class Table:
         seen: dict[tuple[str, type], None] = {}  # in the order of their first feature
         for members in self.all_properties():
             seen.update(dict.fromkeys(zip(members, map(type, members.values()), strict=True)))
-        out: dict[str, set[JsonType]] = {}
-        for name, kind in seen:
-            if kind is not type(None) and (name in out or len(out) < MAX_PROPERTIES):
-                out.setdefault(name, set()).add(_JSON_TYPES.get(kind, "object"))
-        return {name: frozenset(types) for name, types in out.items()}
+        return json_types(seen)
 
     @cached_property
     def geometry_types(self) -> frozenset[str]:
@@ -230,6 +226,15 @@ def _converted(geometry: NDArray[np.object_], local: NDArray[np.bool_], frame: L
     if local.any():
         out[local] = frame.geometries_to_wgs84(geometry[local])
     return out
+
+
+def json_types(seen: Iterable[tuple[str, type]]) -> dict[str, frozenset[JsonType]]:
+    """Return the JSON types of properties. seen: names with Python types."""
+    out: dict[str, set[JsonType]] = {}
+    for name, kind in seen:
+        if kind is not type(None) and (name in out or len(out) < MAX_PROPERTIES):
+            out.setdefault(name, set()).add(_JSON_TYPES.get(kind, "object"))
+    return {name: frozenset(types) for name, types in out.items()}
 
 
 # --- from parts to tables ---

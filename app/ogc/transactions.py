@@ -15,6 +15,7 @@ from app.api.http.caching import none_match
 from app.api.http.problems import MalformedBody, UnsupportedMedia
 from app.api.http.schemas import EnvironmentPath, problem_responses
 from app.errors import Invalid, NotFound, Problem, StaleParent
+from app.ingest.drafts import MAX_ATTEMPTS
 from app.ogc.collections import CollectionPath, unknown_collection_error
 from app.ogc.crs import CRS84, parse_crs, reference_systems
 from app.ogc.drafts import DRAFT, draft_service, own_draft
@@ -22,9 +23,10 @@ from app.ogc.extensions import Extension
 from app.ogc.feature_edits import FeatureEditor
 from app.ogc.footprints import raster_parts
 from app.ogc.items import FeaturePath, get_item
+from app.ogc.property_types import property_types
 from app.ogc.routing import LONG, SHORT, ogc_router
 from app.ogc.service import Service
-from app.ogc.vector import TITLES, find_table, tables, vector_tables
+from app.ogc.vector import TITLES, tables, vector_tables
 from app.store.values import DRAFT_PREFIX
 
 PART4: Final = "http://www.opengis.net/spec/ogcapi-features-4/1.0/conf"
@@ -103,21 +105,23 @@ async def _write(
     services, env = service.services, service.environment.name
     draft = await run_in_threadpool(own_draft, services, env, service.draft or "", principal)
     base = await run_in_threadpool(services.store.versions.get, env, draft.base)
-    table = await find_table(replace(service, version=base), collection)
+    types = await property_types(service, base, collection)
     systems = reference_systems(service, service.version.datum)
     crs = parse_crs((content_crs or CRS84).strip().removeprefix("<").removesuffix(">"), systems, "Content-Crs")
 
+    def once() -> None:
+        version = services.store.versions.get(env, DRAFT_PREFIX + draft.id)
+        assert version.pending is not None
+        editor = FeatureEditor(services.store.content, version, collection, types, crs)
+        tag = if_match or f'"{version.pending.tag}"'
+        services.ingest.drafts.edit(env, draft.id, [edit(editor)], principal.as_writer(), tag)
+
     def apply() -> Service:
-        attempts = 1 if if_match is not None else 20
+        attempts = 1 if if_match is not None else MAX_ATTEMPTS
         for attempt in range(attempts):
-            version = services.store.versions.get(env, DRAFT_PREFIX + draft.id)
-            assert version.pending is not None
-            editor = FeatureEditor(
-                services.store.content, version, collection, {} if table is None else table.types, crs
-            )
             try:
-                tag = if_match or f'"{version.pending.tag}"'
-                services.ingest.drafts.edit(env, draft.id, [edit(editor)], principal.as_writer(), tag)
+                with services.ingest.drafts.turn(draft.id):
+                    once()
             except StaleParent:
                 if attempt == attempts - 1:
                     raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from app.errors import Invalid, NotFound
@@ -19,11 +19,13 @@ from app.store.diff import FeatureChanges
 from app.store.gc_pause import gc_paused
 from app.store.parts.features import (
     PackedFeatures,
+    PackedLeaf,
     features_from_items,
     features_in_box,
     find_places,
     items_by_id,
     load_packed,
+    packed_leaves,
 )
 from app.store.parts.roots import PartRoot, read_document, read_root
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
@@ -98,6 +100,11 @@ class ContentReader:
         draft = self._chunks.stage()
         with gc_paused():
             return load_packed(draft, self._root(draft, version, key))
+
+    def packed_leaves(self, version: Version, key: PartKey) -> Iterator[PackedLeaf]:
+        """Read a vector part leaf by leaf, in bounded memory."""
+        draft = self._chunks.stage()
+        return packed_leaves(draft, self._root(draft, version, key))
 
     def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
         """Return the given ids that the part has; none if there is no such part."""

@@ -46,7 +46,8 @@ class References:
             node = root.trees[name]
             leaves = tree.leaves(draft, [node])[0] if node is not None else []
             names_by_leaf = self._names_of(draft, leaves)
-            out.update(leaf_items(draft, [leaf for leaf in leaves if _meets(names_by_leaf[leaf], wanted)], anchor))
+            meeting = _meeting([names_by_leaf[leaf] for leaf in leaves], wanted)
+            out.update(leaf_items(draft, [leaves[k] for k in meeting], anchor))
         return out
 
     def _names_of(self, draft: ChunkStage, leaves: Sequence[bytes]) -> dict[bytes, Names]:
@@ -81,10 +82,11 @@ def _names_in(raw: bytes) -> Names:
     return np.sort(np.fromiter(map(hash, named), np.int64))
 
 
-def _meets(names: Names, wanted: Names) -> bool:
-    """Return whether two sorted arrays have a common value."""
-    few, many = (names, wanted) if len(names) < len(wanted) else (wanted, names)
-    if not len(few):
-        return False
-    places = np.searchsorted(many, few)
-    return bool((many[np.minimum(places, len(many) - 1)] == few).any())
+def _meeting(leaves: Sequence[Names], wanted: Names) -> list[int]:
+    """Return which leaves have a wanted name. wanted: sorted."""
+    if not leaves:
+        return []
+    names = np.concatenate(leaves)
+    places = np.minimum(np.searchsorted(wanted, names), len(wanted) - 1)
+    ends = np.cumsum([len(leaf) for leaf in leaves])
+    return np.unique(np.searchsorted(ends, np.flatnonzero(wanted[places] == names), side="right")).tolist()

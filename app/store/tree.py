@@ -89,6 +89,10 @@ class Inner:
         """All of them."""
         return [self.child(k) for k in range(len(self.keys))]
 
+    def names(self) -> list[tuple[bytes, int]]:
+        """Return hash and level of each child: much faster than ``children``."""
+        return [(name, self.level - 1) for name in self.hashes]
+
 
 def decode_inner(raw: bytes) -> Inner:
     """Decode the canonical bytes of an inner node."""
@@ -288,14 +292,14 @@ def check_leaves(root: Node | None) -> None:
 
 def leaves(draft: ChunkStage, roots: Sequence[Node]) -> list[list[bytes]]:
     """Return the hashes of each tree's leaves, in order; one query for each level of the tallest."""
-    frontier: list[list[Node]] = [[root] for root in roots]
-    while any(node.level for nodes in frontier for node in nodes):
-        draft.read_many([node.hash for nodes in frontier for node in nodes if node.level])
+    frontier = [[(root.hash, root.level)] for root in roots]
+    while any(level for nodes in frontier for _, level in nodes):
+        draft.read_many([name for nodes in frontier for name, level in nodes if level])
         frontier = [
-            [c for node in nodes for c in (draft.inner(node.hash).children() if node.level else (node,))]
+            [child for node in nodes for child in (draft.inner(node[0]).names() if node[1] else (node,))]
             for nodes in frontier
         ]
-    return [[node.hash for node in nodes] for nodes in frontier]
+    return [[name for name, _ in nodes] for nodes in frontier]
 
 
 def select(
@@ -358,13 +362,13 @@ def differing(draft: ChunkStage, a: Node | None, b: Node | None) -> tuple[list[b
 def names(draft: ChunkStage, root: Node | None, existing_names: Container[bytes] = ()) -> set[bytes]:
     """Return the hashes of all nodes of a tree except ``existing_names`` and the nodes below them. Reads no leaves."""
     out: set[bytes] = set()
-    nodes = [root] if root else []
+    nodes = [(root.hash, root.level)] if root else []
     while nodes:
-        nodes = [n for n in nodes if n.hash not in existing_names]
-        out.update(n.hash for n in nodes)
-        inner = [n for n in nodes if n.level]
-        draft.read_many([n.hash for n in inner])
-        nodes = [c for n in inner for c in draft.inner(n.hash).children()]
+        nodes = [node for node in nodes if node[0] not in existing_names]
+        out.update(name for name, _ in nodes)
+        inner = [name for name, level in nodes if level]
+        draft.read_many(inner)
+        nodes = [child for name in inner for child in draft.inner(name).names()]
     return out
 
 

@@ -145,10 +145,21 @@ def test_edit_of_other_content_is_refused_on_request(api: Api, desk: Desk) -> No
     assert "b" not in desk.features()
 
 
-def test_concurrent_edits_are_all_kept(desk: Desk) -> None:
+def test_concurrent_edits_are_all_kept_and_none_is_worked_out_twice(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    editor = desk.api.app.state.services.ingest.drafts
+    run_in_worker, runs = editor._run_in_worker, []
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        runs.append(1)
+        return run_in_worker(*arguments, **options)
+
+    monkeypatch.setattr(editor, "_run_in_worker", counted)
     with ThreadPoolExecutor(4) as threads:
         list(threads.map(lambda k: desk.edit(node(f"n{k}", k, 1)), range(8)))
     assert {f"n{k}" for k in range(8)} <= set(desk.features())
+    assert len(runs) == 8
 
 
 def test_only_the_owner_and_administrators_write_a_draft(api: Api, farm: str) -> None:

@@ -14,7 +14,8 @@ import pyproj
 import pytest
 
 from app.ogc.extensions import extensions
-from app.ogc.tables import TableCache, build_tables
+from app.ogc.property_types import read_types
+from app.ogc.tables import VECTOR_LAYERS, TableCache, build_tables, table_key
 from tests.api import samples
 from tests.api.conftest import ADMIN, Api, problem, running, settings_for
 from tests.api.ogc_sites import SHAPES, TURNED_DATUM, create_turned, local_geojson
@@ -385,6 +386,22 @@ def test_equal_ids_of_two_parts_are_distinct(turned: Api) -> None:
     for feature in items:
         found = turned.get(f"/ogc/{name}/collections/objects-points/items/{feature['id']}").json()
         assert found["properties"] == feature["properties"]
+
+
+def test_types_of_properties_need_no_tables(turned: Api) -> None:
+    store = turned.app.state.services.store
+    version = store.versions.get("turned")
+    layers = [layer for layer in VECTOR_LAYERS if table_key(version, layer) is not None]
+    assert {"topology", "objects"} <= set(layers)
+    for layer in layers:
+        tables = build_tables(store.content, version, layer)
+        stored = {
+            name: {
+                key.removeprefix("stored_"): types for key, types in table.types.items() if key not in ("level", "part")
+            }
+            for name, table in tables.items()
+        }
+        assert read_types(store.content, version, layer) == stored
 
 
 def test_table_cache_drops_the_least_recently_used(turned: Api) -> None:

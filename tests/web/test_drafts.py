@@ -133,3 +133,38 @@ def test_draft_of_a_gis_program_is_edited_further_and_committed(server: WebServe
 def save_in_draft(page: Page) -> None:
     page.get_by_role("button", name="Review", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Save 1 change in the draft").click()
+
+
+def test_conflicts_of_a_merge_offer_a_choice(server: WebServer, open_page: Open) -> None:
+    name = make_network(server, "torn", a=(10, 10), b=(20, 10))
+    site = f"environments/{name}"
+    drafts = [server.call("POST", f"{site}/drafts", 201, json={"name": one}) for one in ("my way", "their way")]
+    for draft in drafts:
+        server.call("POST", f"{site}/drafts/{draft['id']}/edits", 200, json={"changes": [node("a", 11, 11)]})
+    server.call("POST", f"{site}/edits", 201, json={"changes": [node("a", 14, 14)]})
+
+    page = open_page(f"/?site={name}&view=history")
+    row = page.get_by_role("region", name="Drafts").get_by_role("listitem").filter(has_text="my way")
+    row.get_by_role("button", name="Merge with v2").click()
+    conflicts = row.get_by_role("alert", name="Conflicts of the merge")
+    expect(conflicts).to_contain_text("Network a: geometry")
+    assert server.get(f"{site}/drafts/{drafts[0]['id']}")["base"] == 1
+    conflicts.get_by_role("button", name="Keep the draft’s").click()
+    expect(conflicts).to_have_count(0)
+    assert server.get(f"{site}/drafts/{drafts[0]['id']}")["base"] == 2
+    assert position(server, site, drafts[0]["version"]) == [11, 11]
+
+    page.goto(f"{server.address}/?site={name}&view=edit&version={drafts[1]['version']}")
+    expect(page.locator(".map-area")).to_have_attribute("aria-busy", "false")
+    page.get_by_role("button", name="Review", exact=True).click()
+    dialog = page.get_by_role("dialog", name="Review and save")
+    dialog.get_by_role("button", name="Merge with v2").click()
+    dialog.get_by_role("button", name="Keep those of v2").click()
+    expect(dialog.get_by_role("alert")).to_have_count(0)
+    assert server.get(f"{site}/drafts/{drafts[1]['id']}")["base"] == 2
+    assert position(server, site, drafts[1]["version"]) == [14, 14]
+
+
+def position(server: WebServer, site: str, ref: str) -> list[float]:
+    (found,) = server.get(f"{site}/versions/{ref}/layers/topology", ids="a", crs="local")["features"]
+    return [round(value, 3) for value in found["place"]["coordinates"][:2]]

@@ -338,24 +338,39 @@ class PackedFeatures:
     local: NDArray[np.bool_]
 
 
-def load_packed(draft: ChunkStage, root: PartRoot) -> PackedFeatures:
-    """Load a vector part without unpacking its properties."""
-    ids: list[str] = []
-    wkb: list[bytes] = []
-    packed: list[bytes] = []
-    local_count = 0
-    for name in ("local", "wgs84"):
+class PackedLeaf(NamedTuple):
+    """Columns of a leaf of vector items: 0 for local or 1 for wgs84, ids, WKB, packed properties."""
+
+    anchor: int
+    ids: Sequence[str]
+    wkb: Sequence[bytes]
+    properties: Sequence[bytes]
+
+
+def packed_leaves(draft: ChunkStage, root: PartRoot) -> Iterator[PackedLeaf]:
+    """Read the leaves of a vector part, the local ones first."""
+    for anchor, name in enumerate(("local", "wgs84")):
         node = root.trees[name]
         (leaves,) = tree.leaves(draft, [node]) if node is not None else ([],)
         for start in range(0, len(leaves), BATCH):
             some = leaves[start : start + BATCH]
             raws = draft.stream(some)
             for leaf in some:
-                leaf_ids, _, leaf_wkb, leaf_packed = split_leaf(raws[leaf])
-                ids += leaf_ids
-                wkb += leaf_wkb
-                packed += leaf_packed
-        local_count = len(ids) if name == "local" else local_count
+                ids, _, wkb, packed = split_leaf(raws[leaf])
+                yield PackedLeaf(anchor, ids, wkb, packed)
+
+
+def load_packed(draft: ChunkStage, root: PartRoot) -> PackedFeatures:
+    """Load a vector part without unpacking its properties."""
+    ids: list[str] = []
+    wkb: list[bytes] = []
+    packed: list[bytes] = []
+    local_count = 0
+    for leaf in packed_leaves(draft, root):
+        ids += leaf.ids
+        wkb += leaf.wkb
+        packed += leaf.properties
+        local_count = len(ids) if leaf.anchor == 0 else local_count
     order = sorted(range(len(ids)), key=ids.__getitem__)
     local = np.array(order, np.intp) < local_count
     return PackedFeatures([ids[k] for k in order], from_wkb([wkb[k] for k in order]), [packed[k] for k in order], local)

@@ -12,6 +12,7 @@ import { count } from "../../ui/text";
 import { notify } from "../../ui/toast";
 import type { Desk } from "./desk";
 import type { Editor } from "./editor";
+import { MergeConflicts, type Prefer, useMerge } from "../history/merge-conflicts";
 import { changesInWords } from "../history/words";
 import { commitDraft, dryRun, rebaseDraft, save, saveAsDraft } from "./save";
 import { type ChangeRow, cellTitle, summary } from "./words";
@@ -112,7 +113,7 @@ export function Review({ desk }: { desk: Desk }) {
         </p>
       )}
       {draft !== null && (
-        <DraftState editor={editor} busy={busy} onMerge={() => void run(() => rebaseDraft(editor, draft))} />
+        <DraftState editor={editor} busy={busy} run={run} rebase={(prefer) => rebaseDraft(editor, draft, prefer)} />
       )}
       <ChangeList editor={editor} close={close} />
       <Warnings editor={editor} open={isOpen} />
@@ -132,21 +133,32 @@ export function Review({ desk }: { desk: Desk }) {
   );
 }
 
+interface DraftStateProps {
+  editor: Editor;
+  busy: boolean;
+  run: (work: () => Promise<void>) => Promise<void>;
+  rebase: (prefer?: Prefer) => Promise<void>;
+}
+
 /** What the draft holds already, and the version that it must be merged with before it is committed. */
-function DraftState({ editor, busy, onMerge }: { editor: Editor; busy: boolean; onMerge: () => void }) {
+function DraftState({ editor, busy, run, rebase }: DraftStateProps) {
   const saved = savedChanges(editor);
   const { olderBase } = editor.target;
   const head = editor.site.environment.value?.version;
+  const { conflicts, merge } = useMerge(rebase);
   return (
     <>
       <p class="muted">Saved in the draft: {saved.join("; ") || "nothing yet"}.</p>
-      {olderBase !== null && (
+      {olderBase !== null && conflicts.length > 0 && (
+        <MergeConflicts conflicts={conflicts} head={head} busy={busy} onChoose={(prefer) => run(() => merge(prefer))} />
+      )}
+      {olderBase !== null && conflicts.length === 0 && (
         <div class="note" role="status">
           <p class="grow">
             The draft was made from v{olderBase}, and v{head} was saved since. Merge it with v{head} before you commit
             it.
           </p>
-          <Button busy={busy} disabled={!online.value || expired.value} onClick={onMerge}>
+          <Button busy={busy} disabled={!online.value || expired.value} onClick={() => void run(() => merge())}>
             Merge with v{head}
           </Button>
         </div>

@@ -1,5 +1,6 @@
 /** Saving the changes as one version or in a draft; what others saved in the meantime is merged first. */
 import { apiPath, asApiError, request, requestJson, type Schemas, type Version } from "../../api/client";
+import type { Prefer } from "../history/merge-conflicts";
 import { toWire } from "./draft";
 import type { Editor } from "./editor";
 import { summary } from "./words";
@@ -73,8 +74,8 @@ export function commitDraft(editor: Editor, draft: string): Promise<Version> {
 }
 
 /** Puts the server's draft on top of the newest version. Throws ApiError: 409 where both changed the same. */
-export async function rebaseDraft(editor: Editor, draft: string): Promise<void> {
-  await post<ServerDraft>(apiPath(editor.site.path("drafts", draft, "rebase")), {});
+export async function rebaseDraft(editor: Editor, draft: string, prefer?: Prefer): Promise<void> {
+  await post<ServerDraft>(apiPath(editor.site.path("drafts", draft, "rebase")), { prefer });
   await editor.site.refresh();
 }
 

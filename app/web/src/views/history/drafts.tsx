@@ -11,6 +11,7 @@ import { Dialog } from "../../ui/dialog";
 import { Problem } from "../../ui/states";
 import { Time } from "../../ui/text";
 import { attempt, notify } from "../../ui/toast";
+import { MergeConflicts, useMerge } from "./merge-conflicts";
 import { changesInWords } from "./words";
 
 type Draft = Schemas["DraftOut"];
@@ -63,10 +64,10 @@ function Row({ site, draft, drafts, onDelete }: RowProps) {
     go({ version: made.version });
     await site.refresh();
   };
-  const rebase = async () => {
-    const moved = await post<Draft>(site, draft, "rebase", {});
+  const { conflicts, merge } = useMerge(async (prefer) => {
+    const moved = await post<Draft>(site, draft, "rebase", { prefer });
     notify(`${draft.name} builds on v${moved.base} now`);
-  };
+  });
   return (
     <li>
       <div class="grow">
@@ -85,7 +86,7 @@ function Row({ site, draft, drafts, onDelete }: RowProps) {
           </Button>
         )}
         {mayWrite && draft.behind && (
-          <Button icon={GitMerge} busy={busy} disabled={!online.value} onClick={() => void run(rebase)}>
+          <Button icon={GitMerge} busy={busy} disabled={!online.value} onClick={() => void run(() => merge())}>
             Merge with v{draft.head}
           </Button>
         )}
@@ -96,6 +97,14 @@ function Row({ site, draft, drafts, onDelete }: RowProps) {
         )}
         {mayWrite && <Button quiet icon={Trash2} label={`Delete ${draft.name}`} onClick={() => onDelete(draft)} />}
       </div>
+      {draft.behind && conflicts.length > 0 && (
+        <MergeConflicts
+          conflicts={conflicts}
+          head={draft.head}
+          busy={busy}
+          onChoose={(prefer) => run(() => merge(prefer))}
+        />
+      )}
     </li>
   );
 }
