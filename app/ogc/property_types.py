@@ -36,17 +36,17 @@ async def property_types(service: Service, version: Version, collection: str) ->
     tables = None if key is None else CACHE.get(key)
     if tables is not None and collection in tables:
         return tables[collection].types
-    known: Mapping[str, Types] = {}
+    by_collection: Mapping[str, Types] = {}
     if key is not None and tables is None:
         if key not in _cached:
             content, cache = service.services.store.content, service.services.response_cache
             _cached[key] = await cache.join(("types", key), read_types, content, version, layer)
         _cached.move_to_end(key)
-        known = _cached[key]
+        by_collection = _cached[key]
         while len(_cached) > MAX_CACHED:
             _cached.popitem(last=False)
     declared = EMPTY.get(collection)
-    return known.get(collection, {} if declared is None else declared.types)
+    return by_collection.get(collection, {} if declared is None else declared.types)
 
 
 def read_types(content: ContentReader, version: Version, layer: VectorLayer) -> dict[str, Types]:

@@ -143,6 +143,21 @@ async def _check_item(service: Service, collection: str, feature: str, if_match:
     return None if pending is None else f'"{pending.tag}"'
 
 
+async def _write_item(
+    service: Service,
+    principal: Principal,
+    collection: str,
+    feature: str,
+    edit: Edit,
+    content_crs: str | None,
+    if_match: str | None,
+) -> Response:
+    """Apply one edit of a feature that exists."""
+    tag = await _check_item(service, collection, feature, if_match)
+    await _write(service, principal, collection, content_crs, edit, tag)
+    return Response(status_code=204)
+
+
 _BODY: Mapping[str, Any] = {
     "requestBody": {
         "required": True,
@@ -231,9 +246,11 @@ async def replace_item(
 ) -> Response:
     """Replace geometry and properties. Edges move with their nodes; ends of edges are put onto nodes."""
     body = await _body(request)
-    tag = await _check_item(service, collection, feature, if_match)
-    await _write(service, principal, collection, content_crs, lambda e: e.change(feature, body, replaces=True), tag)
-    return Response(status_code=204)
+
+    def edit(editor: FeatureEditor) -> Mapping[str, Any]:
+        return editor.change(feature, body, replaces=True)
+
+    return await _write_item(service, principal, collection, feature, edit, content_crs, if_match)
 
 
 @router.patch(
@@ -258,9 +275,11 @@ async def update_item(
     if unknown or not {"geometry", "properties"} & set(body):
         reason = f"unknown member {unknown[0][:80]!r}" if unknown else "nothing to change"
         raise Invalid(f"{reason}: give 'geometry', 'properties' or both", [Problem(reason, where="body")])
-    tag = await _check_item(service, collection, feature, if_match)
-    await _write(service, principal, collection, content_crs, lambda e: e.change(feature, body, replaces=False), tag)
-    return Response(status_code=204)
+
+    def edit(editor: FeatureEditor) -> Mapping[str, Any]:
+        return editor.change(feature, body, replaces=False)
+
+    return await _write_item(service, principal, collection, feature, edit, content_crs, if_match)
 
 
 @router.delete(
@@ -277,9 +296,7 @@ async def delete_item(
     if_match: IfItemMatch = None,
 ) -> Response:
     """Delete one feature. A node with edges is refused: delete the edges first."""
-    tag = await _check_item(service, collection, feature, if_match)
-    await _write(service, principal, collection, None, lambda e: e.delete(feature), tag)
-    return Response(status_code=204)
+    return await _write_item(service, principal, collection, feature, lambda e: e.delete(feature), None, if_match)
 
 
 # --- methods ---

@@ -72,10 +72,14 @@ def features(draft: ChunkStage, a: PartRoot | None, b: PartRoot | None) -> Featu
         for anchor, name in enumerate(("local", "wgs84")):
             left, right = tree.differing(draft, a.trees[name] if a else None, b.trees[name] if b else None)
             before.update(leaf_items(draft, left, anchor))
-            after.update(leaf_items(draft, right, anchor))
+            for i, item in leaf_items(draft, right, anchor):
+                if before.get(i) == item:
+                    del before[i]  # most items of changed leaves are equal
+                else:
+                    after[i] = item
     return FeatureChanges(
         sorted(after.keys() - before.keys()),
-        sorted(i for i in after.keys() & before.keys() if before[i] != after[i]),
+        sorted(after.keys() & before.keys()),
         sorted(before.keys() - after.keys()),
         before,
         after,

@@ -545,15 +545,16 @@ def _last_node(draft: ChunkStage, root: Node, level: int) -> Node:
 
 def _is_before(draft: ChunkStage, root: Node, level: int, key: bytes) -> Node | None:
     """Return the last node of a level whose last key is before this key."""
+    return _search_before(draft, draft.inner(root.hash), level, key)
 
-    def search(node: Inner) -> Node | None:
-        k = bisect_left(node.keys, key)
-        if node.level == level + 1:
-            return node.child(k - 1) if k else None
-        if k < len(node.keys):
-            last_node = search(draft.inner(node.hashes[k]))
-            if last_node:
-                return last_node
-        return _last_node(draft, node.child(k - 1), level) if k else None
 
-    return search(draft.inner(root.hash))
+def _search_before(draft: ChunkStage, node: Inner, level: int, key: bytes) -> Node | None:
+    # no nested function: one that calls itself would keep the stage until the cyclic garbage collector runs
+    k = bisect_left(node.keys, key)
+    if node.level == level + 1:
+        return node.child(k - 1) if k else None
+    if k < len(node.keys):
+        last_node = _search_before(draft, draft.inner(node.hashes[k]), level, key)
+        if last_node:
+            return last_node
+    return _last_node(draft, node.child(k - 1), level) if k else None

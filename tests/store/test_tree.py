@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -129,3 +131,19 @@ def test_nodes_without_a_boundary_are_cut_on_fewer_bits():
     ends = tree.cut(hashes[(hashes & 63) != 0], 6)
     sizes = np.diff([0, *ends])
     assert sizes.max() <= 256
+
+
+def test_edit_leaves_no_cycle_that_keeps_what_it_read():
+    codec, stage = Numbers(4), tree.ChunkStage(Memory())
+    root = tree.edit(stage, codec, None, {b"%06d" % k: k for k in range(2_000)}, ())
+    assert root is not None
+    assert root.level > 1
+    gc.collect()
+    gc.disable()  # as while layers are loaded: objects of cycles then pile up
+    try:
+        tree.edit(stage, codec, root, {b"010000x": 1}, {b"000007"})
+        reference = weakref.ref(stage)
+        del stage
+        assert reference() is None
+    finally:
+        gc.enable()
