@@ -341,6 +341,11 @@ def test_pages_escape_what_they_show_and_run_nothing(turned: Api) -> None:
         assert "<script" not in page.text
         assert page.headers["content-security-policy"].startswith("default-src 'none'; style-src 'sha256-")
         assert "style=" not in page.text
+    for path in (f"{base}/", f"{base}/collections/objects-points"):
+        page = turned.get(path, params={"f": "html"})
+        picture = page.text.partition('<img src="')[2].partition('"')[0].replace("&amp;", "&")
+        assert "img-src 'self'" in page.headers["content-security-policy"]
+        assert turned.http.get(picture).headers["content-type"] == "image/png"
     links = [part.partition('"')[0] for part in turned.get(items, params={"f": "html"}).text.split('href="')[1:]]
     targets = [one.replace("&amp;", "&") for one in links if "/items/" in one]
     assert len(targets) == 2
