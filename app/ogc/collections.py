@@ -13,7 +13,7 @@ from app.model.names import did_you_mean
 from app.ogc.crs import CRS84
 from app.ogc.extensions import Collection, all_collections, extensions
 from app.ogc.negotiation import HTML, JSON, PAGES, Representation
-from app.ogc.pages import add, anchor, link_list, page, representations, respond_page, table
+from app.ogc.pages import add, anchor, draw_map_picture, link_list, page, representations, respond_page, table, url_list
 from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcCollectionOut, OgcCollectionsOut
 from app.ogc.service import Link, Service, link
@@ -79,7 +79,8 @@ async def list_collections(service: Service, f: Representation = None) -> Respon
         (anchor(one.title, service.url("collections", one.id, f="html")), one.id, one.description)
         for one in collections
     ]
-    table(body, ("title", "id", "content"), rows)
+    if rows:
+        table(body, ("title", "id", "content"), rows)
     representations(body, links)
     return respond_page(service, root)
 
@@ -125,11 +126,11 @@ async def get_collection(
     add(body, "p", entry.description)
     if entry.bbox is not None:
         add(body, "p", "West, south, east, north: " + ", ".join(f"{value:.7f}°" for value in entry.bbox))
+        if entry.bbox[0] <= entry.bbox[2]:
+            draw_map_picture(body, service, "collections", entry.id)
     link_list(body, links)
     if "crs" in entry.members:
         add(body, "h2", "Coordinate reference systems")
-        items = add(body, "ul")
-        for uri in described["crs"]:
-            add(items, "li", uri)
+        url_list(body, described["crs"])
     representations(body, links)
     return respond_page(service, root)

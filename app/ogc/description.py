@@ -12,7 +12,7 @@ from app.api.http.problems import MEDIA_TYPE
 from app.api.http.responses import json_bytes
 from app.ogc.extensions import extensions
 from app.ogc.negotiation import HTML, JSON, OPENAPI, Representation
-from app.ogc.pages import add, page, respond_page, table
+from app.ogc.pages import add, anchor, page, respond_page, table
 from app.ogc.routing import both, ogc_router
 from app.ogc.service import Service
 
@@ -182,7 +182,8 @@ async def _page(service: Service) -> Response:
     for path, item in document["paths"].items():
         get = item["get"]
         names = [parameter.get("name") or parameter["$ref"].rpartition("/")[2] for parameter in get["parameters"]]
-        rows.append((path, get["summary"], ", ".join(names)))
+        cell = path if "{" in path else anchor(path, service.address + path)
+        rows.append((cell, get["summary"], ", ".join(names)))
     table(body, ("address", "content", "parameters"), rows)
     add(body, "h2", "Parameters")
     table(body, ("name", "meaning"), [(name, item["description"]) for name, item in PARAMETERS.items()])

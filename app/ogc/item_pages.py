@@ -12,7 +12,7 @@ import orjson
 import shapely
 from numpy.typing import NDArray
 
-from app.ogc.pages import add, anchor, page, representations, respond_page, table
+from app.ogc.pages import add, anchor, linked, page, representations, respond_page, table
 from app.ogc.service import Link, Service
 from app.ogc.tables import Table
 from app.ogc.vector import title_of
@@ -41,6 +41,11 @@ def _text(value: object, length: int = MAX_CELL) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
+def _cell(value: object, length: int = MAX_CELL) -> Element | str:
+    text = _text(value, length)
+    return linked(text) if text == value else text
+
+
 def items_page(
     service: Service, collection: str, source: Table, rows: NDArray[np.intp], matched: int, links: Sequence[Link]
 ) -> Element:
@@ -54,7 +59,7 @@ def items_page(
     lines = [
         (
             anchor(source.ids[row], service.url("collections", collection, "items", source.ids[row], f="html")),
-            *(_text(one.get(name)) for name in names),
+            *(_cell(one.get(name)) for name in names),
         )
         for row, one in zip(shown, loaded, strict=True)
     ]
@@ -72,7 +77,7 @@ def item_page(service: Service, collection: str, source: Table, row: int, links:
     """Build the page of a feature."""
     root, body = page(source.ids[row], _trail(service, collection))
     draw_map(body, source.in_wgs84(np.array([row])))
-    table(body, ("property", "value"), [(name, _text(value, 20_000)) for name, value in source.properties(row).items()])
+    table(body, ("property", "value"), [(name, _cell(value, 20_000)) for name, value in source.properties(row).items()])
     representations(body, links)
     return root
 

@@ -19,6 +19,7 @@ from starlette.responses import Response
 from app.api.http.features import CONFORMS, geometries_as_geojson, page_of
 from app.api.http.schemas import component_schemas
 from app.errors import NotFound
+from app.model.frame import Datum
 from app.model.names import did_you_mean
 from app.ogc import item_pages
 from app.ogc.collections import CollectionPath, unknown_collection_error
@@ -104,12 +105,14 @@ def _finite(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
     return geometry
 
 
-def _fg_members(output: Output, collection: str) -> dict[str, Any]:
-    """Return the members that JSON-FG adds to a document."""
+def _fg_members(output: Output, collection: str, datum: Datum) -> dict[str, Any]:
+    """Return the members that JSON-FG adds to a document; the datum says what the local frame is."""
     if output.used != "jsonfg":
         return {}
     reference = {} if output.place is None else {"coordRefSys": output.place.uri}
-    return {"conformsTo": CONFORMS, "featureType": collection, **reference}
+    local = output.place is not None and output.place.kind == "local"
+    origin = {"datum": datum.as_dict()} if local else {}
+    return {"conformsTo": CONFORMS, "featureType": collection, **reference, **origin}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +148,7 @@ def _page_links(service: Service, collection: str, output: Output, cursor: str |
 def _write_page(table: Table, page: ItemsPage, output: Output, collection: str, links: list[Link]) -> bytes:
     texts = feature_texts(table, page.rows, output, collection)
     members = {
-        **_fg_members(output, collection),
+        **_fg_members(output, collection, table.datum),
         "numberMatched": page.matched,
         "numberReturned": len(texts),
         "timeStamp": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -266,7 +269,7 @@ async def get_item(
     if output.used == "html":
         return item_pages.respond_page(service, item_pages.item_page(service, collection, table, row, links))
     (text,) = await run_in_threadpool(feature_texts, table, rows, output, collection)
-    members = {**_fg_members(output, collection), "links": links}
+    members = {**_fg_members(output, collection, table.datum), "links": links}
     if output.used == "jsonfg":
         members.pop("featureType")  # it is a member of the feature itself
     body = text[:-1] + b"," + orjson.dumps(members)[1:]

@@ -5,11 +5,12 @@ from __future__ import annotations
 from starlette.responses import Response
 
 from app.api.http.schemas import component_schemas
+from app.ogc.collections import notice
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.extensions import Extension, extensions
 from app.ogc.extent import site_box
 from app.ogc.negotiation import HTML, JSON, OPENAPI, PAGES, Representation
-from app.ogc.pages import add, link_list, page, representations, respond_page
+from app.ogc.pages import add, draw_map_picture, link_list, page, representations, respond_page, url_list
 from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcConformanceOut, OgcLandingOut
 from app.ogc.service import Link, Service, link
@@ -71,6 +72,11 @@ async def get_landing_page(service: Service, f: Representation = None) -> Respon
     add(body, "p", service.description, class_="soft")
     if credits_:
         add(body, "p", credits_, class_="soft")
+    missing = notice(service)
+    if missing is not None:
+        add(body, "p", missing)
+    if box is not None and box[0] <= box[2]:
+        draw_map_picture(body, service)
     line = add(body, "p", "In QGIS: add an OGC API - Features connection with the address ")
     add(line, "code", service.landing_url).tail = ". If it asks for a password, give your token; any user name will do."
     link_list(body, links)
@@ -92,9 +98,7 @@ async def get_conformance(service: Service, f: Representation = None) -> Respons
     if used == "json":
         return service.respond_json({"conformsTo": classes})
     root, body = page("Conformance classes", [(service.title, service.landing_url)])
-    items = add(body, "ul")
-    for uri in classes:
-        add(items, "li", uri)
+    url_list(body, classes)
     representations(body, service.alternates(service.url("conformance"), PAGES, used))
     return respond_page(service, root)
 

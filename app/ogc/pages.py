@@ -25,7 +25,8 @@ h1 { font-size: 1.5rem; margin: .5rem 0; }
 nav, .soft, caption { color: var(--soft); text-align: left; }
 table { border-collapse: collapse; display: block; overflow-x: auto; }
 th, td { border: 1px solid var(--line); padding: .25rem .5rem; text-align: left; vertical-align: top;
-  font-variant-numeric: tabular-nums; max-width: 24rem; }
+  font-variant-numeric: tabular-nums; max-width: 24rem; overflow-wrap: break-word; }
+img { display: block; max-width: 100%; max-height: 26rem; border: 1px solid var(--line); margin: .5rem 0; }
 pre { overflow-x: auto; border: 1px solid var(--line); padding: .5rem; white-space: pre-wrap; }
 svg { width: 100%; max-height: 26rem; border: 1px solid var(--line); margin: .5rem 0; }
 svg path { fill: none; stroke: var(--accent); stroke-width: 1.5; vector-effect: non-scaling-stroke; }
@@ -34,11 +35,14 @@ svg path.point { stroke-width: 6; stroke-linecap: round; }
 """
 
 _HASH = base64.b64encode(hashlib.sha256(STYLE.encode()).digest()).decode()
-POLICY = f"default-src 'none'; style-src 'sha256-{_HASH}'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+POLICY = (
+    f"default-src 'none'; style-src 'sha256-{_HASH}'; img-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
 
 
 def page_headers() -> dict[str, str]:
-    """Return the headers of a page: it runs no script and loads nothing."""
+    """Return the headers of a page: it runs no script and loads nothing but maps of this server."""
     return {**HEADERS, "content-security-policy": POLICY}
 
 
@@ -59,8 +63,10 @@ def page(title: str, trail: Iterable[tuple[str, str]] = ()) -> tuple[Element, El
     add(head, "style", STYLE)
     body = add(root, "body")
     nav = add(body, "nav")
-    for text, href in trail:
-        add(nav, "a", text, href=href).tail = " / "
+    for number, (text, href) in enumerate(trail):
+        if number:
+            nav[-1].tail = " / "
+        add(nav, "a", text, href=href)
     add(body, "h1", title)
     return root, body
 
@@ -116,6 +122,24 @@ def anchor(text: str, href: str) -> Element:
     element = Element("a", {"href": href})
     element.text = text
     return element
+
+
+def draw_map_picture(parent: Element, service: Service, *collection: str) -> None:
+    """Show a map of the service or of one of its collections. collection: parts of its path."""
+    url = service.url(*collection, "map", width="640")
+    add(add(parent, "a", href=service.url(*collection, "map")), "img", src=url, alt="Map")
+
+
+def linked(text: str) -> Element | str:
+    """Return a cell or item: a link if the text is a web address."""
+    return anchor(text, text) if text.startswith(("http://", "https://")) and " " not in text else text
+
+
+def url_list(parent: Element, urls: Iterable[str]) -> None:
+    """List web addresses."""
+    items = add(parent, "ul")
+    for url in urls:
+        add(items, "li").append(anchor(url, url))
 
 
 def error_page(problem: Mapping[str, Any]) -> bytes:

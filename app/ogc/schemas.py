@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import SkipJsonSchema
 
 from app.api.http.features import GeometryOut, omittable
+from app.api.http.schemas import DatumOut
 
 
 class OgcLinkOut(BaseModel):
@@ -87,6 +88,7 @@ class OgcFeatureOut(BaseModel):
     geometry: GeometryOut | None
     properties: dict[str, Any]
     links: list[OgcLinkOut] | SkipJsonSchema[None] = omittable("Only of a single feature.")
+    datum: DatumOut | SkipJsonSchema[None] = omittable("Only of a single feature as JSON-FG in local metres.")
 
 
 class OgcFeaturesOut(BaseModel):
@@ -96,6 +98,7 @@ class OgcFeaturesOut(BaseModel):
 
     type: Literal["FeatureCollection"]
     features: list[OgcFeatureOut]
+    datum: DatumOut | SkipJsonSchema[None] = omittable("Origin of the local frame, of JSON-FG in local metres only.")
     links: list[OgcLinkOut]
     time_stamp: str = Field(alias="timeStamp", description="Time of the response, RFC 3339 in UTC.")
     number_matched: int = Field(alias="numberMatched", description="Number of features on all pages.")

@@ -66,7 +66,10 @@ class Service:
     @property
     def description(self) -> str:
         """Describe the version in a sentence."""
-        return f"{self.environment.name}, version {self.version.ref} ({self.ref})"
+        state = f"version {self.version.ref} ({self.ref})"
+        if self.draft is not None:
+            state = f"draft {self.draft}" + (" without changes" if self.ref == LATEST else "")
+        return f"{self.environment.name}, {state}"
 
     def url(self, *parts: str, pairs: Sequence[tuple[str, str]] = (), **query: str) -> str:
         """Build the absolute URL of a resource of the service; each part is quoted completely."""

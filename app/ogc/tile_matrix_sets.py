@@ -281,7 +281,7 @@ async def get_tile_matrix_set(
     root, body = page(one.title, trail)
     add(body, "p", f"CRS: {one.crs(service)}")
     rows = [
-        (m["id"], m["matrixWidth"], m["cellSize"], m["scaleDenominator"])
+        (m["id"], m["matrixWidth"], f"{m['cellSize']:.7g}", f"{m['scaleDenominator']:.7g}")
         for m in definition(service, one)["tileMatrices"]
     ]
     table(body, ("level", "rows and columns", "metres per pixel", "scale 1:"), rows)

@@ -24,7 +24,7 @@ from app.ogc.extensions import Collection, Extension, all_collections
 from app.ogc.extent import site_box
 from app.ogc.footprints import raster_parts
 from app.ogc.negotiation import HTML, JSON, PAGES, Representation
-from app.ogc.pages import add, anchor, link_list, page, representations, respond_page, table
+from app.ogc.pages import add, anchor, link_list, linked, page, representations, respond_page, table
 from app.ogc.rasters import check_collection, content_of
 from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcLinkOut
@@ -186,7 +186,7 @@ async def _tilesets(service: Service, kind: Kind, collection: str | None) -> Res
         return service.respond_json({"tilesets": items, "links": links})
     root, body = page(f"{WORDS[kind]} of {title}", [(service.title, service.landing_url)])
     rows = [
-        (anchor(one.title, tileset_url(service, kind, collection, one.id) + "?f=html"), one.crs(service))
+        (anchor(one.title, tileset_url(service, kind, collection, one.id) + "?f=html"), linked(one.crs(service)))
         for one in sets
     ]
     table(body, ("tile matrix set", "CRS"), rows)

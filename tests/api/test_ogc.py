@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyproj
 import pytest
+import shapely
 
 from app.ogc.extensions import extensions
 from app.ogc.property_types import read_types
@@ -342,6 +343,11 @@ def test_pages_escape_what_they_show_and_run_nothing(turned: Api) -> None:
         assert "<script" not in page.text
         assert page.headers["content-security-policy"].startswith("default-src 'none'; style-src 'sha256-")
         assert "style=" not in page.text
+    for path in (f"{base}/", f"{base}/collections/objects-points"):
+        page = turned.get(path, params={"f": "html"})
+        picture = page.text.partition('<img src="')[2].partition('"')[0].replace("&amp;", "&")
+        assert "img-src 'self'" in page.headers["content-security-policy"]
+        assert turned.http.get(picture).headers["content-type"] == "image/png"
     links = [part.partition('"')[0] for part in turned.get(items, params={"f": "html"}).text.split('href="')[1:]]
     targets = [one.replace("&amp;", "&") for one in links if "/items/" in one]
     assert len(targets) == 2
@@ -416,3 +422,55 @@ def test_table_cache_drops_the_least_recently_used(turned: Api) -> None:
     assert cache.get(keys[0]) is tables
     cache.put(keys[2], tables)
     assert [cache.get(key) is tables for key in keys] == [True, False, True]
+
+
+# --- JSON-FG read back ---
+
+
+def _stored(api: Api, env: str) -> dict[str, Any]:
+    """Return the objects' geometries of a site in local metres, by id."""
+    document = api.get(f"environments/{env}/versions/latest/layers/objects", params={"crs": "local"})
+    return {one["id"]: one["place"] for one in document.json()["features"]}
+
+
+def _largest_distance(a: dict[str, Any], b: dict[str, Any]) -> float:
+    shapes = [[shapely.from_geojson(json.dumps(one)) for one in (left[name] for name in SHAPES)] for left in (a, b)]
+    return max(float(shapely.hausdorff_distance(p, q)) for p, q in zip(*shapes, strict=True))
+
+
+@pytest.mark.parametrize("crs", [None, "http://www.opengis.net/def/crs/EPSG/0/3857"])
+@pytest.mark.parametrize("heading", [30.0, 0.0])
+def test_json_fg_is_read_back_to_a_millimetre(turned: Api, crs: str | None, heading: float) -> None:
+    original = _stored(turned, "turned")
+    name = f"back-{int(heading)}-{'epsg' if crs else 'frame'}"
+    turned.post("environments", {"name": name, "datum": {**TURNED_DATUM, "heading": heading}})
+    features: list[Any] = []
+    for collection in ("objects-points", "objects-lines", "objects-polygons"):
+        params = {"f": "jsonfg", **({} if crs is None else {"crs": crs})}
+        document = turned.get(ITEMS.format(collection), params=params).json()
+        features += document["features"]
+        assert ("datum" in document) == (crs is None)
+    body = json.dumps({**document, "features": features}).encode()
+    turned.upload(name, {"back.geojson": body}, format="geojson", layer="objects")
+    back = turned.get(f"environments/{name}/versions/latest/layers/objects").json()["features"]
+    assert {one["id"] for one in back} == set(SHAPES)
+    if heading == TURNED_DATUM["heading"]:
+        assert _largest_distance(original, _stored(turned, name)) < 1e-3
+    else:  # metres of another frame are not metres here: positions on earth are the same
+        assert _largest_distance(original, _stored(turned, name)) > 1.0
+        earth = {one["id"]: one["geometry"] for one in features}
+        assert _largest_distance(earth, {one["id"]: one["geometry"] for one in back}) < 1e-8
+
+
+def test_json_fg_of_another_frame_needs_a_geometry(turned: Api) -> None:
+    document = turned.get(ITEMS.format("objects-points"), params={"f": "jsonfg"}).json()
+    turned.post("environments", {"name": "elsewhere", "datum": {"latitude": 10.0, "longitude": 20.0}})
+    for feature in document["features"]:
+        feature["geometry"] = None
+    body = json.dumps(document).encode()
+    answer = turned.upload("elsewhere", {"back.geojson": body}, None, format="geojson", layer="objects")
+    assert answer.status_code in (400, 422)
+    assert "CRS84" in answer.text
+    turned.post("environments", {"name": "unplaced"})
+    turned.upload("unplaced", {"back.geojson": body}, format="geojson", layer="objects")
+    assert turned.get("environments/unplaced").json()["datum"] == document["datum"]

@@ -14,7 +14,8 @@ returns them, is a topology.
 **Metres and degrees are kept apart.** An item anchored in metres has them in ``place``, and the collection's
 ``coordRefSys`` names a local engineering frame (x east, y north, z up); ``geometry`` is its position on earth if the
 environment has a datum, else null. ``fleet_map`` contains the datum, the levels and the parts' documents. A collection
-in another coordinate system is rejected: RFC 7946 allows degrees only.
+in the local frame of our OGC API or API, with its ``datum``, is read in metres if the environment has an equal datum or
+none; else ``geometry`` is read. A collection in another coordinate system is rejected: RFC 7946 allows degrees only.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ import orjson
 import shapely
 from numpy.typing import NDArray
 
-from app.errors import Problem, TooLarge, UnreadableFile
+from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, ReadContext
 from app.formats.geojson.geometry import parse_geometries
-from app.formats.geojson.words import FAMILY, GEOMETRIES, LOCAL_2D, OWN_MEMBER
+from app.formats.geojson.words import FAMILY, GEOMETRIES, LOCAL_2D, OWN_FRAME, OWN_MEMBER
 from app.model.features import MAX_ID, Features, Properties, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
 from app.model.layers import NETWORK, VECTOR_LAYERS, Layer, Layers, Part, PartKey
@@ -74,7 +74,9 @@ class _Reader:
         self.marks = [_has_own_members(row.get("properties")) for row in self.rows]
         if len(self.rows) > context.limits.features:
             raise TooLarge(f"{context.main} has {len(self.rows)} features; the limit is {context.limits.features}")
-        self.local = self._is_local(top.get("coordRefSys"))
+        reference = top.get("coordRefSys")
+        self.local = self._is_local(reference)
+        self.in_own_frame = self.local and isinstance(reference, str) and OWN_FRAME.fullmatch(reference) is not None
         self._check_crs(top.get("crs"), None)
 
     def _rows(self) -> list[dict[str, Any]]:
@@ -106,7 +108,29 @@ class _Reader:
         """Whether ``coordRefSys`` names a local engineering frame."""
         if isinstance(reference, dict):
             reference = reference.get("href")
-        return isinstance(reference, str) and reference.rstrip("/").rpartition("/")[2] in _METRES
+        if not isinstance(reference, str):
+            return False
+        return reference.rstrip("/").rpartition("/")[2] in _METRES or self._is_frame_here(reference)
+
+    def _is_frame_here(self, reference: str) -> bool:
+        """Whether this names the frame of an environment whose datum is ours; a new environment takes it over."""
+        if OWN_FRAME.fullmatch(reference) is None:
+            return False
+        datum = self._datum_member()
+        frame = self.context.frame
+        if frame is None:
+            return "datum" in self.top
+        return frame.datum == datum
+
+    def _datum_member(self) -> Datum | None:
+        """Return the datum beside ``coordRefSys``, as our APIs write it. Raises UnreadableFile for a malformed one."""
+        datum = self.top.get("datum")
+        if datum is None:
+            return None
+        try:
+            return Datum(**datum)
+        except (TypeError, ValueError, Invalid) as error:
+            _raise_unreadable(f"datum: {error}: give latitude, longitude, altitude and heading", 1, "datum")
 
     def _check_crs(self, crs: Any, location: str | None) -> None:
         """Check ``crs`` of the 2008 specification: WGS 84 in longitude, latitude, or absent."""
@@ -191,7 +215,7 @@ class _Reader:
         levels = extension.get("levels")
         return Layers(
             parts,
-            Datum(**datum) if isinstance(datum, dict) else None,
+            Datum(**datum) if isinstance(datum, dict) else self._datum_member() if self.in_own_frame else None,
             tuple(Level(**v) for v in levels) if isinstance(levels, list) else (Level(),),
         )
 
@@ -240,6 +264,9 @@ class _Reader:
             crs = place.get("coordRefSys", row.get("coordRefSys"))
             if self.local if crs is None else self._is_local(crs):
                 return True, place
+            if row.get("geometry") is None and OWN_FRAME.fullmatch(str(crs or self.top.get("coordRefSys"))):
+                reason = "place is in the local frame of an environment with another datum, and geometry is null: "
+                _raise_unreadable(reason + "export the features in CRS84", self.line(k), self.name(k))
             if row.get("geometry") is None:
                 self.context.warn(
                     "place is in an unsupported coordinate system; the feature is stored without a geometry",
@@ -311,6 +338,8 @@ class _Reader:
             # Written from the canonical coordinates instead.
             del members["place"]
             members.pop("coordRefSys", None)
+            if self.in_own_frame:
+                members.pop("datum", None)
         if self.root != "FeatureCollection":
             members = {k: v for k, v in members.items() if k != OWN_MEMBER}
         if members:
@@ -328,6 +357,8 @@ class _Reader:
         if self.top.get("coordRefSys") is not None and self.local:
             members.pop("coordRefSys", None)
             members.pop("conformsTo", None)
+            if self.in_own_frame:
+                members.pop("datum", None)
         if members:
             document["members"] = members
         texts = [self.top[k] for k in ("attribution", "license", "copyright") if isinstance(self.top.get(k), str)]
