@@ -24,6 +24,7 @@ from app.store.parts.features import (
     find_places,
     items_by_id,
     load_packed,
+    packed_from_items,
 )
 from app.store.parts.roots import PartRoot, read_document, read_root
 from app.store.prepare import differing_keys, frame_changes, part_names, read_roots
@@ -86,6 +87,12 @@ class ContentReader:
                 selected_ids = set(ids)
                 items = {i: item for i, item in items.items() if i in selected_ids}
         return features_from_items(items, read_document(draft, root))
+
+    def packed_in_box(self, version: Version, key: PartKey, bbox: Box) -> PackedFeatures:
+        """Read the features of a vector part in a box in degrees by id, with packed properties."""
+        draft = self._chunks.stage()
+        frame = None if version.datum is None else local_frame(version.datum)
+        return packed_from_items(features_in_box(draft, self._root(draft, version, key), bbox, "wgs84", frame))
 
     def referring(self, version: Version, key: PartKey, names: Collection[str]) -> Features:
         """Read the features that name one of these as ``source``, ``target`` or ``drawn_from``, and some others."""

@@ -338,6 +338,14 @@ class PackedFeatures:
     local: NDArray[np.bool_]
 
 
+def packed_from_items(items: Mapping[str, Item]) -> PackedFeatures:
+    """Convert stored items into columns, in the order of their ids."""
+    ids = sorted(items)
+    rows = [items[i] for i in ids]
+    local = np.array([row.anchor == 0 for row in rows], bool)
+    return PackedFeatures(ids, from_wkb([row.wkb for row in rows]), [row.packed for row in rows], local)
+
+
 def load_packed(draft: ChunkStage, root: PartRoot) -> PackedFeatures:
     """Load a vector part without unpacking its properties."""
     ids: list[str] = []
