@@ -25,13 +25,13 @@ from app.ogc import item_pages
 from app.ogc.collections import CollectionPath, unknown_collection_error
 from app.ogc.crs import CRS84, ReferenceSystem, local_uri, parse_crs, reference_systems
 from app.ogc.examples import example_page
-from app.ogc.item_query import ItemQuery, invalid, parse_items_query, select_rows
+from app.ogc.item_query import ItemQuery, invalid, parse_bbox, parse_items_query, select_rows
 from app.ogc.negotiation import GEOJSON, HTML, JSONFG, PAGES, SCHEMA, Representation
 from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcFeatureOut, OgcFeaturesOut
 from app.ogc.service import Link, Service, link
 from app.ogc.tables import Table
-from app.ogc.vector import RESERVED, find_item_table, find_table, queryables, tables, title_of
+from app.ogc.vector import RESERVED, TITLES, find_box_table, find_item_table, find_table, queryables, tables, title_of
 
 ITEMS = {"json": GEOJSON, "jsonfg": JSONFG, "html": HTML}
 
@@ -71,6 +71,17 @@ async def _table(service: Service, collection: str) -> Table:
     if table is None:
         raise unknown_collection_error(service, collection, list(await tables(service)))
     return table
+
+
+async def _box_table(service: Service, collection: str) -> Table | None:
+    """Return a table of the box that is asked for, if there is one and it is enough. Raises Invalid."""
+    given, datum = service.request.query_params, service.version.datum
+    if datum is None or "bbox" not in given or collection not in TITLES or not RESERVED.issuperset(given):
+        return None
+    systems = reference_systems(service, datum)
+    crs = parse_crs(given.get("bbox-crs", CRS84), systems, "bbox-crs")
+    box, _ = parse_bbox(given["bbox"], crs)
+    return await find_box_table(service, collection, crs.box_in_wgs84(box, datum, "bbox"))
 
 
 # --- features as text ---
@@ -192,7 +203,7 @@ async def list_items(service: Service, collection: CollectionPath, f: Representa
 
     Further query parameters are the properties that `/queryables` lists: only features with equal values.
     """
-    table = await _table(service, collection)
+    table = await _box_table(service, collection) or await _table(service, collection)
     example = example_page(service, table)
     if example is not None:
         return example

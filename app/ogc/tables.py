@@ -356,6 +356,22 @@ def build_item_table(
     return None
 
 
+def build_box_table(content: ContentReader, version: Version, layer: VectorLayer, name: str, box: Box) -> Table | None:
+    """Build the table of what a collection has in a box in degrees; None if it has nothing there.
+
+    The layer must have one part with content: of several, ids may need to be qualified.
+    """
+    assert version.datum is not None
+    (key,) = [entry.key for entry in version.parts if entry.key.layer == layer and entry.count]
+    part = content.packed_in_box(version, key, box)
+    rows = np.flatnonzero(_collections_of(layer, part) == name)
+    if not len(rows):
+        return None
+    columns = _Columns()
+    columns.add_part(key, part, rows)
+    return columns.table(version.datum)
+
+
 # --- cache ---
 
 TableKey = tuple[Datum, tuple[tuple[PartKey, str], ...]]

@@ -7,6 +7,7 @@ from typing import Final
 
 from starlette.concurrency import run_in_threadpool
 
+from app.convert.recently_used import RecentlyUsed
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension
@@ -20,11 +21,13 @@ from app.ogc.tables import (
     JsonType,
     Table,
     VectorLayer,
+    build_box_table,
     build_item_table,
     build_tables,
     empty_table,
     table_key,
 )
+from app.store.values import Box
 
 TITLES: Final[Mapping[str, tuple[VectorLayer, str, str]]] = {
     "nodes": ("topology", "Nodes", "Places of the network that robots drive on."),
@@ -54,6 +57,12 @@ EMPTY: Final[Mapping[str, Declared]] = {
     "fence": _declared("Polygon", "kind"),
 }
 """What drafts say of collections without features, so that programs can add the first one."""
+
+
+MAX_READ: Final = 1000
+
+_READ: RecentlyUsed[list[int]] = RecentlyUsed(MAX_READ, lambda _: 1)
+"""Number of features that were read by boxes, of layers without a table."""
 
 
 async def layer_tables(service: Service, layer: VectorLayer) -> dict[str, Table]:
@@ -93,6 +102,24 @@ async def find_item_table(service: Service, name: str, item: str) -> Table | Non
     content = service.services.store.content
     table = await run_in_threadpool(build_item_table, content, service.version, entry[0], name, item)
     return table or await find_table(service, name)
+
+
+async def find_box_table(service: Service, name: str, boxes: Sequence[Box]) -> Table | None:
+    """Return a table of what a collection has in a box in degrees, if that takes less than the table of all; else None.
+
+    Which it does until the boxes asked for have together as many features as the layer: then all are worth a table.
+    """
+    entry = TITLES.get(name)
+    key = None if entry is None else table_key(service.version, entry[0])
+    if entry is None or key is None or len(boxes) != 1 or len(key[1]) != 1 or CACHE.get(key) is not None:
+        return None
+    read = _READ.get(key) or _READ.put(key, [0])
+    if read[0] >= sum(one.count for one in service.version.parts if one.key == key[1][0][0]):
+        return None
+    content = service.services.store.content
+    table = await run_in_threadpool(build_box_table, content, service.version, entry[0], name, boxes[0])
+    read[0] += 1 if table is None else len(table)
+    return table
 
 
 async def vector_tables(service: Service) -> dict[str, Table]:

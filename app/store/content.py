@@ -25,6 +25,7 @@ from app.store.parts.features import (
     find_places,
     items_by_id,
     load_packed,
+    packed_from_items,
     packed_leaves,
 )
 from app.store.parts.roots import PartRoot, read_document, read_root
@@ -88,6 +89,12 @@ class ContentReader:
                 selected_ids = set(ids)
                 items = {i: item for i, item in items.items() if i in selected_ids}
         return features_from_items(items, read_document(draft, root))
+
+    def packed_in_box(self, version: Version, key: PartKey, bbox: Box) -> PackedFeatures:
+        """Read the features of a vector part in a box in degrees by id, with packed properties."""
+        draft = self._chunks.stage()
+        frame = None if version.datum is None else local_frame(version.datum)
+        return packed_from_items(features_in_box(draft, self._root(draft, version, key), bbox, "wgs84", frame))
 
     def referring(self, version: Version, key: PartKey, names: Collection[str]) -> Features:
         """Read the features that name one of these as ``source``, ``target`` or ``drawn_from``, and some others."""

@@ -89,4 +89,5 @@ def _meeting(leaves: Sequence[Names], wanted: Names) -> list[int]:
     names = np.concatenate(leaves)
     places = np.minimum(np.searchsorted(wanted, names), len(wanted) - 1)
     ends = np.cumsum([len(leaf) for leaf in leaves])
-    return np.unique(np.searchsorted(ends, np.flatnonzero(wanted[places] == names), side="right")).tolist()
+    found: list[int] = np.unique(np.searchsorted(ends, np.flatnonzero(wanted[places] == names), side="right")).tolist()
+    return found

@@ -133,15 +133,15 @@ def read_maps(packed: Sequence[bytes]) -> PackedMaps:
     counts = np.where(large, raw[places + 1].astype(np.int64) << 8 | raw[places + 2], first & 0xF)
     single = (large | (first & 0xF0 == 0x80)) & (counts <= MAX_PAIRS)
     places += np.where(large, 3, 1)
-    found = []
+    columns = []
     for number in range(int(counts[single].max(initial=0))):
         maps = np.flatnonzero(single & (counts > number))
         keys, at = _read(raw, places[maps])
         values, at = _read(raw, at)
         places[maps] = at
         single[maps[(keys.lengths < 0) | (values.lengths < 0) | ~keys.texts]] = False
-        found.append((maps, keys, values))
-    steps = [(maps[single[maps]], keys.only(single[maps]), values.only(single[maps])) for maps, keys, values in found]
+        columns.append((maps, keys, values))
+    steps = [(maps[single[maps]], keys.only(single[maps]), values.only(single[maps])) for maps, keys, values in columns]
     return PackedMaps(data, counts, single, steps)
 
 

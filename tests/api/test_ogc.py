@@ -14,6 +14,7 @@ import pyproj
 import pytest
 import shapely
 
+from app.convert.recently_used import RecentlyUsed
 from app.ogc.extensions import extensions
 from app.ogc.property_types import read_types
 from app.ogc.tables import VECTOR_LAYERS, TableCache, build_tables, table_key
@@ -474,3 +475,37 @@ def test_json_fg_of_another_frame_needs_a_geometry(turned: Api) -> None:
     turned.post("environments", {"name": "unplaced"})
     turned.upload("unplaced", {"back.geojson": body}, format="geojson", layer="objects")
     assert turned.get("environments/unplaced").json()["datum"] == document["datum"]
+
+
+# --- boxes of content that was committed just now ---
+
+
+def test_a_box_right_after_a_commit_does_not_build_the_table_of_all(
+    turned: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a box shows is the same, whether it is read from the store or from the table of all."""
+    turned.post("environments", {"name": "fresh", "datum": TURNED_DATUM})
+    turned.upload("fresh", {"network.tmap2.yaml": samples.tmap2()})
+    at = "/ogc/fresh/collections/{}/items"
+    x, y = turned.get(at.format("nodes") + "/gate").json()["geometry"]["coordinates"][:2]
+    far = {"meadow": (40.0, 30.0), **samples.NODES}
+    turned.upload("fresh", {"network.tmap2.yaml": samples.tmap2(far)})
+    box = f"{x - 1e-6},{y - 1e-6},{x + 1e-6},{y + 1e-6}"
+    swapped = f"{y - 1e-6},{x - 1e-6},{y + 1e-6},{x + 1e-6}"
+    epsg = "http://www.opengis.net/def/crs/EPSG/0/4326"
+    queries = [f"?bbox={box}", f"?limit=1&bbox={box}", f"?bbox={swapped}&bbox-crs={epsg}"]
+
+    def answers(name: str) -> list[Any]:
+        documents = [turned.get(at.format(name) + query).json() for query in queries]
+        return [[one["features"], one["numberMatched"]] for one in documents]
+
+    def refuse(*_: Any) -> None:
+        pytest.fail("the table of all is built")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("app.ogc.vector.build_tables", refuse)
+        patched.setattr("app.ogc.vector._READ", RecentlyUsed(10, lambda _: 0))
+        read = answers("nodes")
+    turned.get(at.format("nodes"))
+    assert answers("nodes") == read
+    assert [number for _, number in read] == [1, 1, 1]

@@ -338,6 +338,14 @@ class PackedFeatures:
     local: NDArray[np.bool_]
 
 
+def packed_from_items(items: Mapping[str, Item]) -> PackedFeatures:
+    """Convert stored items into columns, in the order of their ids."""
+    ids = sorted(items)
+    rows = [items[i] for i in ids]
+    local = np.array([row.anchor == 0 for row in rows], bool)
+    return PackedFeatures(ids, from_wkb([row.wkb for row in rows]), [row.packed for row in rows], local)
+
+
 class PackedLeaf(NamedTuple):
     """Columns of a leaf of vector items: 0 for local or 1 for wgs84, ids, WKB, packed properties."""
 
