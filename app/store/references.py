@@ -89,5 +89,7 @@ def _meeting(leaves: Sequence[Names], wanted: Names) -> list[int]:
     names = np.concatenate(leaves)
     places = np.minimum(np.searchsorted(wanted, names), len(wanted) - 1)
     ends = np.cumsum([len(leaf) for leaf in leaves])
-    found: list[int] = np.unique(np.searchsorted(ends, np.flatnonzero(wanted[places] == names), side="right")).tolist()
-    return found
+    leaf_numbers: list[int] = np.unique(
+        np.searchsorted(ends, np.flatnonzero(wanted[places] == names), side="right")
+    ).tolist()
+    return leaf_numbers
