@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
-from urllib.parse import urlencode
 
 import numpy as np
 import shapely
 from starlette.concurrency import run_in_threadpool
 
-from app.api.http.responses import API
 from app.convert.extents import raster_outline
 from app.convert.placement import place_raster
 from app.convert.recently_used import RecentlyUsed
@@ -19,7 +17,7 @@ from app.model.features import NO_GEOMETRY
 from app.model.frame import GROUND, Datum
 from app.model.geodesy import local_frame
 from app.model.imagery import LOCAL
-from app.ogc.service import Service, origin
+from app.ogc.service import Service
 from app.ogc.tables import Table, table_of
 from app.store.parts.roots import read_root
 from app.store.values import PartEntry
@@ -64,15 +62,18 @@ def raster_title(entry: PartEntry) -> str:
     return f"{WORDS[entry.key.layer][1]} {entry.key.name}{level}"
 
 
-def cog_url(service: Service, entry: PartEntry) -> str | None:
-    """Return the absolute URL of a grid or image as cloud optimized GeoTIFF, with its place on earth."""
+def geotiff_map(entry: PartEntry) -> tuple[str, dict[str, str]] | None:
+    """Return format and parameters of the map that has a grid or image as cloud optimized GeoTIFF, with its place."""
     formats = {"occupancy": ("occupancy_grid", "grid"), "imagery": ("satellite", "picture")}
     if entry.key.layer not in formats:
         return None
-    kind, option = formats[entry.key.layer]
-    query = urlencode({option: entry.key.name, "level": entry.key.level, "file_type": "tif"})
-    server = origin(service.request, service.services.options.public_url)
-    return f"{server}{API}/environments/{service.environment.name}/versions/{service.version.ref}/maps/{kind}?{query}"
+    name, option = formats[entry.key.layer]
+    return name, {option: entry.key.name, "level": entry.key.level, "file_type": "tif"}
+
+
+def geotiff_url(service: Service, name: str, entry: PartEntry) -> str | None:
+    """Return the absolute URL of the GeoTIFF of a grid or image; None for a voxel map."""
+    return None if geotiff_map(entry) is None else service.url("collections", name, "geotiff")
 
 
 async def footprint_table(service: Service, name: str) -> Table | None:
@@ -84,7 +85,7 @@ async def footprint_table(service: Service, name: str) -> Table | None:
     footprint = _FOOTPRINTS.get((entry.key, entry.hash, datum))
     if footprint is None:
         footprint = await run_in_threadpool(_read, service, entry, datum)
-    addresses = {"map": service.url("collections", name, "map"), "geotiff": cog_url(service, entry)}
+    addresses = {"map": service.url("collections", name, "map"), "geotiff": geotiff_url(service, name, entry)}
     properties = {**footprint.properties, **{key: url for key, url in addresses.items() if url is not None}}
     return table_of(entry.key, entry.key.name, footprint.geometry, properties, local=footprint.local, datum=datum)
 

@@ -9,7 +9,8 @@ from app.convert.views import ViewContent
 from app.ogc.collections import unknown_collection_error
 from app.ogc.crs import CRS84, reference_systems
 from app.ogc.extensions import Collection, Extension, all_collections
-from app.ogc.footprints import WORDS, cog_url, footprint_table, raster_parts, raster_title
+from app.ogc.footprints import WORDS, footprint_table, geotiff_url, raster_parts, raster_title
+from app.ogc.geotiff import TIFF
 from app.ogc.service import Link, Service, link
 from app.ogc.vector import TITLES, item_links
 from app.store.values import PartEntry
@@ -24,12 +25,10 @@ SHAPE_TYPES = {
 }
 """Shapely's types of the geometries of collections that share a layer."""
 
-TIFF = "image/tiff; application=geotiff; profile=cloud-optimized"
-
 
 def _links(service: Service, name: str, entry: PartEntry) -> list[Link]:
-    cog = cog_url(service, entry)
-    shown = [link(cog, "enclosure", TIFF, "GeoTIFF with its place on earth")] if cog is not None else []
+    geotiff = geotiff_url(service, name, entry)
+    shown = [link(geotiff, "enclosure", TIFF, "GeoTIFF with its place on earth")] if geotiff is not None else []
     return [*item_links(service, name), *shown]
 
 

@@ -31,6 +31,9 @@ SERVICES = (
 )
 """Addresses of services, what finds them, and the end of the names of their operations."""
 
+SAME = {"description": "Not modified: the client has this content"}
+REDIRECT = {"description": "The content is at `Location`: a link that needs no token until it expires"}
+
 Handler = Callable[..., Awaitable[Response]]
 
 
@@ -72,7 +75,13 @@ def ogc_router() -> APIRouter:
 
 
 def both(
-    router: APIRouter, path: str, content: Mapping[str, object], *, in_schema: bool = True, **options: Any
+    router: APIRouter,
+    path: str,
+    content: Mapping[str, object],
+    *,
+    in_schema: bool = True,
+    redirects: bool = False,
+    **options: Any,
 ) -> Callable[[Handler], Handler]:
     """Register a handler for ``GET`` below each address of SERVICES.
 
@@ -80,6 +89,7 @@ def both(
 
     Args:
         content: media types of the response, each with its OpenAPI object.
+        redirects: the response is a redirect to that content.
         options: further arguments of FastAPI's ``add_api_route``.
     """
 
@@ -92,8 +102,7 @@ def both(
                     "description": "A parameter is invalid or unknown; `errors` names it.",
                     "content": {problems.MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
                 },
-                200: {"description": "OK", "content": dict(content)},
-                304: {"description": "Not modified: the client has this content"},
+                **({307: REDIRECT} if redirects else {200: {"description": "OK", "content": dict(content)}, 304: SAME}),
             }
             router.add_api_route(
                 prefix + path,
@@ -101,6 +110,7 @@ def both(
                 methods=["GET"],
                 responses=responses,
                 response_class=Response,
+                status_code=307 if redirects else 200,
                 include_in_schema=in_schema,
                 **options,
             )

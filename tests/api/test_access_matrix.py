@@ -60,6 +60,7 @@ STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]
 NAMED = "environment={env}"
 OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
              "/collections/{collection}/schema", "/collections/{collection}/queryables",
+             "/collections/{collection}/geotiff",
              "/collections/{collection}/items", "/collections/{collection}/items/{feature}",
              "/tileMatrixSets", "/tileMatrixSets/{tms}", "/wmts/1.0.0/WMTSCapabilities.xml", "/layers.qlr",
              *(f"{of}{path}" for of in ("", "/collections/{collection}") for path in (

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pyproj
 import pytest
@@ -146,8 +147,14 @@ def test_grid_is_an_outline_with_the_addresses_of_its_content(turned: Api) -> No
     assert {k: properties[k] for k in ("kind", "name", "level", "resolution", "width", "height")} == {
         "kind": "grid", "name": "map", "level": "ground", "resolution": 0.5, "width": 40, "height": 30,
     }  # fmt: skip
-    for name, head in (("map", b"\x89PNG"), ("geotiff", b"II")):
-        assert turned.get(properties[name].removeprefix(turned.url)).content.startswith(head)
+    assert turned.get(properties["map"].removeprefix(turned.url)).content.startswith(b"\x89PNG")
+    redirect = turned.get(properties["geotiff"].removeprefix(turned.url), 307)
+    anonymous = httpx.get(redirect.headers["location"])
+    assert anonymous.content.startswith(b"II")
+    with_password = httpx.get(properties["geotiff"], auth=("any", ADMIN), follow_redirects=True)
+    assert with_password.content == anonymous.content, "GDAL repeats the password at the link"
+    missing = problem(turned.get("/ogc/turned/collections/nodes/geotiff", 404))
+    assert "only collections of grids and images" in missing["detail"]
     assert turned.get(ITEMS.format("grid-map"), params={"level": "attic"}).json()["features"] == []
     schema = turned.get("/ogc/turned/collections/grid-map/schema").json()["properties"]
     assert schema["geometry"]["format"] == "geometry-polygon"

@@ -179,6 +179,23 @@ def test_gdal_opens_every_collection(server: Api, site: str) -> None:
         assert np.abs(projected[order[0]] - again[order[1]]).max() < 2e-3, name
 
 
+def test_gdalinfo_opens_every_geotiff(server: Api, site: str) -> None:
+    require("gdalinfo", shutil.which("gdalinfo") is not None)
+    env = {**os.environ, "GDAL_HTTP_USERPWD": f"any:{ADMIN}", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+    for name in names_of(server, site):
+        if not name.startswith(("grid-", "image-")):
+            continue
+        (outline,) = server.get(f"/ogc/{site}/collections/{name}/items").json()["features"]
+        command = ["gdalinfo", "-json", f"/vsicurl/{outline['properties']['geotiff']}"]
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=240)
+        assert done.returncode == 0, done.stderr[-2000:]
+        seen = json.loads(done.stdout)
+        assert seen["size"] == [outline["properties"]["width"], outline["properties"]["height"]]
+        corner = np.array([seen["wgs84Extent"]["coordinates"][0][0][:2]])
+        ring = np.array(outline["geometry"]["coordinates"][0])
+        assert min(metres_apart(np.array([point[:2]]), corner) for point in ring) < 0.01, name
+
+
 def test_ogrinfo_counts_every_collection(server: Api, site: str) -> None:
     require("ogrinfo", shutil.which("ogrinfo") is not None)
     env = {**os.environ, "GDAL_HTTP_USERPWD": f"any:{ADMIN}"}

@@ -77,6 +77,7 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
     ogc = ("/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
            "/collections/{collection}/items", "/collections/{collection}/items/{feature}",
            "/collections/{collection}/schema", "/collections/{collection}/queryables",
+           "/collections/{collection}/geotiff",
            "/tileMatrixSets", "/tileMatrixSets/{tms}", "/wmts/1.0.0/WMTSCapabilities.xml", "/layers.qlr",
            *(f"{of}{path}" for of in ("", "/collections/{collection}") for path in (
                "/map", "/tiles", "/tiles/{tms}", "/tiles/{tms}/{z}/{row}/{col}",
