@@ -51,7 +51,7 @@ bench: install-dev
 bench-web: install-dev
 	@$(BIN)/python -m tests.bench.web $(ARGS)
 
-# Kills of the server, the router and the database at random moments: 50 of each; `make test` does 10.
+# Kills of the server, the router and the database at random moments: 50 of each; `make test` does 4.
 chaos: install-dev
 	@FLEETMAP_CHAOS=$${FLEETMAP_CHAOS:-50} $(BIN)/python -m pytest -s tests/chaos $(ARGS)
 

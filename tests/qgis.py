@@ -1,6 +1,6 @@
 """QGIS without a screen: scripts of tests run by a Python that has its modules.
 
-``FLEETMAP_QGIS`` names that Python (``.ci/qgis`` makes one); without it, it is the system's. Writing needs QGIS 3.34.
+``QGIS_PYTHON`` names that Python (``.ci/qgis`` makes one); without it, it is the system's. Writing needs QGIS 3.34.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-PYTHON = os.environ.get("FLEETMAP_QGIS", "/usr/bin/python3")
+PYTHON = os.environ.get("QGIS_PYTHON", "/usr/bin/python3")
 START = """
 import json, os, sys
 from qgis.core import *
@@ -29,7 +29,7 @@ def answer(result):
 def run(script: str, *arguments: str | Path, folder: Path) -> Any:
     """Run a script that ends in ``answer(result)`` and return the result; ``folder`` is QGIS' home."""
     if version() < (3, 34):
-        message = f"QGIS 3.34 is missing in {PYTHON}: set FLEETMAP_QGIS to the program that .ci/qgis makes"
+        message = f"QGIS 3.34 is missing in {PYTHON}: set QGIS_PYTHON to the program that .ci/qgis makes"
         (pytest.fail if os.environ.get("CI") else pytest.skip)(message)
     folder.chmod(0o700)
     command = [PYTHON, "-c", START + script, *map(str, arguments)]

@@ -25,7 +25,7 @@ class Workspaces:
         """Create a temporary folder, locked until the block ends; then it is removed."""
         folder = self.folder / secrets.token_hex(16)
         with self._lock(shared=True):
-            folder.mkdir()
+            folder.mkdir(parents=True)
             lock = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
             fcntl.flock(lock, fcntl.LOCK_EX)
         try:

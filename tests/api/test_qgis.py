@@ -1,6 +1,6 @@
 """QGIS opens the demo by one address, draws it, and edits its network through a draft.
 
-``FLEETMAP_PICTURES=docs/images`` keeps the two images of docs/how-to/qgis.md.
+``QGIS_PICTURES=docs/images`` keeps the two images of docs/how-to/qgis.md.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def orchard(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 
 def keep(picture: Path) -> None:
     """Keep the image for the documentation if asked to."""
-    if folder := os.environ.get("FLEETMAP_PICTURES"):
+    if folder := os.environ.get("QGIS_PICTURES"):
         Image.open(picture).quantize(64).save(Path(folder) / picture.name, optimize=True)
 
 

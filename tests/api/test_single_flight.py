@@ -285,7 +285,9 @@ def test_token_revoked_during_lookup_is_not_cached() -> None:
 def test_database_serialises_writers(tmp_path: Any) -> None:
     """A slow writer makes others wait, not fail; a failed writer releases the lock; readers never wait."""
     notifications: list[int] = []
-    database = Database(f"sqlite:///{tmp_path}/turns.sqlite3", readonly=False, written=lambda: notifications.append(1))
+    database = Database(
+        f"sqlite:///{tmp_path}/turns.sqlite3", readonly=False, written=lambda _: notifications.append(1)
+    )
     with database.write() as connection:
         connection.exec_driver_sql("CREATE TABLE t (n INTEGER)")
     gate = Gate()

@@ -22,7 +22,7 @@ from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess
 from tests.events.conftest import free_port
 
-ROUNDS = max(1, int(os.environ.get("FLEETMAP_CHAOS", "10")) // 8)
+ROUNDS = max(1, int(os.environ.get("FLEETMAP_CHAOS", "4")) // 8)
 SEED = int(os.environ.get("FLEETMAP_CHAOS_SEED", "5"))
 SECONDS = 120.0
 """Maximum time until a request is answered, however often the server is killed meanwhile."""
