@@ -110,6 +110,8 @@ def verify(
 def _open(settings: Settings, *, readonly: bool) -> Store:
     from app.main import open_store
 
+    if not readonly:  # with files in S3, this machine may not have served yet
+        settings.blob_dir.mkdir(parents=True, exist_ok=True)
     return open_store(settings, readonly=readonly)
 
 
