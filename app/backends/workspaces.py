@@ -24,8 +24,9 @@ class Workspaces:
     def create(self) -> Iterator[Path]:
         """Create a temporary folder, locked until the block ends; then it is removed."""
         folder = self.folder / secrets.token_hex(16)
+        self.folder.mkdir(parents=True, exist_ok=True)
         with self._lock(shared=True):
-            folder.mkdir(parents=True)
+            folder.mkdir()
             lock = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
             fcntl.flock(lock, fcntl.LOCK_EX)
         try:
