@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from fastapi import Path
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api.http.auth import Viewer
 from app.api.http.responses import API
 from app.errors import NotFound
-from app.ogc.collections import CollectionPath
 from app.ogc.footprints import geotiff_map, raster_parts
 from app.ogc.routing import both, ogc_router
 from app.ogc.service import Service, origin
@@ -16,6 +18,10 @@ from app.ogc.service import Service, origin
 TIFF = "image/tiff; application=geotiff; profile=cloud-optimized"
 SECONDS = 3600
 """Maximum life of the link."""
+
+RasterPath = Annotated[
+    str, Path(max_length=512, description="Id of a collection of a grid or image.", examples=["grid-map"])
+]
 
 router = ogc_router()
 
@@ -27,7 +33,7 @@ router = ogc_router()
     redirects=True,
     summary="Redirect to the GeoTIFF of a grid or image",
 )
-async def get_geotiff(service: Service, collection: CollectionPath, principal: Viewer) -> Response:
+async def get_geotiff(service: Service, collection: RasterPath, principal: Viewer) -> Response:
     """Redirect to a grid or image as cloud optimized GeoTIFF, with its place on earth.
 
     The address works where programs send user and password, which maps do not take: it leads to a signed link.

@@ -54,7 +54,7 @@ class Server:
         self.process.stop(signal.SIGKILL)
         self.process = self._start()
 
-    def ask(self, method: str, path: str, *statuses: int, **request: Any) -> httpx.Response:
+    def send(self, method: str, path: str, *statuses: int, **request: Any) -> httpx.Response:
         """Send a request until it is answered with one of these statuses. 5xx: the server is ending or starting."""
         address = path if path.startswith("/") else f"/api/v1/{path}"
         deadline = time.monotonic() + SECONDS
@@ -70,7 +70,7 @@ class Server:
             time.sleep(0.05)
 
     def nodes(self, ref: object) -> dict[str, Any]:
-        features = self.ask("GET", f"{SITE}/versions/{ref}/layers/topology", 200).json()["features"]
+        features = self.send("GET", f"{SITE}/versions/{ref}/layers/topology", 200).json()["features"]
         return {feature["id"]: feature["properties"].get("count") for feature in features}
 
 
@@ -108,16 +108,16 @@ class Writers:
 
     def _patch(self, count: int) -> None:
         body = {"properties": {"count": count}}
-        self._server.ask("PATCH", f"{self._items()}/patched", 204, json=body, headers=MERGE_PATCH)
+        self._server.send("PATCH", f"{self._items()}/patched", 204, json=body, headers=MERGE_PATCH)
 
     def _add(self, count: int) -> None:
         point = {"type": "Point", "coordinates": [5.001, 52.001]}
         body = {"type": "Feature", "id": f"added-{count}", "geometry": point, "properties": {"count": count}}
-        self._server.ask("POST", self._items(), 201, 409, json=body)  # 409: the answer of the first try was lost
+        self._server.send("POST", self._items(), 201, 409, json=body)  # 409: the answer of the first try was lost
 
     def _put_pair(self, count: int) -> None:
         changes = [node("left", count), node("right", count)]
-        self._server.ask("POST", f"{SITE}/drafts/{self._draft}/edits", 200, json={"changes": changes})
+        self._server.send("POST", f"{SITE}/drafts/{self._draft}/edits", 200, json={"changes": changes})
 
     def wait_for_more(self, before: dict[str, int]) -> None:
         """Wait until each writer has another write acknowledged."""
@@ -147,12 +147,12 @@ def check(nodes: dict[str, Any], done: dict[str, int]) -> None:
 def test_drafts_survive_kills(server: Server) -> None:
     dice = random.Random(SEED)
     datum = {"latitude": 52.0, "longitude": 5.0}
-    server.ask("POST", "environments", 201, json={"name": "farm", "datum": datum})
+    server.send("POST", "environments", 201, json={"name": "farm", "datum": datum})
     first = [node(item, 0) for item in ("patched", "left", "right", "head")]
-    head = server.ask("POST", f"{SITE}/edits", 201, json={"changes": first}).json()["version"]
+    head = server.send("POST", f"{SITE}/edits", 201, json={"changes": first}).json()["version"]
     done = {"patched": 0, "added": 0, "pair": 0}
     for k in range(ROUNDS):
-        draft = server.ask("POST", f"{SITE}/drafts", 201, json={"name": f"draft {k}"}).json()["id"]
+        draft = server.send("POST", f"{SITE}/drafts", 201, json={"name": f"draft {k}"}).json()["id"]
         before = dict(done)
         writers = Writers(server, draft, before)
         writers.wait_for_more(before)
@@ -164,7 +164,7 @@ def test_drafts_survive_kills(server: Server) -> None:
 
         edit = {"changes": [node("head", k + 1)]}
         head += 1
-        moved = server.ask("POST", f"{SITE}/edits", 201, json=edit, headers={"idempotency-key": f"head-{k}"})
+        moved = server.send("POST", f"{SITE}/edits", 201, json=edit, headers={"idempotency-key": f"head-{k}"})
         assert moved.json()["version"] == head
         with ThreadPoolExecutor(1) as pool:
             rebase = pool.submit(server.ask, "POST", f"{SITE}/drafts/{draft}/rebase", 200, json={})
@@ -176,12 +176,12 @@ def test_drafts_survive_kills(server: Server) -> None:
             committed = killed_during(server, commit, dice)
         head += 1
         assert committed["version"] == head
-        assert server.ask("GET", SITE, 200).json()["version"] == head, "committed once"
-        server.ask("GET", f"{SITE}/drafts/{draft}", 404)
+        assert server.send("GET", SITE, 200).json()["version"] == head, "committed once"
+        server.send("GET", f"{SITE}/drafts/{draft}", 404)
         stored = server.nodes(head)
         check(stored, done)
         assert stored["head"] == k + 1
-    messages = [one["message"] for one in server.ask("GET", f"{SITE}/versions?limit=1000", 200).json()]
+    messages = [one["message"] for one in server.send("GET", f"{SITE}/versions?limit=1000", 200).json()]
     assert [messages.count(f"draft {k}") for k in range(ROUNDS)] == [1] * ROUNDS
 
 
