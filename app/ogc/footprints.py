@@ -72,8 +72,10 @@ def geotiff_map(entry: PartEntry) -> tuple[str, dict[str, str]] | None:
 
 
 def geotiff_url(service: Service, name: str, entry: PartEntry) -> str | None:
-    """Return the absolute URL of the GeoTIFF of a grid or image; None for a voxel map."""
-    return None if geotiff_map(entry) is None else service.url("collections", name, "geotiff")
+    """Return the absolute URL of the GeoTIFF of a grid or image; None for a voxel map, and in an edited draft."""
+    if geotiff_map(entry) is None or service.version.pending is not None:
+        return None
+    return service.url("collections", name, "geotiff")
 
 
 async def footprint_table(service: Service, name: str) -> Table | None:

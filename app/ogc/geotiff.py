@@ -42,6 +42,8 @@ async def get_geotiff(service: Service, collection: RasterPath, principal: Viewe
     wanted = None if entry is None else geotiff_map(entry)
     if wanted is None:
         raise NotFound(f"{collection} has no GeoTIFF: only collections of grids and images have one")
+    if service.version.pending is not None:
+        raise NotFound("no map is made of a draft before it is committed: open the GeoTIFF of a version")
     name, parameters = wanted
     links = service.services.links
     path = f"{API}/environments/{service.environment.name}/versions/{service.version.ref}/maps/{name}"

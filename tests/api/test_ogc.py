@@ -171,6 +171,18 @@ def test_grids_of_drafts_are_not_written(turned: Api) -> None:
     assert turned.get("environments/turned/drafts").json() == []
 
 
+def test_edited_draft_has_no_geotiff(turned: Api) -> None:
+    at = "/ogc/turned/drafts/mine/collections"
+    assert turned.get(f"{at}/grid-map/geotiff", 307), "nothing is edited: that of the version"
+    node = turned.get(f"{at}/nodes/items?limit=1").json()["features"][0]
+    turned("PATCH", f"{at}/nodes/items/{node['id']}", 204, json={"properties": {"note": "edited"}})
+    (grid,) = turned.get(f"{at}/grid-map/items").json()["features"]
+    assert "geotiff" not in grid["properties"]
+    assert "before it is committed" in problem(turned.get(f"{at}/grid-map/geotiff", 404))["detail"]
+    (draft,) = turned.get("environments/turned/drafts").json()
+    turned("DELETE", f"environments/turned/drafts/{draft['id']}", 204)
+
+
 # --- positions ---
 
 
