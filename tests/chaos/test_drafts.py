@@ -167,12 +167,12 @@ def test_drafts_survive_kills(server: Server) -> None:
         moved = server.send("POST", f"{SITE}/edits", 201, json=edit, headers={"idempotency-key": f"head-{k}"})
         assert moved.json()["version"] == head
         with ThreadPoolExecutor(1) as pool:
-            rebase = pool.submit(server.ask, "POST", f"{SITE}/drafts/{draft}/rebase", 200, json={})
+            rebase = pool.submit(server.send, "POST", f"{SITE}/drafts/{draft}/rebase", 200, json={})
             rebased = killed_during(server, rebase, dice)
             assert rebased["base"] == head
             key = {"idempotency-key": f"commit-{k}"}
             path = f"{SITE}/drafts/{draft}/commit"
-            commit = pool.submit(server.ask, "POST", path, 201, json={"message": f"draft {k}"}, headers=key)
+            commit = pool.submit(server.send, "POST", path, 201, json={"message": f"draft {k}"}, headers=key)
             committed = killed_during(server, commit, dice)
         head += 1
         assert committed["version"] == head
