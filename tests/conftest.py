@@ -5,11 +5,12 @@ from __future__ import annotations
 import gc
 import hashlib
 import importlib
+import itertools
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,7 +20,9 @@ import yaml
 from hypothesis import settings
 
 from app import native
+from tests.api.conftest import Api, running, settings_for
 from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
+from tests.seaweed import s3_url, seaweed  # noqa: F401  fixtures
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 TOP = Path(__file__).resolve().parents[1]
@@ -73,6 +76,22 @@ def pytest_collection_finish() -> None:
     """Freeze imported and collected objects, so that the garbage collector ignores them."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    """Server that most tests share; each uses its own environments."""
+    with running(settings_for(tmp_path_factory.mktemp("server"))) as api:
+        yield api
+
+
+_count = itertools.count(1)
+
+
+@pytest.fixture
+def fresh() -> Callable[[], str]:
+    """Return a name that no environment has."""
+    return lambda: f"env-{next(_count)}"
 
 
 @pytest.fixture(scope="session")

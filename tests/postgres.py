@@ -1,6 +1,6 @@
 """Temporary PostgreSQL cluster with PostGIS for a test session, on a free loopback port.
 
-Import the fixtures in a conftest.py: ``from tests.postgres import postgres_cluster, postgres_url``.
+tests/conftest.py imports the fixtures: once, or each import would start a cluster of its own.
 """
 
 from __future__ import annotations

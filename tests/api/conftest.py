@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import ssl
 import tempfile
 import threading
@@ -155,22 +154,6 @@ def settings_for(folder: Path, **more: Any) -> Settings:
     values = {"admin_token": ADMIN, "conversion_workers": 1, "max_memory_bytes": 4 * 2**30, "log_level": "warning"}
     values["zenoh_mode"] = "off"  # tests of events set the addresses of their router
     return Settings(_env_file=None, data_dir=folder, **{**values, **more})  # type: ignore[call-arg]
-
-
-@pytest.fixture(scope="session")
-def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """Server that most tests share; each uses its own environments."""
-    with running(settings_for(tmp_path_factory.mktemp("server"))) as api:
-        yield api
-
-
-_count = itertools.count(1)
-
-
-@pytest.fixture
-def fresh() -> Callable[[], str]:
-    """Return a name that no environment has."""
-    return lambda: f"env-{next(_count)}"
 
 
 def create_farm(api: Api, name: str) -> str:

@@ -14,9 +14,6 @@ from PIL import Image
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
-from tests.postgres import postgres_cluster, postgres_url
-
-__all__ = ["postgres_cluster", "postgres_url"]
 
 VECTORS = ("location", "objects", "topology", "zones")
 

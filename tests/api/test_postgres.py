@@ -14,9 +14,6 @@ from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.api.test_writers import races
-from tests.postgres import postgres_cluster, postgres_url
-
-__all__ = ["postgres_cluster", "postgres_url"]
 
 pytestmark = pytest.mark.postgres
 

@@ -23,10 +23,7 @@ from app.main import open_store
 from app.store.values import Source
 from tests.api import samples
 from tests.api.conftest import Api, parts, running, settings_for
-from tests.postgres import postgres_cluster, postgres_url
-from tests.seaweed import Seaweed, s3_url, seaweed
-
-__all__ = ["postgres_cluster", "postgres_url", "s3_url", "seaweed"]
+from tests.seaweed import Seaweed
 
 pytestmark = pytest.mark.postgres
 

@@ -9,10 +9,9 @@ import pytest
 
 from app.backends.lead import Leads, open_leads
 from app.store.store import Store
-from tests.postgres import postgres_cluster, postgres_url
 from tests.store.conftest import database_url, migrated_database, migrated_file
 
-__all__ = ["database_url", "migrated_database", "migrated_file", "postgres_cluster", "postgres_url"]
+__all__ = ["database_url", "migrated_database", "migrated_file"]
 
 
 @pytest.fixture

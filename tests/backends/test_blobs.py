@@ -17,9 +17,7 @@ from app.backends.blob_s3 import S3Files
 from app.backends.blobs import BlobFiles, Unreadable
 from app.backends.local_copies import LocalCopies
 from app.errors import NoRoom, Unavailable
-from tests.seaweed import ACCESS, Seaweed, s3_url, seaweed
-
-__all__ = ["s3_url", "seaweed"]
+from tests.seaweed import ACCESS, Seaweed
 
 LARGE = random.Random(5).randbytes(12_000_000)
 

@@ -22,7 +22,7 @@ from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
 from app.model.voxels import HALF, VoxelMap
-from tests.api.conftest import Api, api  # noqa: F401  fixture
+from tests.api.conftest import Api
 
 REAL = [
     "geb079/geb079.bt",
@@ -213,7 +213,7 @@ def test_large_leaves_cost_no_more_than_small_ones() -> None:
     assert counts["free"] > 2048**2
 
 
-def test_band_parameter_works_over_http(api: Api, shared: Path) -> None:  # noqa: F811
+def test_band_parameter_works_over_http(api: Api, shared: Path) -> None:
     api.post("environments", {"name": "tree"})
     api.upload("tree", {"map.bt": (shared / "data/octomap/geb079/geb079.bt").read_bytes()})
     coverage = {t["format"]: t for t in api.get("environments/tree/versions/1/maps").json()}

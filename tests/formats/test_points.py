@@ -18,7 +18,7 @@ from app.formats import FileGroup, ReadContext, WriteContext, get_format
 from app.model.layers import Layers, PartKey
 from app.model.voxels import VoxelMap, coarser, cut, expand_leaves, morton
 from app.syntax import lzf
-from tests.api.conftest import Api, api  # noqa: F401  fixture
+from tests.api.conftest import Api
 from tests.formats import clouds
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
@@ -46,7 +46,7 @@ def cells(voxels: VoxelMap) -> set[tuple[int, ...]]:
     return set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
 
 
-def test_real_clouds_round_trip_over_http(api: Api, shared: Path) -> None:  # noqa: F811
+def test_real_clouds_round_trip_over_http(api: Api, shared: Path) -> None:
     for k, path in enumerate(sorted((shared / "data" / "pointcloud").rglob("*.p[cl]?"))):
         env, data = f"cloud-{k}", path.read_bytes()
         api.post("environments", {"name": env})
@@ -62,7 +62,7 @@ def test_real_clouds_round_trip_over_http(api: Api, shared: Path) -> None:  # no
         assert all(line["information"] == "raw" for line in report["layers"])
 
 
-def test_cloud_is_not_exported_for_other_voxels(api: Api) -> None:  # noqa: F811
+def test_cloud_is_not_exported_for_other_voxels(api: Api) -> None:
     """Another octree with the same name replaces the cloud; the previous version still has it."""
     api.post("environments", {"name": "stale"})
     api.upload("stale", {"map.pcd": SHELF})
@@ -81,7 +81,7 @@ def test_cloud_is_not_exported_for_other_voxels(api: Api) -> None:  # noqa: F811
     assert not [d for d in report["dropped"] if d["what"] == "resources"], "the cloud has gone with its voxels"
 
 
-def test_two_clouds_are_selected_by_name(api: Api) -> None:  # noqa: F811
+def test_two_clouds_are_selected_by_name(api: Api) -> None:
     api.post("environments", {"name": "pair"})
     api.upload("pair", {"shelf.pcd": SHELF, "line.pcd": LINE})
     assert api.get("/maps/pair/pcd/shelf.pcd").content == SHELF

@@ -21,9 +21,7 @@ from app.model.features import Features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey
-from tests.api.conftest import Api, api, fresh
-
-__all__ = ["api", "fresh"]
+from tests.api.conftest import Api
 
 Cells = NDArray[np.uint8]
 

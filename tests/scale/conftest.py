@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,7 @@ from tests.agent.conftest import ROOT
 from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess
 from tests.events.conftest import eventually, free_port
-from tests.postgres import Cluster, postgres_cluster
-
-__all__ = ["postgres_cluster"]
+from tests.postgres import Cluster
 
 
 @dataclass
@@ -106,37 +105,32 @@ class Servers:
             server.process.stop(signal.SIGKILL)
 
 
-@pytest.fixture
-def empty_servers(postgres_cluster: Cluster, tmp_path: Path) -> Iterator[Callable[..., Servers]]:
-    """Function that makes servers on a database without a schema, of which none runs yet."""
-    made: list[Servers] = []
-    databases: list[str] = []
-    routers: list[Router] = []
-
-    def make(*, zenoh: bool = True) -> Servers:
-        databases.append(postgres_cluster.create_database())
+@contextmanager
+def servers_on(cluster: Cluster, folder: Path, *, zenoh: bool = True) -> Iterator[Servers]:
+    """Make servers on a database without a schema, of which none runs yet."""
+    with ExitStack() as stack:
+        database = cluster.create_database()
+        stack.callback(cluster.drop_database, database)
         port = None
         if zenoh:
             port = free_port()
-            routers.append(Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}"))))
-            assert routers[-1].problem is None
-        folder = tmp_path / f"servers-{len(made)}"
-        folder.mkdir()
-        made.append(Servers(folder, postgres_cluster.url(databases[-1]), port))
-        return made[-1]
-
-    yield make
-    for servers in made:
-        servers.close()
-    for router in routers:
-        router.close()
-    for name in databases:
-        postgres_cluster.drop_database(name)
+            router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}")))
+            stack.callback(router.close)
+            assert router.problem is None
+        servers = Servers(folder, cluster.url(database), port)
+        stack.callback(servers.close)
+        yield servers
 
 
 @pytest.fixture
-def servers(empty_servers: Callable[..., Servers]) -> Servers:
+def empty_servers(postgres_cluster: Cluster, tmp_path: Path) -> Iterator[Servers]:
+    """Servers of which none runs yet."""
+    with servers_on(postgres_cluster, tmp_path) as servers:
+        yield servers
+
+
+@pytest.fixture
+def servers(empty_servers: Servers) -> Servers:
     """Three running servers on one database, each with a data folder of its own, connected to one Zenoh router."""
-    three = empty_servers()
-    three.start(3)
-    return three
+    empty_servers.start(3)
+    return empty_servers

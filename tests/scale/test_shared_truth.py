@@ -5,8 +5,11 @@ from __future__ import annotations
 import base64
 import itertools
 import os
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -14,43 +17,49 @@ import psycopg
 import pytest
 
 from app.agent.signed_manifest import key_id, verify_signature
+from app.main import close_services, open_services
 from tests.agent.conftest import network
-from tests.api.conftest import ADMIN
+from tests.api.conftest import ADMIN, settings_for
 from tests.cli.conftest import ServerProcess
 from tests.events.conftest import eventually
-from tests.scale.conftest import Servers
+from tests.postgres import Cluster
+from tests.scale.conftest import Servers, servers_on
 
 pytestmark = pytest.mark.postgres
 
-FETCHES = 300
-COMMITS = 200
+FETCHES = 120
+COMMITS = 20
+GUESSES = 9
 
 
-@pytest.fixture
-def three(empty_servers: Callable[..., Servers]) -> Servers:
-    """Three servers without Zenoh."""
-    servers = empty_servers(zenoh=False)
-    servers.start(3)
-    return servers
+@pytest.fixture(scope="module")
+def servers(postgres_cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Servers]:
+    """Three servers without Zenoh, which the tests share; each uses its own environment."""
+    with servers_on(postgres_cluster, tmp_path_factory.mktemp("servers"), zenoh=False) as three:
+        three.start(3, token_failures=str(GUESSES))
+        yield three
 
 
-def upload(servers: Servers, number: int, moved: float) -> None:
+def create(servers: Servers, name: str) -> None:
+    servers.call(servers.all[0], "POST", "environments", json={"name": name})
+    upload(servers, name, 0.0)
+
+
+def upload(servers: Servers, name: str, moved: float) -> None:
     files = {"files": ("n.tmap2.yaml", network(moved, 60))}
-    servers.call(servers.all[number], "POST", "environments/farm/versions", files=files)
+    servers.call(servers.all[0], "POST", f"environments/{name}/versions", files=files)
 
 
-def test_pinned_robot_accepts_all_servers_across_key_rotations(three: Servers) -> None:
-    servers = three
-    servers.call(servers.all[0], "POST", "environments", json={"name": "farm"})
-    upload(servers, 0, 0.0)
+def test_pinned_robot_accepts_all_servers_across_key_rotations(servers: Servers) -> None:
+    create(servers, "pinned")
     turn = itertools.cycle(servers.all)
     listed = servers.call(servers.all[0], "GET", "keys")
     pinned = base64.b64decode(listed[0]["public_key"])
     signers = []
     for n in range(FETCHES):
-        if n % 100 == 50:
-            servers.call(servers.all[n // 100], "POST", "keys", json={})
-        answer = next(turn).http.get("/api/v1/environments/farm/versions/latest/manifest?formats=tmap2")
+        if n % 40 == 20:
+            servers.call(servers.all[n // 40], "POST", "keys", json={})
+        answer = next(turn).http.get("/api/v1/environments/pinned/versions/latest/manifest?formats=tmap2")
         assert answer.status_code == 200, answer.text
         signature = answer.headers["Fleetmap-Signature"]
         pinned = verify_signature(
@@ -64,26 +73,22 @@ def test_pinned_robot_accepts_all_servers_across_key_rotations(three: Servers) -
     ] * 3
 
 
-def test_signed_link_of_one_server_is_valid_on_all(three: Servers) -> None:
-    servers = three
-    servers.call(servers.all[0], "POST", "environments", json={"name": "farm"})
-    upload(servers, 0, 0.0)
+def test_signed_link_of_one_server_is_valid_on_all(servers: Servers) -> None:
+    create(servers, "linked")
     body = {"format": "tmap2"}
-    link = servers.call(servers.all[1], "POST", "environments/farm/versions/1/links", json=body)
+    link = servers.call(servers.all[1], "POST", "environments/linked/versions/1/links", json=body)
     path = httpx.URL(link["url"]).raw_path.decode()
     maps = {httpx.get(f"{server.process.address}{path}").raise_for_status().content for server in servers.all}
     assert len(maps) == 1
 
 
-def test_commit_is_read_on_another_server_soon(three: Servers, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commit_is_read_on_another_server_soon(servers: Servers, capsys: pytest.CaptureFixture[str]) -> None:
     """The answer is cached in memory there for a second, unless a notification comes."""
-    servers = three
-    servers.call(servers.all[0], "POST", "environments", json={"name": "farm"})
-    upload(servers, 0, 0.0)
-    address, etags, delays = "/maps/farm/tmap2", [], []
-    for n in range(1, COMMITS // 10):
+    create(servers, "changed")
+    address, etags, delays = "/maps/changed/tmap2", [], []
+    for n in range(1, COMMITS):
         before = servers.all[1].http.get(address).headers["etag"]
-        upload(servers, 0, n / 10)
+        upload(servers, "changed", n / 10)
         start = time.monotonic()
         while servers.all[1].http.head(address).headers["etag"] == before:
             assert time.monotonic() - start < 10
@@ -96,41 +101,43 @@ def test_commit_is_read_on_another_server_soon(three: Servers, capsys: pytest.Ca
     assert delays[len(delays) // 2] < 0.5
 
 
-def test_ten_first_starts_at_once_make_one_administrator(empty_servers: Callable[..., Servers]) -> None:
-    servers = empty_servers(zenoh=False)
-    processes = [servers.launch(admin_token="") for _ in range(10)]
+def test_ten_first_starts_at_once_make_one_administrator(
+    postgres_cluster: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = postgres_cluster.create_database()
+    together = threading.Barrier(10)
+
+    def start(number: int) -> list[Any]:
+        settings = settings_for(tmp_path / str(number), database_url=postgres_cluster.url(database), admin_token=None)
+        together.wait()
+        services = open_services(settings)
+        try:
+            return services.keys.public()
+        finally:
+            close_services(services)
+
     try:
-        addresses = [process.ready() for process in processes]
-        printed = [line for process in processes for line in process.lines if "administrator's token" in line]
-        assert len(printed) == 1
-        token = printed[0].split()[-1]
-        keys = [
-            httpx.get(f"{a}/api/v1/keys", headers={"Authorization": f"Bearer {token}"}).raise_for_status().json()
-            for a in addresses
-        ]
-        assert keys == [keys[0]] * 10
-        assert len(keys[0]) == 1
+        with ThreadPoolExecutor(10) as threads:
+            keys = list(threads.map(start, range(10)))
     finally:
-        for process in processes:
-            process.stop()
+        postgres_cluster.drop_database(database)
+    assert capsys.readouterr().out.count("administrator's token") == 1
+    assert keys == [keys[0]] * 10
+    assert len(keys[0]) == 1
 
 
-def test_wrong_tokens_count_on_all_servers(empty_servers: Callable[..., Servers]) -> None:
-    servers = empty_servers(zenoh=False)
-    servers.start(3, token_failures="9")
-
+def test_wrong_tokens_count_on_all_servers(servers: Servers) -> None:
     def guess(number: int) -> int:
         wrong = {"Authorization": f"Bearer guess-{os.urandom(4).hex()}"}
         return httpx.get(f"{servers.all[number].process.address}/api/v1/keys", headers=wrong).status_code
 
-    assert [guess(n) for n in (0, 1, 2) * 3] == [401] * 9
+    assert [guess(n) for n in (0, 1, 2) * 3] == [401] * GUESSES
     for number in range(3):
         eventually(lambda n=number: guess(n) == 429, 10)
     assert servers.all[0].http.get("/api/v1/keys").status_code == 200, "a valid token is always accepted"
 
 
-def test_session_of_one_server_is_valid_on_all(three: Servers) -> None:
-    servers = three
+def test_session_of_one_server_is_valid_on_all(servers: Servers) -> None:
     clients = [httpx.Client(base_url=server.process.address) for server in servers.all]
     clients[0].post("/api/v1/session", json={"token": ADMIN}).raise_for_status()
     secret = clients[0].cookies["fleetmap_session"]
@@ -143,9 +150,8 @@ def test_session_of_one_server_is_valid_on_all(three: Servers) -> None:
         client.close()
 
 
-def test_servers_serve_beside_a_newer_compatible_schema(three: Servers) -> None:
+def test_servers_serve_beside_a_newer_compatible_schema(servers: Servers) -> None:
     """The next release migrates first; this one goes on, starts again, and refuses only what it cannot read."""
-    servers = three
 
     def migrate_to(revision: str, compatible: str) -> None:
         with psycopg.connect(servers.url.replace("+psycopg", ""), autocommit=True) as connection:

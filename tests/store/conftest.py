@@ -10,11 +10,8 @@ from pathlib import Path
 import pytest
 
 from app.store.store import Store
-from tests.postgres import Cluster, postgres_cluster, postgres_url
+from tests.postgres import Cluster
 from tests.store.samples import DATUM
-
-__all__ = ["postgres_cluster", "postgres_url"]
-
 
 DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)]
 
