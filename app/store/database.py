@@ -139,6 +139,7 @@ class Database:
         self._damage: tuple[float, str] | None = None
         self._checking = threading.Lock()
         self._gone = ""
+        self._is_closed = False
         self.readonly = readonly
         # SQLite does not queue writers: among many, one may never get its turn
         self._turn = threading.Lock()
@@ -205,6 +206,9 @@ class Database:
         except DatabaseDamaged as error:
             self.note_damage(error.detail)
             raise
+        finally:
+            if self._is_closed:  # meanwhile: the connection went back to a pool that nobody would empty
+                self.engine.pool.dispose()
 
     def check(self) -> None:
         """Raise DatabaseDamaged while found damage persists; a damaged SQLite file is checked again periodically."""
@@ -357,8 +361,9 @@ class Database:
             self._turn.release()
 
     def close(self) -> None:
-        """Close all connections."""
-        self.engine.dispose()
+        """Close all connections; those that threads still use are closed when they are done with them."""
+        self._is_closed = True
+        self.engine.pool.dispose()  # not Engine.dispose(), which would begin another pool for such threads
 
 
 def _short(error: exc.SQLAlchemyError) -> str:

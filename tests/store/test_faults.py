@@ -58,6 +58,18 @@ for n in range(1000):
 """
 
 
+def test_closed_store_keeps_no_connection_that_a_thread_still_uses(database_url: str, tmp_path: Path) -> None:
+    store = Store(database_url, tmp_path / "blobs")
+    pool = store._database.engine.pool
+    with store._database.read() as connection:
+        store.close()
+        assert connection.exec_driver_sql("SELECT 1").scalar_one() == 1, "its use goes on"
+    assert pool.checkedin() == 0  # type: ignore[attr-defined]
+    store.environments.page()  # by a thread that the end of its process overtook
+    assert store._database.engine.pool is pool
+    assert pool.checkedin() == 0  # type: ignore[attr-defined]
+
+
 def test_kill_9_leaves_old_or_new_state(store: Store):
     store.environments.create("farm", datum=DATUM)
     random.seed(1)
