@@ -252,7 +252,7 @@ def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path)
                 body = {"json": {"token": ADMIN}}  # the example has a placeholder
             answer = api(method.upper(), target, None, params=query, **body)
             missing = op["tags"] == ["maps by format"] and answer.status_code == 422  # this format's inputs are missing
-            missing |= "/drafts/" in path and path.endswith("/geotiff") and answer.status_code == 404  # no maps of edits
+            missing |= "/drafts/" in path and path.endswith("/geotiff") and answer.status_code == 404  # of edits
             assert answer.status_code < 400 or missing, (operation, answer.status_code, answer.text[:1000])
             assert str(answer.status_code) in op["responses"], (operation, answer.status_code)
             if path == "/api/v1/tokens" and method == "post":
