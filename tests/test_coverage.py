@@ -21,7 +21,7 @@ from tests.formats.test_every_format import cases
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "environment_template"
 SUPPLY = re.compile(r"upload|supply|PATCH|needs|ask for|option", re.IGNORECASE)
 JOB_SECONDS = 300.0
-SLOW_SECONDS = 5.0
+SLOW_SECONDS = 2.0
 
 
 def environments() -> list[Any]:

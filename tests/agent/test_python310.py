@@ -106,7 +106,7 @@ REPETITIONS = (
 )
 """Tests that repeat what a shorter test beside them does, many times or with much data: on one Python."""
 
-PARTS = 3
+PARTS = 2
 
 OWN = sorted(p for p in Path(__file__).parent.rglob("test_*.py") if not SERVER.search(p.read_text()))
 

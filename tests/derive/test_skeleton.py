@@ -302,9 +302,9 @@ def test_compiled_code_is_read_from_read_only_directory_unless_damaged(tmp_path:
         "from app.sandbox import SandboxPolicy, confine, landlock_version\n"
         "assert confine(SandboxPolicy()) or not landlock_version()\n"
         "import numpy as np\n"
-        "from app.derive import _kernels_roadmap as k\n"
+        "from app.derive import _kernels_space as k\n"
         "k.compile_all()\n"
-        "print(sum(k.spanner.stats.cache_hits.values()))\n"
+        "print(sum(k.erode.stats.cache_hits.values()))\n"
     )
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "native"), "PYTHONDONTWRITEBYTECODE": "1"}
     process = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
@@ -312,13 +312,13 @@ def test_compiled_code_is_read_from_read_only_directory_unless_damaged(tmp_path:
     fill = (  # of one module, as of all of them
         "from pathlib import Path\n"
         "from app import native\n"
-        "assert 'app.derive._kernels_roadmap' in native._modules()\n"
-        "native._modules = lambda: ['app.derive._kernels_roadmap']\n"
+        "assert 'app.derive._kernels_space' in native._modules()\n"
+        "native._modules = lambda: ['app.derive._kernels_space']\n"
         f"native.fill(Path({str(tmp_path / 'native')!r}))"
     )
     subprocess.run([sys.executable, "-c", fill], env=env, check=True)
     before = sorted(p.name for p in (tmp_path / "native").rglob("*"))
-    assert any("spanner" in n for n in before)
+    assert any("erode" in n for n in before)
     process = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
     assert process.stdout.split() == ["1"]
     assert sorted(p.name for p in (tmp_path / "native").rglob("*")) == before

@@ -20,7 +20,7 @@ from app.cli import demo
 from app.cli.client import Client
 from tests.api.conftest import ADMIN, Api, running, settings_for
 
-EXAMPLES = int(os.environ.get("SCHEMATHESIS_EXAMPLES", "3"))
+EXAMPLES = int(os.environ.get("SCHEMATHESIS_EXAMPLES", "2"))
 CPU_SECONDS = 2.0
 FOLLOWED = "/api/v1/events"
 """Endpoint of server-sent events, which never ends when followed."""
