@@ -53,6 +53,10 @@ def servers(settings: list[Settings]) -> Iterator[list[Api]]:
         yield [stack.enter_context(running(one)) for one in settings]
 
 
+def sha256_of(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def conversions(servers: list[Api]) -> int:
     """Return how many maps all servers have converted."""
     return sum(server.app.state.services.maps.cache.misses for server in servers)
@@ -156,14 +160,24 @@ def test_verify_repairs_files_wherever_they_are(settings: list[Settings], tmp_pa
     name = store.blobs.put(data)
     store.versions.add_sources("farm", 0, [Source("cloud.bin", len(data), name)])
     store.blobs.files.write({f"{name[:2]}/{name}": data[1:] + b"x"})
+    for key in ("intact", "damaged", "lost"):
+        store.made_maps.publish(key, b"{}", [key.encode()])
+    shared = {key: f"made/{sha256_of(key)[:2]}/{sha256_of(key)}" for key in ("damaged", "lost")}
+    store.blobs.files.write({shared["damaged"]: b"x" * len("damaged")})
+    store.blobs.files.delete([shared["lost"]])
     command = [sys.executable, "-m", "app.cli", "verify"]
     found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert found.returncode == 1, found.stdout + found.stderr
     assert name[:16] in found.stdout
+    assert "3 shared maps" in found.stdout
+    for key, path in shared.items():
+        assert [key in line for line in found.stdout.splitlines() if path[8:24] in line] == [True]
     command += ["--repair", "--from", str(tmp_path / "originals")]
     repaired = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert repaired.returncode == 0, repaired.stdout + repaired.stderr
     assert store.blobs.get(name) == data
+    assert len(list(store.made_maps.iterate_checks())) == len(list(store.blobs.files.list("made/"))) == 1
+    assert store.made_maps.load("intact") is not None
     store.close()
 
 
