@@ -138,10 +138,10 @@ class Verifier:
         for environment, number, blob in self._sources():
             blob_users.setdefault(blob, []).append((environment, number))
         self._check_blobs(out, blob_users)
-        for name, size, problem in self._made_maps.iterate_checks():
+        for shared, size, problem in self._made_maps.iterate_checks():
             self._count(out, "shared map", size)
             if problem is not None:
-                out.findings.append(Finding("shared map", name, problem))
+                out.findings.append(Finding("shared map", shared, problem))
 
     def _check_pending(
         self, out: VerifyResult, walk: _Walk, chunks: dict[str, list[VersionName]], blobs: dict[str, list[VersionName]]
