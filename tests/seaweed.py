@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import http.client
 import json
 import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -87,6 +93,63 @@ class Seaweed:
             self.process.kill()
             self.process.wait()
             self.process = None
+
+
+@dataclass
+class Fault:
+    """What goes wrong between a client and the store: an answer of this status, a delay in seconds, changed bytes."""
+
+    status: int | None = None
+    seconds: float = 0.0
+    changes_bytes: bool = False
+
+
+class FaultyStore:
+    """Proxy of an S3 server on a free loopback port, with the faults that ``fault`` says."""
+
+    def __init__(self, port: int) -> None:
+        self.target, self.fault = port, Fault()
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Forwarder, self))
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
+        self._thread.start()
+        self.endpoint = f"http://127.0.0.1:{self._server.server_port}"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+
+class _Forwarder(BaseHTTPRequestHandler):
+    def __init__(self, store: FaultyStore, *args: Any) -> None:
+        self._store = store
+        super().__init__(*args)
+
+    def answer(self) -> None:
+        fault, body = self._store.fault, self.rfile.read(int(self.headers.get("content-length") or 0))
+        time.sleep(fault.seconds)
+        with contextlib.suppress(OSError):  # the client has given up
+            if fault.status is not None:
+                self.send_response(fault.status)
+                self.send_header("content-length", "0")
+                self.end_headers()
+                return
+            connection = http.client.HTTPConnection("127.0.0.1", self._store.target, timeout=30)
+            connection.request(self.command, self.path, body, dict(self.headers))
+            answer = connection.getresponse()
+            data = answer.read()
+            connection.close()
+            self.send_response(answer.status)
+            for name, value in answer.getheaders():
+                if name.lower() not in ("date", "server", "transfer-encoding", "connection"):
+                    self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(bytes(255 - byte for byte in data) if fault.changes_bytes else data)
+
+    do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = answer
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
 
 
 def _free_ports(count: int) -> list[int]:

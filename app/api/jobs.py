@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import Path, Query
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.responses import Response
 
 from app.api.http.auth import Principal, Viewer
@@ -24,7 +24,7 @@ class JobOut(BaseModel):
 
     id: str
     state: Literal["queued", "running", "done", "failed", "cancelled"]
-    progress: float
+    progress: float = Field(description="1 when the work is done, else 0: a conversion does not report its steps.")
     detail: str
     result: dict[str, Any] | None = None
     problem: ProblemOut | None = None

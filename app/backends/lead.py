@@ -272,7 +272,6 @@ class SharedLeads(Leads):
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join(5)
-        self._disconnect()
         for lead in self._host_leads.values():
             lead.release()
 
@@ -294,6 +293,7 @@ class SharedLeads(Leads):
                 self._disconnect()
             self._wake.wait(ROUND_SECONDS)
             self._wake.clear()
+        self._disconnect()
 
     def _hold_elections(self) -> None:
         """Keep the session alive, free leads that are no longer wanted, and try to get those that are."""

@@ -62,7 +62,8 @@ def verify(
 
     Exit status: 0 if no damage is left, 1 otherwise. May run while the server runs. Removes damaged cached maps, which
     are converted again when requested; changes nothing else without --repair. --repair tries the sources of --from,
-    then reads the uploads of damaged versions again.
+    then reads the uploads of damaged versions again. Damaged maps that servers share are removed, and made again when
+    requested.
 
     Example: `fleetmap verify --repair --from /backup/originals --from https://other-server`
     """
@@ -267,7 +268,7 @@ def _show(
         more = f" and {len(versions) - MAX_VERSIONS} more" if len(versions) > MAX_VERSIONS else ""
         version_names = ", ".join(versions[:MAX_VERSIONS]) + more or "none"
         source = healed.get((f.kind, f.name), "")
-        repair = f"repaired from {source}" if source and source != REMOVED else source
+        repair = source if not source or source.startswith("removed") else f"repaired from {source}"
         rows.append((f"{f.kind} {f.name[:16]}", f.problem, version_names, repair))
     output.show_table(("what", "problem", "versions", "repair"), rows)
     left = sum((f.kind, f.name) not in healed for f in verification.findings)

@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 import io
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -29,6 +29,8 @@ from app.upload_reader import EnvironmentContext, UploadHints
 
 Run = Callable[..., Any]
 """Runner of a module-level function: ``run(function, *args)`` returns its result (``Pool.run``)."""
+
+REMAKING = "removed, to be made again when requested"
 
 
 class Donor(Protocol):
@@ -54,9 +56,11 @@ class RecoveredData:
 
 
 def repair(
-    store: Store, findings: Iterable[Finding], donors: Sequence[Donor], run: Run, limits: Limits
+    store: Store, findings: Collection[Finding], donors: Sequence[Donor], run: Run, limits: Limits
 ) -> dict[tuple[str, str], str]:
     """Repair as many findings as possible. Returns the origin of the bytes by (kind, name) of the finding.
+
+    Damaged maps that servers share are removed: REMAKING instead of an origin.
 
     Data that is reachable only through a lost chunk is checked by the next verification.
     """
@@ -98,6 +102,9 @@ def repair(
         healed |= {("chunk", name): origin for name in rebuilt.chunks}
     if healed:
         store.garbage.look_at_everything()  # what was lost is not known to be part of versions
+    for name in (f.name for f in findings if f.kind == "shared map"):
+        store.made_maps.drop(name)
+        healed["shared map", name] = REMAKING
     return healed
 
 

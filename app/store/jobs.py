@@ -122,10 +122,6 @@ class Jobs:
         """Mark the jobs that wait for a task as queued again: its worker stops."""
         self._update_task(task, {"state": "queued", "progress": 0.0})
 
-    def note_progress(self, task: str, progress: float) -> None:
-        """Store how much of a task is done, 0 to 1."""
-        self._update_task(task, {"progress": min(1.0, max(0.0, progress))}, notify=False)
-
     def finish_task(
         self,
         task: str,
@@ -139,10 +135,10 @@ class Jobs:
         values |= {"outcome": outcome, "problem": problem}
         self._update_task(task, values if location is None else {**values, "location": location})
 
-    def _update_task(self, task: str, values: Mapping[str, Any], *, notify: bool = True) -> int:
+    def _update_task(self, task: str, values: Mapping[str, Any]) -> int:
         table = tables.job
         change = update(table).where(table.c.task == task, table.c.state.in_(ACTIVE))
-        with self._database.write(notify=notify, upkeep=True) as connection:
+        with self._database.write(upkeep=True) as connection:
             return connection.execute(change.values(updated=self._database.now(), **values)).rowcount
 
     def is_awaited(self, task: str) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
@@ -140,6 +140,36 @@ class MadeMaps:
         log.warning("made maps: a shared map was lost or damaged, it will be converted again (key=%s)", key[:16])
         with self._database.write(notify=False, upkeep=True) as connection:
             connection.execute(delete(made_map).where(made_map.c.key == key))
+
+    def iterate_checks(self) -> Iterator[tuple[str, int, str | None]]:
+        """Hash one file after the other, in order of their names: (name, bytes, ``lost``, ``damaged`` or None)."""
+        after = ""
+        while True:
+            query = select(made_map.c.object, made_map.c.size).distinct().where(made_map.c.object > after)
+            with self._database.read() as connection:
+                rows = connection.execute(query.order_by(made_map.c.object).limit(BATCH)).all()
+            for row in rows:
+                yield row.object, row.size, self._problem_of(row.object)
+            if len(rows) < BATCH:
+                return
+            after = rows[-1].object
+
+    def _problem_of(self, name: str) -> str | None:
+        digest = hashlib.sha256()
+        try:
+            for block in self._files.stream(_object_key(name)):
+                digest.update(block)
+        except FileNotFoundError:
+            return "lost"
+        except OSError:  # a broken disk
+            return "damaged"
+        return None if digest.hexdigest() == name else "damaged"
+
+    def drop(self, name: str) -> None:
+        """Remove a file and its maps; they are made again when requested."""
+        with self._database.write(notify=False, upkeep=True) as connection:
+            connection.execute(delete(made_map).where(made_map.c.object == name))
+            self._files.delete([_object_key(name)])
 
     def collect(self, days: float = IDLE_DAYS) -> int:
         """Remove maps that no server has used for so many days; returns how many."""

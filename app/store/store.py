@@ -117,7 +117,7 @@ class Store:
 
     def verifier(self, progress: Progress = lambda kind, size: None) -> Verifier:
         """Create a verifier of everything that is stored."""
-        return Verifier(self._database, self.chunks, self.blobs, self.blob_upkeep, progress)
+        return Verifier(self._database, self.chunks, self.blobs, self.blob_upkeep, self.made_maps, progress)
 
     def check_pages(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
         """Check SQLite's tables after this one, each in a query of its own: (table, bytes, problem).

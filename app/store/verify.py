@@ -21,6 +21,7 @@ from app.store.blob_upkeep import BlobUpkeep
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
+from app.store.made_maps import MadeMaps
 from app.store.manifest import unpack_manifest
 from app.store.parts.rasters import tile_leaf
 from app.store.parts.resources import file_leaf
@@ -29,8 +30,10 @@ from app.store.prepare import version_root
 from app.store.tree import ChunkStage, Node
 from app.store.values import DRAFT_PREFIX, DRY_PREFIX, PartEntry
 
-Kind = Literal["database", "blob", "chunk", "version", "cache"]
+Kind = Literal["database", "blob", "chunk", "version", "cache", "shared map"]
 KINDS: Final[tuple[Kind, ...]] = ("database", "chunk", "version", "blob", "cache")
+"""What the background check reads; each reader of a shared map checks it."""
+
 VersionName = tuple[str, int | str]
 """An environment's name, and a version's number or the name of a draft or dry run: ``draft:…``, ``dry:…``."""
 
@@ -90,10 +93,11 @@ class Verifier:
         chunks: Chunks,
         blobs: Blobs,
         upkeep: BlobUpkeep,
+        made_maps: MadeMaps,
         progress: Progress = lambda kind, size: None,
     ) -> None:
         self._database, self._chunks, self._blobs, self._upkeep = database, chunks, blobs, upkeep
-        self._progress = progress
+        self._made_maps, self._progress = made_maps, progress
 
     def run(self) -> VerifyResult:
         """Check everything. Raises Unavailable if the database cannot be read at all."""
@@ -134,6 +138,10 @@ class Verifier:
         for environment, number, blob in self._sources():
             blob_users.setdefault(blob, []).append((environment, number))
         self._check_blobs(out, blob_users)
+        for shared, size, problem in self._made_maps.iterate_checks():
+            self._count(out, "shared map", size)
+            if problem is not None:
+                out.findings.append(Finding("shared map", shared, problem))
 
     def _check_pending(
         self, out: VerifyResult, walk: _Walk, chunks: dict[str, list[VersionName]], blobs: dict[str, list[VersionName]]

@@ -6,24 +6,30 @@ import base64
 import hashlib
 import os
 import random
+import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
+import uvicorn
 
 from app.config import Settings
+from app.convert.maps import Maps
 from app.errors import Unavailable
 from app.main import open_store
 from app.store.values import Source
+from app.worker import create_worker
 from tests.api import samples
 from tests.api.conftest import Api, parts, running, settings_for
-from tests.seaweed import Seaweed
+from tests.events.conftest import eventually
+from tests.seaweed import Fault, FaultyStore, Seaweed
 
 pytestmark = pytest.mark.postgres
 
@@ -50,9 +56,71 @@ def servers(settings: list[Settings]) -> Iterator[list[Api]]:
         yield [stack.enter_context(running(one)) for one in settings]
 
 
+def sha256_of(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def conversions(servers: list[Api]) -> int:
     """Return how many maps all servers have converted."""
     return sum(server.app.state.services.maps.cache.misses for server in servers)
+
+
+@contextmanager
+def working(settings: Settings) -> Iterator[Any]:
+    """Run a worker with these settings; yields the counter of its conversions."""
+    app = create_worker(settings)
+    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_config=None, lifespan="on"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        eventually(lambda: server.started and app.state.worker.is_connected, 60.0)
+        yield app.state.services.metrics.conversions
+    finally:
+        server.should_exit = True
+        thread.join(60)
+        assert not thread.is_alive(), "the worker did not stop"
+
+
+def test_job_of_one_server_is_followed_and_fetched_on_another(
+    settings: list[Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick, gate = Maps.get_or_convert, threading.Event()
+
+    def slow(self: Maps, recipe: Any, stop: Any) -> Any:
+        assert gate.wait(60)
+        return quick(self, recipe, stop)
+
+    quick_to_answer = settings[0].model_copy(update={"job_seconds": 0.2})
+    with running(quick_to_answer) as a, running(settings[1]) as b:
+        a.post("environments", {"name": "farm"})
+        a.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+        monkeypatch.setattr(Maps, "get_or_convert", slow)
+        started = a.get("/maps/farm/tmap2", 202).headers["location"]
+        assert b.get(started).json()["state"] == "running"
+        gate.set()
+        done = eventually(lambda: (job := b.get(started).json())["state"] == "done" and job, 60.0)
+        fetched = b.get(done["result"]["location"])
+        assert fetched.content == a.get("/maps/farm/tmap2").content
+        assert conversions([b]) == 0
+
+
+def test_worker_shares_nothing_with_its_servers_but_database_and_blob_store(
+    settings: list[Settings], tmp_path: Path
+) -> None:
+    """It reads uploaded meshes by their hashes, and leaves the map where the servers find it."""
+    files = {p.relative_to(YARD).as_posix(): p.read_bytes() for p in YARD.rglob("*") if p.is_file()}
+    url, place = settings[0].database_url, settings[0].blob_url
+    with ExitStack() as stack:
+        a, b = (stack.enter_context(running(one)) for one in settings)
+        counter = stack.enter_context(working(settings_for(tmp_path / "w", database_url=url, blob_url=place)))
+        a.post("environments", {"name": "yard"})
+        a.upload("yard", files)
+        maps = [server.get("/maps/yard/octomap").content for server in (b, a)]
+        assert maps[0] == maps[1]
+        assert counter.labels("octomap", "made")._value.get() == 1
+        copies = list((tmp_path / "w" / "blobs").glob("[0-9a-f][0-9a-f]/*"))
+        assert bool(copies) == str(place).startswith("s3:"), "files of the bucket, read by hash"
+        assert conversions([a, b]) == 0
 
 
 def test_map_made_on_one_server_is_served_by_all(servers: list[Api]) -> None:
@@ -153,14 +221,24 @@ def test_verify_repairs_files_wherever_they_are(settings: list[Settings], tmp_pa
     name = store.blobs.put(data)
     store.versions.add_sources("farm", 0, [Source("cloud.bin", len(data), name)])
     store.blobs.files.write({f"{name[:2]}/{name}": data[1:] + b"x"})
+    for key in ("intact", "damaged", "lost"):
+        store.made_maps.publish(key, b"{}", [key.encode()])
+    shared = {key: f"made/{sha256_of(key)[:2]}/{sha256_of(key)}" for key in ("damaged", "lost")}
+    store.blobs.files.write({shared["damaged"]: b"x" * len("damaged")})
+    store.blobs.files.delete([shared["lost"]])
     command = [sys.executable, "-m", "app.cli", "verify"]
     found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert found.returncode == 1, found.stdout + found.stderr
     assert name[:16] in found.stdout
+    assert "3 shared maps" in found.stdout
+    for key, path in shared.items():
+        assert [key in line for line in found.stdout.splitlines() if path[8:24] in line] == [True]
     command += ["--repair", "--from", str(tmp_path / "originals")]
     repaired = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert repaired.returncode == 0, repaired.stdout + repaired.stderr
     assert store.blobs.get(name) == data
+    assert len(list(store.made_maps.iterate_checks())) == len(list(store.blobs.files.list("made/"))) == 1
+    assert store.made_maps.load("intact") is not None
     store.close()
 
 
@@ -236,3 +314,40 @@ def test_server_serves_what_it_has_without_the_store_and_recovers(
         sources = api.get("environments/farm/versions/2").json()["sources"]
         assert {s["name"] for s in sources} == {"map.pgm", "map.yaml"}
         assert api.app.state.services.store.blob_upkeep.verify() == []
+
+
+def test_faults_of_the_store_are_named_and_end_by_themselves(
+    tmp_path: Path, seaweed: Seaweed, s3_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.backends.blob_s3.STALL_SECONDS", 1)
+    monkeypatch.setattr("app.backends.blob_s3.CONNECT_SECONDS", 1)
+    store = FaultyStore(seaweed.ports["s3"])
+    monkeypatch.setenv("AWS_ENDPOINT_URL", store.endpoint)
+    try:
+        with running(settings_for(tmp_path, blob_url=s3_url)) as api:
+            writability = api.app.state.services.writability
+            api.post("environments", {"name": "farm"})
+            api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+            made = api.get("/maps/farm/tmap2").content
+            faults = [(Fault(status=507), 507, "full"), (Fault(status=403), 503, "access was refused")]
+            for fault, status, reason in [*faults, (Fault(seconds=5.0), 503, "slowly")]:
+                store.fault = fault
+                writability.forget()
+                assert api.get("/readyz").json()["status"] == "read-only", reason
+                assert reason in api.problem("GET", "/readyz?for=writes", 503)["detail"]
+                refused = api("POST", "environments/farm/versions", status, files=parts(samples.grid()))
+                assert "nothing was stored" in refused.json()["detail"]
+                assert api.get("/maps/farm/tmap2").content == made
+                store.fault = Fault()
+                writability.forget()
+                assert api.get("/readyz").json()["status"] == "ready", reason
+            assert api.upload("farm", samples.grid()).json()["version"] == 2
+            source = api.get("environments/farm/versions/2/sources/map.pgm").content
+            services = api.app.state.services
+            shutil.rmtree(services.store.blob_dir)
+            store.fault = Fault(changes_bytes=True)
+            api.problem("GET", "environments/farm/versions/2/sources/map.pgm", 500)
+            store.fault = Fault()
+            assert api.get("environments/farm/versions/2/sources/map.pgm").content == source
+    finally:
+        store.close()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import random
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,7 @@ from app.backends.blob_s3 import S3Files
 from app.backends.blobs import BlobFiles, Unreadable
 from app.backends.local_copies import LocalCopies
 from app.errors import NoRoom, Unavailable
-from tests.seaweed import ACCESS, Seaweed
+from tests.seaweed import ACCESS, Fault, FaultyStore, Seaweed
 
 LARGE = random.Random(5).randbytes(12_000_000)
 
@@ -125,40 +123,16 @@ def test_store_that_is_gone_comes_back(seaweed: Seaweed, s3_url: str, tmp_path: 
     assert [f.key for f in files.list()] == ["ab/x"]
 
 
-class FailingStore(BaseHTTPRequestHandler):
-    """S3 server that answers every request with one status, after a while."""
-
-    status, seconds = 507, 0.0
-
-    def answer(self) -> None:
-        self.rfile.read(int(self.headers.get("content-length") or 0))
-        time.sleep(type(self).seconds)
-        self.send_response(type(self).status)
-        self.send_header("content-length", "0")
-        self.end_headers()
-
-    do_GET = do_PUT = do_POST = do_DELETE = answer
-
-    def log_message(self, *_: object) -> None:
-        """Print nothing."""
-
-
 @pytest.fixture
-def failing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[S3Files]:
-    """A blob store on a server that fails as ``FailingStore`` says."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), FailingStore)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    for name, value in {**ACCESS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}"}.items():
+def faulty(monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyStore]:
+    """A store that answers every request as its ``fault`` says."""
+    store = FaultyStore(0)
+    for name, value in {**ACCESS, "AWS_ENDPOINT_URL": store.endpoint}.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("app.backends.blob_s3.STALL_SECONDS", 1)
     monkeypatch.setattr("app.backends.blob_s3.CONNECT_SECONDS", 1)
-    files = S3Files("s3://maps/x", tmp_path)
-    files.prepare()
-    yield files
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    yield store
+    store.close()
 
 
 @pytest.mark.parametrize(
@@ -171,10 +145,11 @@ def failing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[S3Files
     ],
 )
 def test_failing_store_is_named_with_its_reason(
-    failing: S3Files, monkeypatch: pytest.MonkeyPatch, status: int, seconds: float, error: type[Exception], reason: str
+    faulty: FaultyStore, tmp_path: Path, status: int, seconds: float, error: type[Exception], reason: str
 ) -> None:
-    monkeypatch.setattr(FailingStore, "status", status)
-    monkeypatch.setattr(FailingStore, "seconds", seconds)
+    faulty.fault = Fault(status, seconds)
+    failing = S3Files("s3://maps/x", tmp_path)
+    failing.prepare()
     with pytest.raises(error, match=reason) as caught:
         failing.check()
     assert "127.0.0.1" not in str(caught.value)
