@@ -178,7 +178,10 @@ def _has_uvloop() -> bool:
 def open_store(settings: Settings, *, readonly: bool = False) -> Store:
     """Open the database and the blob store of the settings."""
     url = settings.blob_url or ""
-    files: BlobFiles | None = S3Files(url, settings.blob_dir) if url.startswith("s3://") else None
+    files: BlobFiles | None = None
+    if url.startswith("s3://"):
+        secret = settings.blob_secret_key.get_secret_value() if settings.blob_secret_key else None
+        files = S3Files(url, settings.blob_dir, access_key=settings.blob_access_key, secret_key=secret)
     return Store(
         settings.database,
         settings.blob_dir,

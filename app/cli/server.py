@@ -57,7 +57,7 @@ PANELS: Mapping[str, str] = {
 }
 """Help panels by the first word of a setting; the others are in the first panel."""
 
-NOT_FLAGS = frozenset({"admin_token", "zenoh_password"})
+NOT_FLAGS = frozenset({"admin_token", "blob_secret_key", "zenoh_password"})
 """Settings without an option: secrets in a command line are visible to all users of the machine."""
 
 DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
