@@ -92,8 +92,12 @@ class Site:
             configuration["connect"] = {"endpoints": [values["--connect"]]}
         assert "--no-multicast-scouting" in values
         assert configuration["scouting"]["multicast"]["enabled"] is False
-        self.routers[name] = Router(json.dumps(configuration))
-        assert self.routers[name].problem is None
+
+        def starts() -> bool:  # its port may be taken for a moment after a stop
+            self.routers[name] = Router(json.dumps(configuration))
+            return self.routers[name].problem is None
+
+        eventually(starts)
 
     def wait_ready(self, name: str) -> None:
         """Wait until a server or worker is ready; fails at once if it has ended."""

@@ -119,6 +119,22 @@ def test_event_reaches_a_robot_through_the_other_router(site: Site) -> None:
             assert [event["type"] for event in late.events if event["sequence"] == 3] == ["version.created"]
 
 
+def test_events_go_on_when_a_router_stops_and_comes_back(site: Site) -> None:
+    create(site, "mesh")
+    with site.robot_session("router-2") as robot:
+        listener = Listener(robot, "fleetmap/mesh/events")
+        listener.wait(lambda e: e.sequences() == [1])
+        site.routers["router-1"].close()
+        site.upload(site.https, "mesh", 0.0)
+        listener.wait(lambda e: e.sequences() == [1, 2])
+        eventually(lambda: all(site.is_connected(name) for name in SERVERS))
+        site.start_router("router-1")
+        with site.robot_session("router-1") as other:
+            late = Listener(other, "fleetmap/mesh/events")
+            site.upload(site.https, "mesh", 0.5)
+            late.wait(lambda e: sorted(e.sequences()) == [1, 2, 3])
+
+
 def test_services_share_no_folder_and_log_no_secret(site: Site) -> None:
     for name in SERVERS:
         folder = site.containers[name].folder / "data"
