@@ -3,11 +3,13 @@
 With ``--scale`` also those of compose.scale.yaml and Kubernetes: the key of the S3 server, a certification authority
 with the certificate of the proxy and the Zenoh routers (by ``openssl``), and the routers' users and rules. The rules
 are written again each time: after a change of ``robots`` run this again, and restart the routers one by one.
+``--kubernetes`` prints the files as secrets of Kubernetes.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import json
 import secrets
 import subprocess
@@ -23,6 +25,19 @@ ROUTERS = ("router-1", "router-2")
 ROUTER_PORT = 7447
 INSIDE = "/run/secrets"
 """Where containers find the secrets."""
+_OF_ALL = ("fleetmap_database_url", "fleetmap_blob_access_key", "fleetmap_blob_secret_key")
+_OF_SERVERS = ("fleetmap_admin_token", "fleetmap_zenoh_password", "ca.pem")
+_OF_ROUTERS = ("router.json5", "router_users", "ca.pem", "server.pem", "server.key")
+KUBERNETES = {
+    "fleetmap": {name: name for name in _OF_ALL},
+    "fleetmap-server": {name: name for name in _OF_SERVERS},
+    "fleetmap-router": {name: name for name in _OF_ROUTERS},
+    "fleetmap-database": {"database_password": "database_password"},
+    "fleetmap-store": {"store_users.json": "store_users.json"},
+    "fleetmap-tls": {"tls.crt": "server.pem", "tls.key": "server.key"},
+}
+"""Secrets of the manifests: name -> key -> file."""
+
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 825
 ROBOTS = """\
 # Users of the Zenoh routers: one robot a line, NAME:PASSWORD (letters, digits, dots, - and _). Then run
@@ -84,6 +99,18 @@ def make_scale(folder: Path, hosts: list[str]) -> list[str]:
     _write(folder / "router_users", users)
     _write(folder / "router.json5", rules)
     return written
+
+
+def kubernetes_secrets(folder: Path) -> str:
+    """Return the existing secrets as a list of Kubernetes objects, in JSON."""
+
+    def secret(name: str, files: dict[str, str]) -> dict[str, object]:
+        data = {key: base64.b64encode((folder / file).read_bytes()).decode() for key, file in files.items()}
+        kind = "kubernetes.io/tls" if "tls.key" in files else "Opaque"
+        return {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": name}, "type": kind, "data": data}
+
+    items = [secret(name, files) for name, files in KUBERNETES.items()]
+    return json.dumps({"apiVersion": "v1", "kind": "List", "items": items}, indent=2)
 
 
 def _write_missing(folder: Path, contents: dict[str, str]) -> list[str]:
@@ -196,7 +223,13 @@ if __name__ == "__main__":
     parser.add_argument("folder", nargs="?", type=Path, default=HERE / "secrets")
     parser.add_argument("--scale", action="store_true", help="also those of compose.scale.yaml")
     parser.add_argument("--host", action="append", default=[], help="name or address of this machine, may be repeated")
+    parser.add_argument("--kubernetes", action="store_true", help="print the existing ones as secrets of Kubernetes")
     options = parser.parse_args()
+    if options.kubernetes:
+        if not (options.folder / "router.json5").exists():
+            raise SystemExit(f"{options.folder} is not complete: run make_secrets.py --scale first")
+        print(kubernetes_secrets(options.folder))
+        raise SystemExit(0)
     names = make(options.folder)
     if options.scale:
         names += make_scale(options.folder, options.host)
