@@ -141,10 +141,14 @@ def _store_users(folder: Path) -> str:
 def _router(folder: Path) -> tuple[str, str]:
     """Users of both routers, and their configuration, with the rules and limits of the server's own router."""
     sys.path.insert(0, str(HERE.parent))
+    from app.errors import Invalid  # of this checkout, which needs no packages for this
     from app.events.security import SERVER, access_control, read_users
 
     lines = [line for line in (folder / "robots").read_text().splitlines() if line.strip() and line.strip()[0] != "#"]
-    robots = read_users(folder / "robots") if lines else {}
+    try:
+        robots = read_users(folder / "robots") if lines else {}
+    except Invalid as error:
+        raise SystemExit(error.detail) from None
     if ROUTER in robots:
         raise SystemExit(f"{folder / 'robots'}: the name {ROUTER} is reserved")
     passwords = {SERVER: "fleetmap_zenoh_password", ROUTER: "router_password"}
