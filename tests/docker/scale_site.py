@@ -197,9 +197,9 @@ class Fetches:
 
 
 def fetch_round_robin(
-    site: Site, environment: str, count: int, rotate_at: Sequence[int], formats: str = "tmap2,geojson"
+    site: Site, environment: str, count: int, rotate_at: Sequence[int], commit_at: Sequence[int] = ()
 ) -> Fetches:
-    """Fetch manifest and maps like a robot, each from the next server, with key rotations at the next one in between.
+    """Fetch manifest and maps like a robot, each from the next server; in between rotate keys and commit versions.
 
     A refusal is a manifest whose signer the robot's key does not endorse, or a map of another hash than its manifest's.
     """
@@ -209,7 +209,9 @@ def fetch_round_robin(
     for number in range(count):
         if number in rotate_at:
             site.call(next(turn), "POST", "keys", json={})
-        answer = next(turn).get(f"{versions}/latest/manifest?formats={formats}")
+        if number in commit_at:
+            site.upload(next(turn), environment, 1.0 + number / 100)
+        answer = next(turn).get(f"{versions}/latest/manifest?formats=tmap2,geojson")
         assert answer.status_code == 200, answer.text
         signature = answer.headers["Fleetmap-Signature"]
         try:
