@@ -26,7 +26,7 @@ import typer
 
 from app.cli import local, options, output, variables
 from app.cli.problems import RequestFailed
-from app.errors import FleetMapError, NoRoom, Unavailable
+from app.errors import FleetMapError, Unavailable
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -362,10 +362,9 @@ def check(settings: Settings) -> None:
         with startup_lock(settings.data_dir):
             store.initialise()
         store.check()
-        try:
-            store.check_writable()
-        except NoRoom as error:  # reading still works
-            output.print_status(error.detail, style="yellow")
+        problem = store.write_problem()
+        if problem is not None:
+            output.print_status(problem, style="yellow")
 
 
 def with_demo_token(settings: Settings) -> Settings:
