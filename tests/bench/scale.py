@@ -11,13 +11,14 @@ from typing import Any
 
 import httpx
 
-from tests.docker.scale_site import SERVERS, Load, ReadinessWatch, Site, fetch_round_robin, running_site
+from tests.docker.scale_site import SERVERS, Load, ReadinessWatch, Site, fetch_round_robin, read_delays, running_site
 from tests.docker.schema_upgrade import upgrade_to_later_revision
 from tests.postgres import running_cluster
 
 FETCHES = 1000
 ROTATIONS = (250, 500, 750)
 COMMITS = tuple(range(100, FETCHES, 100))
+READS = 200
 REQUESTS = 200
 """Requests of the load between two events."""
 
@@ -27,7 +28,7 @@ def rows() -> list[dict[str, Any]]:
     with running_cluster() as cluster, tempfile.TemporaryDirectory() as folder:
         url = cluster.url(cluster.create_database())
         with running_site(Path(folder), url) as site:
-            return [*_fetches(site), *_deltas(site), *_upgrade(site, url), *_kills(site)]
+            return [*_fetches(site), *_deltas(site), *_commits(site), *_upgrade(site, url), *_kills(site)]
 
 
 def _row(what: str, ours: float, bound: float, unit: str, peer: float | None = None) -> dict[str, Any]:
@@ -85,6 +86,14 @@ def _deltas(site: Site) -> list[dict[str, Any]]:
     sizes = [size(client) for client in site.servers.values()]
     label = "a moved node from a server that made neither map (peer: from the one that made both)"
     return [_row(label, max(sizes), 1, "B", sizes[0])]
+
+
+def _commits(site: Site) -> list[dict[str, Any]]:
+    """Measure how long after a commit another server serves it."""
+    _create(site, "commits")
+    delays = read_delays(site, "commits", READS)
+    worst = delays[READS * 99 // 100]
+    return [_row(f"commit on one server, read on another: 99th percentile of {READS}", worst * 1e3, 100, "ms")]
 
 
 def _upgrade(site: Site, url: str) -> list[dict[str, Any]]:

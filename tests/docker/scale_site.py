@@ -232,6 +232,23 @@ def fetch_round_robin(
     return fetches
 
 
+def read_delays(site: Site, environment: str, commits: int) -> list[float]:
+    """Commit on one server and poll another one, which serves the version before from memory.
+
+    Returns the seconds from each commit's answer to the new map, sorted.
+    """
+    writer, reader, *_ = site.servers.values()
+    address, delays = f"/maps/{environment}/tmap2", []
+    for number in range(commits):
+        before = reader.get(address).headers["etag"]
+        site.upload(writer, environment, 2.0 + number / 1000)
+        start = time.monotonic()
+        while reader.head(address).headers["etag"] == before:
+            assert time.monotonic() - start < START_SECONDS
+        delays.append(time.monotonic() - start)
+    return sorted(delays)
+
+
 class Load:
     """Clients of the proxy that read and commit until they are stopped. failures: requests that were not answered.
 

@@ -88,6 +88,7 @@ def test_only_proxy_and_routers_are_published(compose: dict[str, Any]) -> None:
     for name in ("database", "store"):
         assert services[name]["networks"] == ["inside"]
     assert services["proxy"]["networks"] == ["web"], "it reaches servers only"
+    assert services["router-1"]["networks"] == services["router-2"]["networks"] == ["outside"]
     assert {name for name, service in services.items() if "web" in service["networks"]} == {
         "proxy",
         *(f"server-{number}" for number in (1, 2, 3)),

@@ -15,7 +15,16 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from tests.docker.scale_site import SERVERS, WORKERS, Load, ReadinessWatch, Site, fetch_round_robin, running_site
+from tests.docker.scale_site import (
+    SERVERS,
+    WORKERS,
+    Load,
+    ReadinessWatch,
+    Site,
+    fetch_round_robin,
+    read_delays,
+    running_site,
+)
 from tests.docker.schema_upgrade import upgrade_to_later_revision
 from tests.events.conftest import Listener, eventually
 from tests.postgres import Cluster
@@ -23,6 +32,7 @@ from tests.postgres import Cluster
 pytestmark = [pytest.mark.postgres, pytest.mark.timeout(600)]
 
 FETCHES = 24
+COMMITS = 9
 CAVE = {"generator": "cave", "parameters": {"width": 8.0, "depth": 8.0}, "replace": True}
 
 
@@ -85,6 +95,35 @@ def test_pinned_robot_accepts_all_servers_across_a_key_rotation(site: Site) -> N
     assert len(list(itertools.groupby(fetches.signers))) == 2, "no server signs with the older key afterwards"
     assert len(fetches.recipes) == 2
     assert sum(site.conversions().values()) == before + len(fetches.recipes)
+
+
+def test_commit_on_one_server_is_read_on_another_soon(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    """The other one keeps its answer in memory for a second, unless it is notified."""
+    create(site, "commits")
+    site.upload(site.https, "commits", 0.0)
+    delays = read_delays(site, "commits", COMMITS)
+    with capsys.disabled():
+        print(f"\ncommit read on another server: {', '.join(f'{delay:.3f}' for delay in delays)} s")
+    assert delays[COMMITS // 2] < 0.5
+
+
+def test_signed_link_and_session_of_one_server_are_valid_on_all(site: Site) -> None:
+    create(site, "guests")
+    site.upload(site.https, "guests", 0.0)
+    a, b, c = site.servers.values()
+    link = site.call(a, "POST", "environments/guests/versions/1/links", json={"format": "tmap2"})
+    path = httpx.URL(link["url"]).raw_path.decode()
+    assert len({httpx.get(client.base_url.join(path)).raise_for_status().content for client in (a, b, c)}) == 1
+
+    token = site.containers[SERVERS[0]].secret("fleetmap_admin_token")
+    started = httpx.post(a.base_url.join("/api/v1/session"), json={"token": token}).raise_for_status()
+    cookies = {"fleetmap_session": started.cookies["fleetmap_session"]}
+    sessions = [httpx.Client(base_url=client.base_url, cookies=cookies) for client in (a, b, c)]
+    assert {session.get("/api/v1/session").status_code for session in sessions} == {200}
+    sessions[1].delete("/api/v1/session", headers={"Origin": str(b.base_url)}).raise_for_status()
+    eventually(lambda: sessions[2].get("/api/v1/session").status_code == 401)
+    for session in sessions:
+        session.close()
 
 
 def test_all_servers_send_deltas(site: Site) -> None:
