@@ -49,6 +49,12 @@ class Settings(BaseSettings):
         "the usual `AWS_*` variables. Servers with one PostgreSQL database must share it. Default: `blobs` in the data "
         "folder, for one server.",
     )
+    blob_access_key: str | None = Field(
+        default=None, description="Access key of the S3 server. Unset: `AWS_ACCESS_KEY_ID`, or the machine's role."
+    )
+    blob_secret_key: SecretStr | None = Field(
+        default=None, description="Secret of `blob_access_key`. Unset: `AWS_SECRET_ACCESS_KEY`."
+    )
     blob_cache_bytes: int = Field(
         default=4 * 2**30,
         ge=0,
@@ -378,6 +384,8 @@ class Settings(BaseSettings):
         "database_direct_url",
         "signing_key",
         "blob_url",
+        "blob_access_key",
+        "blob_secret_key",
         "admin_token",
         "tls_certificate",
         "tls_key",
@@ -419,6 +427,14 @@ class Settings(BaseSettings):
         if value is not None and value.startswith("s3://") and not urlsplit(value).netloc:
             raise ValueError("no bucket: use s3://bucket or s3://bucket/prefix")
         return value
+
+    @model_validator(mode="after")
+    def _blob_keys_are_whole(self) -> Self:
+        if (self.blob_access_key is None) != (self.blob_secret_key is None):
+            raise ValueError("blob_access_key and blob_secret_key must be set together")
+        if self.blob_access_key is not None and not (self.blob_url or "").startswith("s3://"):
+            raise ValueError("blob_access_key requires a blob_url in S3: s3://bucket/prefix")
+        return self
 
     @model_validator(mode="after")
     def _direct_url_needs_postgres(self) -> Self:

@@ -50,7 +50,7 @@ from app.convert.preview import Previews
 from app.convert.shared_maps import SharedMaps
 from app.convert.tiles import Tiles
 from app.convert.views import Views
-from app.errors import Conflict, DatabaseDamaged, FleetMapError, LostBlobs, NoRoom, Unavailable
+from app.errors import Conflict, DatabaseDamaged, FleetMapError, LostBlobs, Unavailable
 from app.events import bus, relay
 from app.events.bus import Bus, BusOptions
 from app.events.credentials import ZenohCredentials
@@ -178,7 +178,10 @@ def _has_uvloop() -> bool:
 def open_store(settings: Settings, *, readonly: bool = False) -> Store:
     """Open the database and the blob store of the settings."""
     url = settings.blob_url or ""
-    files: BlobFiles | None = S3Files(url, settings.blob_dir) if url.startswith("s3://") else None
+    files: BlobFiles | None = None
+    if url.startswith("s3://"):
+        secret = settings.blob_secret_key.get_secret_value() if settings.blob_secret_key else None
+        files = S3Files(url, settings.blob_dir, access_key=settings.blob_access_key, secret_key=secret)
     return Store(
         settings.database,
         settings.blob_dir,
@@ -204,11 +207,11 @@ def open_services(settings: Settings) -> Services:
                     "" if settings.database.startswith("sqlite") else " (run `fleetmap migrate` to update the schema)"
                 )
                 raise Unavailable(error.detail + hint) from error
-            try:
-                store.check_writable()
+            problem = store.write_problem()
+            if problem is None:
                 store.recover()
-            except NoRoom as error:  # reading still works
-                log.error("%s", error.detail)  # noqa: TRY400  a trace shows paths
+            else:
+                log.error("%s", problem)
             if not settings.insecure_no_auth:
                 _ensure_first_token(store, settings)
             intake = UploadSpool(settings.spool_dir, settings.limits, at_once=settings.max_uploads)

@@ -1,4 +1,4 @@
-"""Blob store in an S3 bucket, by obstore. Access is configured by the usual ``AWS_*`` environment variables."""
+"""Blob store in an S3 bucket, by obstore. The usual ``AWS_*`` environment variables configure the access."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from app.backends.workspaces import Workspaces
 from app.errors import NoRoom, Unavailable
 
 if TYPE_CHECKING:
-    from obstore.store import ClientConfig, RetryConfig
+    from obstore.store import ClientConfig, RetryConfig, S3Config
 
 CONNECT_SECONDS: Final = 3
 STALL_SECONDS: Final = 10
@@ -35,16 +35,24 @@ _REFUSED: Final = ("401 ", "403 ", "AccessDenied", "SignatureDoesNotMatch", "Inv
 
 
 class S3Files:
-    """Files in a bucket, below the URL ``s3://bucket[/prefix]``. folder: for workspaces on this machine."""
+    """Files in a bucket, below the URL ``s3://bucket[/prefix]``.
+
+    Args:
+        folder: for workspaces on this machine.
+        access_key, secret_key: instead of those of the ``AWS_*`` variables.
+    """
 
     remote = True
 
-    def __init__(self, url: str, folder: Path) -> None:
+    def __init__(self, url: str, folder: Path, *, access_key: str | None = None, secret_key: str | None = None) -> None:
         parts = urlsplit(url)
         self._place = f"s3://{parts.netloc}{parts.path.rstrip('/')}"
         self._workspaces = Workspaces(folder / "tmp")
-        self._store = _open(parts.netloc, parts.path, retries=RETRIES, stall=STALL_SECONDS)
-        self._probing = _open(parts.netloc, parts.path, retries=0, stall=CONNECT_SECONDS)
+        keys: S3Config = {}
+        if access_key is not None and secret_key is not None:
+            keys = {"access_key_id": access_key, "secret_access_key": secret_key}
+        self._store = _open(parts.netloc, parts.path, keys, retries=RETRIES, stall=STALL_SECONDS)
+        self._probing = _open(parts.netloc, parts.path, keys, retries=0, stall=CONNECT_SECONDS)
         self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-s3")
 
     def prepare(self) -> None:
@@ -134,7 +142,7 @@ class S3Files:
         return Unavailable(f"{self._place} cannot be written ({reason}), and nothing was stored: try again later")
 
 
-def _open(bucket: str, prefix: str, *, retries: int, stall: int) -> S3Store:
+def _open(bucket: str, prefix: str, keys: S3Config, *, retries: int, stall: int) -> S3Store:
     client: ClientConfig = {
         "allow_http": True,  # if the endpoint's address says so
         "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
@@ -142,7 +150,8 @@ def _open(bucket: str, prefix: str, *, retries: int, stall: int) -> S3Store:
         "timeout": timedelta(seconds=REQUEST_SECONDS if retries else stall),
     }
     retry: RetryConfig = {"max_retries": retries, "retry_timeout": timedelta(seconds=2 * STALL_SECONDS)}
-    return S3Store(bucket, prefix=prefix.strip("/") or None, client_options=client, retry_config=retry)
+    folder = prefix.strip("/") or None
+    return S3Store(bucket, prefix=folder, config=keys, client_options=client, retry_config=retry)
 
 
 def _is_of_store(error: OSError) -> bool:
@@ -154,7 +163,10 @@ def _reason(error: Exception) -> str:
     """Return why a request failed, in a few words, without addresses and signatures."""
     text = str(error)
     if any(word in text for word in _REFUSED):
-        return "access was refused: check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and the bucket's policy"
+        return (
+            "access was refused: check the bucket's policy, and the keys (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, or "
+            "FLEETMAP_BLOB_ACCESS_KEY, FLEETMAP_BLOB_SECRET_KEY)"
+        )
     if "NoSuchBucket" in text:
         return "no such bucket: create it"
     if any(word in text for word in _FULL):

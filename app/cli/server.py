@@ -26,7 +26,7 @@ import typer
 
 from app.cli import local, options, output, variables
 from app.cli.problems import RequestFailed
-from app.errors import FleetMapError, NoRoom, Unavailable
+from app.errors import FleetMapError, Unavailable
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -57,7 +57,7 @@ PANELS: Mapping[str, str] = {
 }
 """Help panels by the first word of a setting; the others are in the first panel."""
 
-NOT_FLAGS = frozenset({"admin_token", "zenoh_password"})
+NOT_FLAGS = frozenset({"admin_token", "blob_secret_key", "zenoh_password"})
 """Settings without an option: secrets in a command line are visible to all users of the machine."""
 
 DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
@@ -362,10 +362,9 @@ def check(settings: Settings) -> None:
         with startup_lock(settings.data_dir):
             store.initialise()
         store.check()
-        try:
-            store.check_writable()
-        except NoRoom as error:  # reading still works
-            output.print_status(error.detail, style="yellow")
+        problem = store.write_problem()
+        if problem is not None:
+            output.print_status(problem, style="yellow")
 
 
 def with_demo_token(settings: Settings) -> Settings:

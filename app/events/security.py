@@ -128,8 +128,12 @@ def read_users(path: Path) -> dict[str, str]:
     return users
 
 
-def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
-    """Return Zenoh's access control. Denied messages are dropped; to see them, set ``RUST_LOG=zenoh=trace``."""
+def access_control(prefix: str, robots: Iterable[str], router: str | None = None) -> dict[str, Any]:
+    """Return Zenoh's access control. Denied messages are dropped; to see them, set ``RUST_LOG=zenoh=trace``.
+
+    router: name of the other routers of a mesh. A router knows the one that connects to it by its user, and the one
+    that it connects to by its certificate: both have this name.
+    """
 
     def rule(name: str, flows: list[str], kinds: Iterable[str], keys: Iterable[str]) -> dict[str, Any]:
         return {"id": name, "permission": "allow", "flows": flows, "messages": list(kinds), "key_exprs": list(keys)}
@@ -145,11 +149,16 @@ def access_control(prefix: str, robots: Iterable[str]) -> dict[str, Any]:
         rule("robots: receive all", ["egress"], (*PUBLISHER_MESSAGES, *SUBSCRIBER_MESSAGES), ALL_KEYS),
         rule("robots: subscribe and query all", ["ingress"], SUBSCRIBER_MESSAGES, ALL_KEYS),
     ]
-    subjects = [{"id": SERVER, "usernames": [SERVER]}, {"id": "robots", "usernames": names}]
-    policies = [
-        {"rules": [rules[0]["id"]], "subjects": [SERVER]},
-        {"rules": [rules[1]["id"], rules[2]["id"]], "subjects": ["robots"]},
-    ]
+    subjects = [{"id": SERVER, "usernames": [SERVER]}]
+    if router is not None:
+        subjects += [
+            {"id": "router that connects", "usernames": [router]},
+            {"id": "router that is connected to", "cert_common_names": [router]},
+        ]
+    policies = [{"rules": [rules[0]["id"]], "subjects": [str(subject["id"]) for subject in subjects]}]
+    if names:  # a subject without names would be every client
+        subjects.append({"id": "robots", "usernames": names})
+        policies.append({"rules": [rules[1]["id"], rules[2]["id"]], "subjects": ["robots"]})
     for name in names:
         robot_rules = [
             rule(f"status of {name}", ["ingress"], ["put"], [messages.status_key(prefix, "*", name)]),

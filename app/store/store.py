@@ -11,7 +11,7 @@ from sqlalchemy import Connection, select
 
 from app.backends.blobs import BlobFiles
 from app.backends.notify import CommitCounter
-from app.errors import DatabaseDamaged
+from app.errors import DatabaseDamaged, NoRoom, Unavailable
 from app.store import schema, tables
 from app.store.audit import Audit, record
 from app.store.base import utcnow
@@ -110,6 +110,23 @@ class Store:
         """Raise Unavailable (NoRoom: a full disk) unless the blob folder and the database's folder can be written."""
         self.blobs.check()
         self._database.check_room()
+
+    def write_problem(self) -> str | None:
+        """Return why nothing can be stored although reading works: a full disk, or a file store that is away, or None.
+
+        For the start. Raises Unavailable if the blob folder is unusable: another folder is needed.
+        """
+        try:
+            self.check_writable()
+        except NoRoom as error:
+            return error.detail
+        except DatabaseDamaged:
+            raise
+        except Unavailable as error:
+            if not self.blobs.files.remote:
+                raise
+            return error.detail
+        return None
 
     def note_damage(self, error: DatabaseDamaged) -> None:
         """Note that another process found the database damaged: from now on ``check`` fails."""

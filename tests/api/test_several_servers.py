@@ -306,6 +306,10 @@ def test_server_serves_what_it_has_without_the_store_and_recovers(
             refused = api("POST", "environments/farm/versions", 503, files=parts(samples.grid()))
             assert "nothing was stored" in refused.json()["detail"]
             assert api.get("environments/farm").json()["version"] == 1
+            later = settings_for(tmp_path / "later", database_url=postgres_url, blob_url=s3_url)
+            with running(later) as started:
+                assert started.get("/readyz").json()["status"] == "read-only"
+                assert started.get("/maps/farm/tmap2").content == made.content
         finally:
             seaweed.start()
         api.app.state.services.writability.forget()
