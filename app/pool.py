@@ -15,6 +15,7 @@ import os
 import queue
 import resource
 import threading
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ _processes = multiprocessing.get_context("forkserver")
 
 PRELOADED_MODULES = ("app.ingest.prepare", "app.convert.warm")
 """Modules that the server's worker processes import before their first job."""
+
+FORK_SERVER_TRIES, FORK_SERVER_SECONDS = 40, 0.05
 
 CANCEL_POLL_SECONDS = 0.2
 """Seconds between two checks of a queued job for its cancellation."""
@@ -205,8 +208,8 @@ class Pool:
         arguments = (theirs, {**os.environ, **self._environment}, self._memory_bytes, self._warm, self._allowed)
         process = _processes.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
         try:
-            process.start()
-        except (OSError, EOFError) as error:  # EOFError: the fork server ended; it is restarted
+            _start(process)
+        except (OSError, EOFError) as error:
             ours.close()
             raise Unavailable("the system cannot start another process: try again in a few seconds") from error
         finally:
@@ -228,6 +231,18 @@ class Pool:
         _kill(worker.process)
         worker.process.join(5.0)
         worker.pipe.close()
+
+
+def _start(process: BaseProcess) -> None:
+    """Start a process. If the fork server has just ended, multiprocessing starts another one once it notices."""
+    for left in reversed(range(FORK_SERVER_TRIES)):
+        try:
+            process.start()
+            break
+        except (EOFError, ConnectionError):
+            if not left:
+                raise
+            time.sleep(FORK_SERVER_SECONDS)
 
 
 def _kill(process: BaseProcess) -> None:

@@ -10,6 +10,8 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -173,6 +175,17 @@ def test_failed_process_start_raises_unavailable(pool: Pool, monkeypatch: pytest
         with pytest.raises(Unavailable, match="try again"):
             pool.run(work_double, 1)
     assert pool.run(work_double, 1) == 2
+
+
+def test_worker_starts_when_the_fork_server_dies_meanwhile(pool: Pool) -> None:
+    forkserver.ensure_running()
+    before = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+    os.kill(before, signal.SIGSTOP)
+    with ThreadPoolExecutor(1) as thread:
+        result = thread.submit(pool.run, work_double, 4)
+        time.sleep(0.2)  # it waits for the fork server
+        os.kill(before, signal.SIGKILL)
+        assert result.result(60) == 8
 
 
 def test_waiting_job_raises_unavailable_when_pool_closes(pool: Pool) -> None:
