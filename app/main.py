@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
 import shutil
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ from app.backends.blob_s3 import S3Files
 from app.backends.blobs import BlobFiles
 from app.backends.documents import FileDocument
 from app.backends.lead import open_leads
+from app.backends.locks import file_lock
 from app.backends.notify import Listener
 from app.backends.shared_queue import SharedQueue
 from app.config import Settings
@@ -411,8 +412,8 @@ def start_scrub(settings: Settings, services: Services) -> Scrub | None:
         return None
     sample = partial(services.maps.cache.sample, CACHE_SHARE)
     rate = settings.scrub_bytes_per_second
-    lead = services.leads.lead("scrub") if services.store.is_shared else None
-    scrub = Scrub(services.store, sample, every=settings.scrub_hours * 3600, rate=rate, lead=lead)
+    lead = services.leads.lead("scrub")
+    scrub = Scrub(services.store, sample, lead, every=settings.scrub_hours * 3600, rate=rate)
     scrub.start()
     return scrub
 
@@ -516,12 +517,9 @@ def _prepare(services: Services) -> None:
         services.prepared.set()
 
 
-@contextlib.contextmanager
-def startup_lock(data_dir: Path) -> Iterator[None]:
+def startup_lock(data_dir: Path) -> AbstractContextManager[None]:
     """Lock a data folder for the start of one process at a time, so that migration and recovery run once."""
-    with (data_dir / "start.lock").open("w") as handle:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
+    return file_lock(data_dir / "start.lock")
 
 
 def _ensure_first_token(store: Store, settings: Settings) -> None:

@@ -7,7 +7,6 @@ successor, so that a robot with a pinned old key can trust the new one.
 from __future__ import annotations
 
 import base64
-import fcntl
 import hashlib
 import json
 import logging
@@ -25,6 +24,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from app.backends.documents import Document, write_private
+from app.backends.locks import file_lock
 from app.errors import Conflict, Unavailable
 
 log = logging.getLogger(__name__)
@@ -144,8 +144,7 @@ class Keys(SigningKeys):
     @contextmanager
     def _exclusive(self) -> Iterator[None]:
         self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with (self._folder / "lock").open("w") as handle:
-            fcntl.flock(handle, fcntl.LOCK_EX)
+        with file_lock(self._folder / "lock"):
             yield
 
     def _read_files(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:

@@ -66,6 +66,33 @@ PUBLIC_NAMES = {
 }
 """Exceptions with their reasons."""
 
+WRITERS = {
+    "app/api/http/metrics.py": "gives room on the disk to files that Prometheus's client has made",
+    "app/api/http/uploads.py": "files of an upload, in a workspace",
+    "app/convert/cache.py": "a map's files are renamed, linked and synced as one folder, which no other store does",
+    "app/convert/trials.py": "a log of which one line is appended at a time",
+    "app/events/router.py": "hands settings to its process by a descriptor",
+    "app/events/security.py": "files of passwords, which the router's process reads",
+    "app/ingest/online.py": "a cache by address: nobody knows the hash of what a provider will send",
+    "app/main.py": "creates the data folder and the folder of Prometheus's client",
+    "app/native.py": "compiled code, outside of the data folder",
+    "app/review/graph_rules.py": "no file: a method of the same name",
+    "app/signing.py": "a private key in a file of its own, as operators back it up and remove it",
+    "app/store/blob_coding.py": "temporary files, in a workspace",
+    "app/store/blobs.py": "the same",
+    "app/store/made_maps.py": "the same",
+    "app/store/database.py": "creates the folder of SQLite's file",
+    "app/syntax/geotiff.py": "no file: rasterio writes to memory",
+    "app/web/build.py": "the page, when it is built",
+}
+"""Modules beside ``app/backends`` that write files on the server, with their reasons."""
+
+WRITING = {
+    *("write_bytes", "write_text", "mkdir", "unlink", "rmtree", "rename", "hardlink_to", "symlink_to", "copyfile"),
+    *("fdopen", "posix_fallocate", "NamedTemporaryFile", "TemporaryDirectory"),
+}
+"""Functions that write files, besides ``open`` with such a mode."""
+
 
 @cache
 def modules(folder: str) -> dict[str, ast.Module]:
@@ -147,6 +174,33 @@ def test_private_modules_are_imported_in_their_package_only() -> None:
 def is_module(pieces: list[str]) -> bool:
     path = TOP.joinpath(*pieces)
     return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def calls_of_writers(tree: ast.Module) -> Iterator[str]:
+    """List the functions that write files, where a module calls them."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            texts = [one.value for one in node.args if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+            if name in WRITING or (name == "open" and any(len(text) < 4 and set(text) & set("wax+") for text in texts)):
+                yield name
+
+
+def test_only_backends_write_files_of_the_server() -> None:
+    """The command line and the robot's side have files of their own."""
+    apart = ("app/backends/", "app/cli/", "app/agent/")
+    writers = {
+        name for name, tree in modules("app").items() if not name.startswith(apart) and any(calls_of_writers(tree))
+    }
+    assert writers - set(WRITERS) == set(), "put it behind a port of app/backends"
+    assert set(WRITERS) - writers == set(), "no exceptions any more"
+
+
+def test_only_backends_lock_files() -> None:
+    for name, tree in modules("app").items():
+        if not name.startswith(("app/backends/", "app/agent/")):
+            imports = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+            assert "fcntl" not in imports, name
 
 
 def test_format_has_few_fields() -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Final, Protocol
+
+from app.backends.locks import file_lock
 
 FRESH_SECONDS: Final = 1.0
 """Seconds for which a document is not read again unless a commit is known of."""
@@ -25,8 +26,11 @@ class Document(Protocol):
     def read(self) -> bytes | None:
         """Return the content, None without one."""
 
-    def update(self, change: Change) -> bytes:
-        """Replace the content by that which ``change`` returns; return it. No other process changes it meanwhile."""
+    def update(self, change: Change, *, notify: bool = True) -> bytes:
+        """Replace the content by that which ``change`` returns; return it. No other process changes it meanwhile.
+
+        notify: whether other servers have to read it again at once.
+        """
 
 
 class FileDocument:
@@ -49,11 +53,11 @@ class FileDocument:
         except FileNotFoundError:
             return None
 
-    def update(self, change: Change) -> bytes:
-        """Replace the file atomically. Raises OSError."""
+    def update(self, change: Change, *, notify: bool = True) -> bytes:
+        """Replace the file atomically; there is no other server to notify. Raises OSError."""
+        del notify
         self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with (self.path.parent / "lock").open("w") as handle:
-            fcntl.flock(handle, fcntl.LOCK_EX)
+        with file_lock(self.path.parent / "lock"):
             content = change(self.read())
             write_private(self.path, content)
             return content

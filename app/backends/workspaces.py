@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from app.backends.locks import file_lock
+
 LOCK: Final = ".lock"
 
 
@@ -25,7 +27,7 @@ class Workspaces:
         """Create a temporary folder, locked until the block ends; then it is removed."""
         folder = self.folder / secrets.token_hex(16)
         self.folder.mkdir(parents=True, exist_ok=True)
-        with self._lock(shared=True):
+        with file_lock(self.folder / LOCK, shared=True):
             folder.mkdir()
             lock = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -36,20 +38,10 @@ class Workspaces:
             os.close(lock)
 
     def recover(self) -> int:
-        """Remove the folders of ended processes; returns how many."""
+        """Remove the folders of ended processes, none that is being created; returns how many."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        with self._lock(shared=False):
+        with file_lock(self.folder / LOCK):
             return sum(folder.is_dir() and _remove(folder) for folder in list(self.folder.iterdir()))
-
-    @contextmanager
-    def _lock(self, *, shared: bool) -> Iterator[None]:
-        """Keep the search for abandoned folders from removing one that is being created."""
-        lock = os.open(self.folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(lock)
 
 
 def _remove(folder: Path) -> bool:

@@ -12,7 +12,6 @@ still converted and kept in memory for a while.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import logging
 import math
@@ -32,6 +31,7 @@ from uuid import uuid4
 
 import orjson
 
+from app.backends.locks import file_lock
 from app.convert.report import Report
 from app.errors import BROKEN_STORAGE_ERRNOS, DISK_FULL_ERRNOS, Unavailable, system_reason
 
@@ -503,7 +503,7 @@ class Cache:
             path = self._folder / "locks" / key[:2]  # few lock files; keys that share one rarely collide
             with contextlib.ExitStack() as stack:
                 try:
-                    fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
+                    stack.enter_context(file_lock(path))
                 except OSError as error:  # without a lock file two processes may convert the same map
                     self._note_problem(system_reason(error))
                 yield

@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import threading
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
+from app.backends.documents import write_private
 from app.backends.lead import LeadLostError, Leads
 from app.errors import FleetMapError
 
@@ -116,10 +116,8 @@ class LeaderThread(ABC):
             elif state["state"] == "connected":
                 log.info("%s", self._healthy_state)
         self._logged_state = state
-        temporary = path.with_suffix(f".{os.getpid()}")
         try:
-            temporary.write_text(json.dumps(state))
-            temporary.replace(path)
+            write_private(path, json.dumps(state).encode())
         except OSError as error:  # keep running on a full disk
             log.warning("%s: could not write %s: %s", self._thread.name, path.name, error.strerror)
 

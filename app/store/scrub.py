@@ -1,23 +1,22 @@
 """Background scrub: one process hashes stored bytes again, slowly, in repeated passes.
 
 A pass reads SQLite's tables one by one, chunks, versions' roots, files and a sample of the cache. Its position is
-stored in the blob folder, beside the lock that one process holds; after a restart the pass continues there.
+stored in the blob folder, since SQLite's own file may be damaged, or in the database that several servers share; after
+a restart the pass continues there.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
 from typing import Any, Final
 
+from app.backends.documents import Document, FileDocument
 from app.backends.lead import Lead
 from app.errors import FleetMapError, Unavailable, system_reason
 from app.store.store import Store
@@ -25,7 +24,6 @@ from app.store.verify import KINDS, Kind, check_root
 
 log = logging.getLogger(__name__)
 
-LOCK: Final = ".scrub.lock"
 STATE: Final = ".scrub.json"
 DOCUMENT: Final = "scrub"
 POLL_SECONDS: Final = 60.0
@@ -53,19 +51,16 @@ class ScrubState:
     findings: dict[str, int] = field(default_factory=dict)
 
 
-def read_state(folder: Path) -> ScrubState:
-    """Read the state that the scrubbing process stored in a blob folder."""
-    try:
-        return _parse_state((folder / STATE).read_bytes())
-    except OSError:
-        return ScrubState()
+def _document(store: Store) -> Document:
+    return store.document(DOCUMENT) if store.is_shared else FileDocument(store.blob_dir / STATE)
 
 
 def current_state(store: Store) -> ScrubState:
-    """Read the state of a store's scrub: from the database if several servers share it. Raises Unavailable."""
-    if store.is_shared:
-        return _parse_state(store.document(DOCUMENT).read() or b"{}")
-    return read_state(store.blob_dir)
+    """Read the state of a store's scrub, a new one if its file cannot be read. Raises Unavailable."""
+    try:
+        return _parse_state(_document(store).read() or b"{}")
+    except OSError:
+        return ScrubState()
 
 
 def _parse_state(content: bytes) -> ScrubState:
@@ -80,18 +75,18 @@ def _parse_state(content: bytes) -> ScrubState:
 class Scrub:
     """Passes over a store in a thread of its own. every: seconds from one pass to the next. rate: bytes per second.
 
-    lead: lead among several servers; None with one. delay: seconds before the first pass, so that it does not slow down
-    the start of the server.
+    lead: right to scrub, of one process of all servers. delay: seconds before the first pass, so that it does not slow
+    down the start of the server.
     """
 
     def __init__(
         self,
         store: Store,
         check_cache: CheckCache,
+        lead: Lead,
         *,
         every: float,
         rate: int,
-        lead: Lead | None = None,
         delay: float = POLL_SECONDS,
     ) -> None:
         self._lead = lead
@@ -105,7 +100,7 @@ class Scrub:
         self._thread = threading.Thread(target=self._run, daemon=True, name="fleetmap-scrub")
 
     def start(self) -> None:
-        """Start the thread; it scrubs once this process gets the lock."""
+        """Start the thread; it scrubs once this process gets the lead."""
         self._thread.start()
 
     def close(self) -> None:
@@ -113,20 +108,15 @@ class Scrub:
         self._stopped.set()
         if self._thread.is_alive():
             self._thread.join(5.0)
+        self._lead.release()
 
     def _run(self) -> None:
         self._stopped.wait(self._delay)
         while not self._stopped.is_set():
             try:
-                with (self._store.blob_dir / LOCK).open("w") as handle:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    while not self._stopped.is_set():
-                        if self._lead is None or self._lead.try_acquire():
-                            self.pass_if_due()
-                        self._reason = ""
-                        self._stopped.wait(POLL_SECONDS)
-            except BlockingIOError:
-                pass  # another process scrubs
+                if self._lead.try_acquire():  # else another process scrubs
+                    self.pass_if_due()
+                self._reason = ""
             except OSError as error:
                 self._wait_for(system_reason(error))
             except FleetMapError as error:
@@ -155,7 +145,7 @@ class Scrub:
             if step in restarting:
                 self._state.found.pop(restarting[step], None)  # the step restarts and finds it again
             step()
-            if self._stopped.is_set() or (self._lead is not None and not self._lead.is_held):
+            if self._stopped.is_set() or not self._lead.is_held:
                 self._save()
                 return
             self._state.step, self._state.after = self._state.step + 1, ""
@@ -206,7 +196,7 @@ class Scrub:
         if self._debt > 0.05:  # one long sleep instead of many of a microsecond
             self._stopped.wait(self._debt)
             self._debt = 0.0
-        return not self._stopped.is_set() and (self._lead is None or self._lead.is_held)
+        return not self._stopped.is_set() and self._lead.is_held
 
     def _note(self, kind: Kind, name: str, problem: str) -> None:
         state = self._state
@@ -219,17 +209,9 @@ class Scrub:
 
     def _save(self) -> None:
         self._saved = time.monotonic()
-        if self._store.is_shared:
-            content = json.dumps(asdict(self._state)).encode()
-            fence = contextlib.nullcontext() if self._lead is None else self._lead.fenced()
-            with contextlib.suppress(Unavailable), fence:
-                self._store.document(DOCUMENT).update(lambda _: content, notify=False)
-            return
-        path = self._store.blob_dir / STATE
-        temporary = path.with_suffix(f".{os.getpid()}")
-        with contextlib.suppress(OSError):  # a full disk must not stop the scrub
-            temporary.write_text(json.dumps(asdict(self._state)))
-            temporary.replace(path)
+        content = json.dumps(asdict(self._state)).encode()
+        with contextlib.suppress(Unavailable, OSError), self._lead.fenced():  # a full disk must not stop the scrub
+            _document(self._store).update(lambda _: content, notify=False)
 
 
 def figures(state: ScrubState) -> dict[str, Any]:

@@ -51,7 +51,7 @@ FILE = part('form-data; name="files"; filename="n.tmap2.yaml"', samples.tmap2())
 def spool_is_empty(api: Api) -> bool:
     """Test that no upload of this process is left on disk."""
     spool: Path = api.app.state.services.options.spool_dir
-    return [p.name for p in spool.rglob("*") if p.is_file()] == ["alive"]
+    return {p.name for p in spool.rglob("*") if p.is_file()} == {".lock"}
 
 
 def test_upload_leaves_an_empty_spool(tight: Api) -> None:
@@ -228,11 +228,11 @@ def test_start_removes_files_of_a_killed_server(tmp_path: Path) -> None:
     left = tmp_path / "spool" / "dead" / "upload"
     left.mkdir(parents=True)
     (left / "0").write_bytes(b"half a file")
-    (tmp_path / "spool" / "dead" / "alive").touch()
+    (tmp_path / "spool" / "dead" / ".lock").touch()
     with running(settings_for(tmp_path)) as api:
         assert not left.exists()
         assert spool_is_empty(api)
-    assert not any((tmp_path / "spool").iterdir())
+    assert [p.name for p in (tmp_path / "spool").iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_leader_keeps_running_when_state_file_cannot_be_written(
         raise OSError(28, "No space left on device")
 
     one = Rounds(tmp_path, lambda: None)
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr("app.events.leader.write_private", full)
     one.start()
     try:
         eventually(lambda: one.rounds > 3)

@@ -106,9 +106,9 @@ def check(folder: Path, address: str, ledger: Ledger) -> int:
         assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
     left = [p for p in (folder / "data" / "blobs" / "tmp").iterdir() if p.name != ".lock"]
     assert not left, "temporary files of the killed server are still there"
-    spools = list((folder / "data" / "spool").iterdir())
+    spools = [p for p in (folder / "data" / "spool").iterdir() if p.is_dir()]
     assert len(spools) == 1, "the spool of the killed server is still there"
-    assert [p.name for p in spools[0].iterdir()] == ["alive"]
+    assert [p.name for p in spools[0].iterdir()] == [".lock"]
     return int(head)
 
 

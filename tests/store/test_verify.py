@@ -7,7 +7,7 @@ import json
 import pickle
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,35 @@ import pytest
 from sqlalchemy import exc
 
 from app.backends.blobs import unreadable_error as _unreadable_error
+from app.backends.lead import LocalLead
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
 from app.ingest.repair import repair
 from app.limits import Limits
 from app.store.changes import Changes
 from app.store.chunks import insert
 from app.store.encode import compress, digest
-from app.store.scrub import LOCK, Scrub, current_state, figures, read_state
+from app.store.scrub import Scrub, current_state, figures
 from app.store.store import Store
 from app.store.values import Source, Writer
 from tests.store.samples import GRID, TOPOLOGY, everything, grid, network, replaces, save
+
+ScrubOf = Callable[..., Scrub]
+
+
+@pytest.fixture
+def scrub_of(tmp_path: Path) -> Iterator[ScrubOf]:
+    """Function that makes a scrub whose process has the lead; with ``leads=False`` it has to get it."""
+    lead = LocalLead(tmp_path, "scrub")
+
+    def make(
+        store: Store, cache: Any = lambda: iter(()), *, rate: int = 10**9, delay: float = 60.0, leads: bool = True
+    ) -> Scrub:
+        if leads:
+            assert lead.try_acquire()
+        return Scrub(store, cache, lead if leads else LocalLead(tmp_path, "scrub"), every=3600, rate=rate, delay=delay)
+
+    yield make
+    lead.release()
 
 
 def filled(store: Store) -> None:
@@ -110,20 +129,20 @@ def test_verification_finds_changed_version_row(store: Store) -> None:
     assert "was committed" in finding.problem
 
 
-def test_scrub_finds_damage_resumes_and_reports_age(store: Store) -> None:
+def test_scrub_finds_damage_resumes_and_reports_age(store: Store, scrub_of: ScrubOf) -> None:
     filled(store)
     entry = store.versions.get("farm", 1).part(GRID)
     assert entry is not None
     spoil_chunk(store, entry.hash)
     assert figures(current_state(store))["age"] == float("inf")
     cache = [("00", 10, True), ("01", 0, False)]
-    scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
+    scrub = scrub_of(store, lambda: iter(cache))
     scrub._stopped.set()  # stopped within the first step
     scrub.pass_if_due()
     begun = current_state(store)
     assert begun.started
     assert not begun.completed
-    scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
+    scrub = scrub_of(store, lambda: iter(cache))
     scrub.pass_if_due()
     state = current_state(store)
     assert state.findings == {"chunk": 1, "cache": 1}
@@ -133,7 +152,9 @@ def test_scrub_finds_damage_resumes_and_reports_age(store: Store) -> None:
     assert current_state(store) == state, "the next pass is not due yet"
 
 
-def test_scrub_checks_sqlite_by_table_with_pauses(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scrub_checks_sqlite_by_table_with_pauses(
+    sqlite_store: Store, scrub_of: ScrubOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Pauses hold no connection; a stop between two tables loses nothing, and damage counts once."""
     real, checked = sqlite_store._database.integrity, list[str]()
 
@@ -154,22 +175,22 @@ def test_scrub_checks_sqlite_by_table_with_pauses(sqlite_store: Store, monkeypat
         return False
 
     for _ in range(len(tables)):
-        scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=size // len(tables))
+        scrub = scrub_of(sqlite_store, rate=size // len(tables))
         scrub._stopped.wait = wait  # type: ignore[method-assign]
         scrub._stopped.set()
         scrub.pass_if_due()
     assert checked == tables
     assert len(waited) >= len(tables)
     assert min(waited) >= 0.9
-    Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9).pass_if_due()
+    scrub_of(sqlite_store).pass_if_due()
     assert checked == tables
-    assert read_state(sqlite_store.blob_dir).findings == {"database": 1}
+    assert current_state(sqlite_store).findings == {"database": 1}
     with pytest.raises(DatabaseDamaged, match="a page is bad"):
         sqlite_store._database.check()
 
 
 def test_scrub_skips_unreadable_files(
-    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    sqlite_store: Store, scrub_of: ScrubOf, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     names = sorted(sqlite_store.blobs.put(bytes([k]) * 100) for k in range(3))
     real = sqlite_store.blobs._problem
@@ -181,14 +202,14 @@ def test_scrub_skips_unreadable_files(
         return "damaged" if name == names[1] else real(row)
 
     monkeypatch.setattr(sqlite_store.blobs, "_problem", problem)
-    Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9).pass_if_due()
-    assert read_state(sqlite_store.blob_dir).findings == {"blob": 1}
+    scrub_of(sqlite_store).pass_if_due()
+    assert current_state(sqlite_store).findings == {"blob": 1}
     assert "Permission denied" in caplog.text
     assert "/srv" not in caplog.text
 
 
 def test_scrub_continues_after_unexpected_error(
-    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    sqlite_store: Store, scrub_of: ScrubOf, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.store.scrub.POLL_SECONDS", 0.01)
     errors = [ValueError("a defect"), *[OSError(errno.EIO, "refused", "/srv/data")] * 2]
@@ -199,10 +220,10 @@ def test_scrub_continues_after_unexpected_error(
         return iter(())
 
     monkeypatch.setattr(sqlite_store, "check_pages", check_pages)
-    scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0)
+    scrub = scrub_of(sqlite_store, delay=0.0)
     scrub.start()
     deadline = time.monotonic() + 30
-    while not read_state(sqlite_store.blob_dir).completed:
+    while not current_state(sqlite_store).completed:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     scrub.close()
@@ -211,23 +232,23 @@ def test_scrub_continues_after_unexpected_error(
     assert "/srv" not in caplog.text
 
 
-def test_scrub_runs_in_one_process(sqlite_store: Store) -> None:
-    scrubs = [Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0) for _ in range(2)]
+def test_scrub_runs_in_one_process(sqlite_store: Store, scrub_of: ScrubOf) -> None:
+    scrubs = [scrub_of(sqlite_store, delay=0.0, leads=False) for _ in range(2)]
     for scrub in scrubs:
         scrub.start()
     deadline = time.monotonic() + 30
-    while not read_state(sqlite_store.blob_dir).completed:
+    while not current_state(sqlite_store).completed:
         assert time.monotonic() < deadline
         time.sleep(0.02)
+    assert [scrub._lead.is_held for scrub in scrubs].count(True) == 1
     for scrub in scrubs:
         scrub.close()
-    assert (sqlite_store.blob_dir / LOCK).exists()
 
 
-def test_scrub_keeps_to_its_rate(sqlite_store: Store) -> None:
+def test_scrub_keeps_to_its_rate(sqlite_store: Store, scrub_of: ScrubOf) -> None:
     sqlite_store.blobs.put(b"x" * 40_000)
     waited: list[float] = []
-    scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=100_000)
+    scrub = scrub_of(sqlite_store, rate=100_000)
     scrub._stopped.wait = lambda seconds=None: bool(waited.append(seconds or 0.0))  # type: ignore[method-assign]
     scrub.pass_if_due()
     assert sum(waited) >= 0.4

@@ -8,7 +8,6 @@ killed server (``UploadSpool``).
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import os
 import shutil
@@ -26,6 +25,7 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api.http.problems import MalformedBody
 from app.backends.room import check_room
+from app.backends.workspaces import Workspaces
 from app.errors import DISK_FULL_ERRNOS, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.ingest import SpooledFile
 from app.limits import Limits
@@ -56,37 +56,30 @@ class UploadSpool:
         self._limits, self._at_once = limits, at_once
         self._active = 0
         self._lock = threading.Lock()
-        self._folder = spool / uuid4().hex
-        self._alive: IO[str] | None = None
-        if spool.is_dir():
-            _remove_abandoned(spool)
+        self._workspaces, self._opened = Workspaces(spool), contextlib.ExitStack()
+        self._folder: Path | None = None
         with contextlib.suppress(OSError):  # a full disk must not prevent the server's start
+            self._workspaces.recover()
             self._open()
 
-    def _open(self) -> None:
-        """Create the directory of this process."""
+    def _open(self) -> Path:
+        """Return the directory of this process, which a later start removes if this process has ended."""
         with self._lock:
-            if self._alive is None:
-                self._folder.mkdir(parents=True, exist_ok=True)
-                # Locked while this process lives: a later start removes unlocked directories.
-                alive = (self._folder / "alive").open("w")
-                fcntl.flock(alive, fcntl.LOCK_EX)
-                self._alive = alive
+            if self._folder is None:
+                self._folder = self._opened.enter_context(self._workspaces.create())
+            return self._folder
 
     def check(self) -> None:
         """Raise NoRoom or Unavailable if an upload could not be spooled."""
         try:
-            self._open()
-            check_room(self._folder)
+            check_room(self._open())
         except OSError as error:
             kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
             raise kind(f"the upload directory cannot be written: {error.strerror}") from error
 
     def close(self) -> None:
         """Remove the directory of this process."""
-        if self._alive is not None:
-            self._alive.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        self._opened.close()
 
     @contextlib.asynccontextmanager
     async def receive(self, request: Request) -> AsyncIterator[UploadForm]:
@@ -98,10 +91,10 @@ class UploadSpool:
             if self._active >= self._at_once:
                 raise Unavailable("too many concurrent uploads: try again in a few seconds")
             self._active += 1
-        folder = self._folder / uuid4().hex
+        folder: Path | None = None
         try:
             boundary = _boundary(request.headers.get("content-type", ""))
-            self._open()
+            folder = self._open() / uuid4().hex
             folder.mkdir()
             receiver = _MultipartReceiver(boundary, folder, self._limits)
             try:
@@ -112,7 +105,8 @@ class UploadSpool:
         finally:
             with self._lock:
                 self._active -= 1
-            await run_in_threadpool(shutil.rmtree, folder, True)
+            if folder is not None:
+                await run_in_threadpool(shutil.rmtree, folder, True)
 
 
 def _boundary(content_type: str) -> bytes:
@@ -134,22 +128,6 @@ async def _feed(request: Request, receiver: _MultipartReceiver) -> None:
             await run_in_threadpool(receiver.write, b"".join(batch))
             batch, size = [], 0
     await run_in_threadpool(receiver.finish, b"".join(batch))
-
-
-def _remove_abandoned(spool: Path) -> None:
-    """Remove the directories of ended processes, which are not locked."""
-    for folder in spool.iterdir():
-        try:
-            with (folder / "alive").open("r+") as handle:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
-        except BlockingIOError:
-            continue
-        except OSError:
-            # No lock file: its process died during its start, or another process is removing it.
-            if folder.is_dir() and not any(folder.iterdir()):
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
 
 
 class _MultipartReceiver:
