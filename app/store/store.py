@@ -33,6 +33,7 @@ from app.store.overlays import Overlays
 from app.store.position import Areas
 from app.store.robots import Robots
 from app.store.search import Search
+from app.store.search_index import SearchIndex
 from app.store.sessions import Sessions
 from app.store.tokens import Tokens
 from app.store.verify import Progress, Verifier
@@ -78,7 +79,8 @@ class Store:
         self.events = Outbox(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)
-        self.search = Search(database, self.chunks)
+        self.search_index = SearchIndex(database, self.chunks)
+        self.search = Search(database, self.search_index)
         self.tokens = Tokens(database)
         self.sessions = Sessions(database, self.tokens)
         self.wrong_tokens = WrongTokens(database)

@@ -12,12 +12,14 @@ from sqlalchemy import (
     BigInteger,
     Boolean,
     Column,
+    Computed,
     Float,
     ForeignKey,
     Index,
     Integer,
     LargeBinary,
     MetaData,
+    SmallInteger,
     String,
     Table,
     Text,
@@ -25,7 +27,7 @@ from sqlalchemy import (
     true,
 )
 
-from app.store.column_types import UtcDateTime, WkbGeometry
+from app.store.column_types import Grams, UtcDateTime, WkbGeometry, binary_text
 
 
 def _box() -> list[Column[float]]:
@@ -50,6 +52,8 @@ def _environment(**options: Any) -> Column[str]:
     return Column("environment_id", String(32), ForeignKey("environment.id", ondelete="CASCADE"), **options)
 
 
+SEARCH_STALE = "(search_sequence = sequence AND search_updated = updated) IS NOT TRUE"
+
 environment = Table(
     "environment",
     metadata,
@@ -70,10 +74,19 @@ environment = Table(
     *_box(),
     Column("extent", WkbGeometry, nullable=True),
     Column("area_stale", Boolean, nullable=False, server_default=true(), index=True),
+    Column("index_stale", Boolean, Computed("indexed <> head"), index=True),
+    Column("search_version", Integer, nullable=False, server_default="-1"),
+    Column("search_sequence", BigInteger, nullable=False, server_default="-1"),
+    Column("search_updated", UtcDateTime, nullable=True),
+    Column("search_stale", Boolean, Computed(SEARCH_STALE), index=True),
 )
 """Environments. head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event
 that changed the closures in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be
 computed from the head before it is read.
+
+search_version: the version that ``search_item`` shows; negative while there is none. search_sequence, search_updated:
+``sequence`` and ``updated`` at that time; every change raises one of them. index_stale, search_stale: whether ``place``
+and ``search_item`` may be behind, as the database computes it.
 """
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
@@ -537,6 +550,35 @@ place = Table(
 
 Index("ix_place_geometry", place.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
 Index("ix_place_box", place.c.south, place.c.north, place.c.west, place.c.east)
+
+search_item = Table(
+    "search_item",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    _environment(nullable=False),
+    Column("environment", binary_text(63), nullable=False),
+    Column("kind", SmallInteger, nullable=False),
+    Column("level", String(256), nullable=False),
+    Column("part", String(256), nullable=False),
+    Column("feature", String(512), nullable=False),
+    Column("name", Text, nullable=False),
+    Column("folded", binary_text(), nullable=False),
+    Column("folded_id", binary_text(), nullable=True),
+    Column("x", Float(53), nullable=True),
+    Column("y", Float(53), nullable=True),
+    Column("grams", Grams, nullable=True),
+    Index("ix_search_item_feature", "environment_id", "feature"),
+    Index("ix_search_item_folded", "kind", "folded", "environment"),
+    Index("ix_search_item_folded_id", "kind", "folded_id", "environment"),
+)
+"""What a search by name finds: environments, and items of their searched versions. Can be rebuilt from the trees.
+
+kind: see ``app.store.search_index``. name: of the item, else its id. folded: the name in lower case; folded_id: the id,
+of an environment the title, if it differs. x, y: metres in the local frame. grams: of both texts, on PostgreSQL; on
+SQLite the virtual tables ``search_text`` and ``search_term`` have them.
+"""
+
+Index("ix_search_item_grams", search_item.c.grams, postgresql_using="gin", info=POSTGRESQL).ddl_if(dialect="postgresql")
 
 audit = Table(
     "audit",
