@@ -7,24 +7,28 @@ returned. Others that contain it come from an index of groups of three character
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from functools import lru_cache
+from typing import Any, Final, Literal, NamedTuple
 
 import orjson
 from sqlalchemy import (
     ARRAY,
     ColumnElement,
+    CompoundSelect,
     Connection,
+    Integer,
     Row,
     Select,
     Text,
     and_,
     any_,
+    bindparam,
     cast,
     column,
     func,
-    literal,
+    literal_column,
     or_,
     select,
     table,
@@ -52,7 +56,7 @@ LAST: Final = "\U0010ffff"
 """Sorts after all texts that begin alike."""
 
 WILDCARDS: Final = "*?["
-DOUBLE: Final = '"'
+SINGLE, DOUBLE = "'", '"'
 
 _COLUMNS: Final = ("id", "kind", "level", "feature", "name", "folded", "folded_id", "x", "y")
 
@@ -124,104 +128,140 @@ class Search:
 
     def _matches(self, connection: Connection, scope: _Scope, needle: str, limit: int) -> Iterator[_Match]:
         """Find the best ``limit`` items, best first; one that matches by name and id may come twice."""
-        if scope.few is not None:
-            rows = connection.execute(scope.items().where(_has_text(needle, sqlite=self._database.sqlite)))
+        sqlite = self._database.sqlite
+        values = {**scope.values, "needle": needle, "last": needle + LAST}
+        if scope.form == "few":
+            rows = connection.execute(_all_query(sqlite=sqlite), values)
             yield from heapq.nsmallest(limit, (_best_match(row, needle) for row in rows))
             return
         seen: set[int] = set()
         for rank in (EQUAL, PREFIX):
-            for match in _ordered_matches(connection, scope, needle, rank, limit + len(seen)):
+            ordered = _ordered_query(rank, scope.form, sqlite=sqlite)
+            rows = connection.execute(ordered, {**values, "limit": limit + len(seen)})
+            for match in sorted(_match(row, rank, by_id=bool(row.by_id)) for row in rows):
                 seen.add(match.id)
                 yield match
+        query = _part_query(scope.form, is_short=len(needle) < GRAM, sqlite=sqlite)
         for kind in range(len(ORDER)):
-            rows = connection.execute(self._containing(scope, needle, kind).limit(MAX_CANDIDATES + limit))
+            wanted = _wanted(needle, kind, sqlite=sqlite)
+            more = {"wanted": wanted, "kind": kind, "column": ORDER[kind], "limit": MAX_CANDIDATES + limit}
+            rows = connection.execute(query, {**values, **more})
             matches = (_best_match(row, needle) for row in rows)
             yield from sorted(match for match in matches if match.rank == PART)
 
-    def _containing(self, scope: _Scope, needle: str, kind: int) -> Select[Any]:
-        """Select items with a text in their name or id, by the index of three characters in a row."""
-        item, is_short = tables.search_item, len(needle) < GRAM
-        windows = sorted({needle[k : k + GRAM] for k in range(max(1, len(needle) - GRAM + 1))})
-        query = scope.items().where(_has_text(needle, sqlite=self._database.sqlite))
-        if not self._database.sqlite:
-            wanted = " & ".join(_quoted(window, "'") + (":*" if is_short else "") for window in windows)
-            return query.where(item.c.kind == kind, item.c.grams.op("@@")(cast(literal(wanted), TSQUERY)))
-        if is_short:
-            term = _SEARCH_TERM.c
-            begins = term.term >= needle, term.term < needle + LAST, term.col == ORDER[kind]
-            rows = select(term.doc).where(*begins).distinct().subquery()
-            return query.join(rows, rows.c.doc == item.c.id)
-        text = _SEARCH_TEXT.c
-        wanted = f"{ORDER[kind]} : ({' AND '.join(_quoted(window, DOUBLE) for window in windows)})"
-        return query.join(_SEARCH_TEXT, text.rowid == item.c.id).where(text.search_text.op("MATCH")(wanted))
+
+# --- which environments ---
+
+Form = Literal["all", "range", "ids", "few"]
 
 
 @dataclass(frozen=True, slots=True)
 class _Scope:
-    """Environments that a search looks at. few: their ids, if they are few; else a condition on the items."""
+    """Environments that a search looks at, as a form of the queries and its values.
 
-    few: Sequence[str] | None = None
-    condition: ColumnElement[bool] | None = None
+    ``range``: names from ``first`` to ``end``. ``ids``, ``few``: these; of few environments all items are read.
+    """
 
-    def items(self) -> Select[Any]:
-        """Select items of these environments, with what a result says of their environment."""
-        item, owner = tables.search_item, tables.environment
-        columns = (item.c[name] for name in _COLUMNS)
-        query = (
-            select(*columns, owner.c.name.label("owner"), owner.c.title, owner.c.search_version.label("version"))
-            .join(owner, owner.c.id == item.c.environment_id)
-            .where(owner.c.deleted.is_(None), owner.c.search_version >= 0)
-        )
-        if self.few is not None:
-            return query.where(item.c.environment_id.in_(self.few))
-        return query if self.condition is None else query.where(self.condition)
+    form: Form
+    values: Mapping[str, Any]
 
 
 def _scope(connection: Connection, allowed: str | None) -> _Scope:
     """Return the environments that a name pattern allows."""
     if allowed is None:
-        return _Scope()
+        return _Scope("all", {})
     prefix = allowed[: min((k for k in map(allowed.find, WILDCARDS) if k >= 0), default=len(allowed))]
     is_range = allowed == prefix + "*"
-    owner, item = tables.environment, tables.search_item
+    owner = tables.environment
     names = select(owner.c.id, owner.c.name).where(owner.c.deleted.is_(None))
     names = names.where(owner.c.name.startswith(prefix, autoescape=True)) if prefix else names
     rows = connection.execute(names.limit(FEW + 1) if is_range else names)
     ids = [row.id for row in rows if reaches(allowed, row.name)]
-    if len(ids) <= FEW:
-        return _Scope(few=ids)
-    if is_range:
-        return _Scope(condition=and_(item.c.environment >= prefix, item.c.environment < prefix + LAST))
-    if connection.dialect.name == "sqlite":
-        some = select(func.json_each(literal(orjson.dumps(ids).decode())).table_valued("value").c.value)
-        return _Scope(condition=item.c.environment_id.in_(some))
-    return _Scope(condition=item.c.environment_id == any_(cast(literal(ids, ARRAY(Text)), ARRAY(Text))))
+    if is_range and len(ids) > FEW:
+        return _Scope("range", {"first": prefix, "end": prefix + LAST})
+    listed = orjson.dumps(ids).decode() if connection.dialect.name == "sqlite" else ids
+    return _Scope("few" if len(ids) <= FEW else "ids", {"ids": listed})
 
 
-def _ordered_matches(connection: Connection, scope: _Scope, needle: str, rank: int, limit: int) -> list[_Match]:
-    """Find the first items of each kind whose name or id equals a text, or begins with it, in one query."""
+# --- queries: made once, since making one takes longer than executing it ---
+
+
+def _items(form: Form, *, sqlite: bool) -> Select[Any]:
+    """Select items, with what a result says of their environment."""
+    item, owner = tables.search_item, tables.environment
+    columns = (item.c[name] for name in _COLUMNS)
+    query = (
+        select(*columns, owner.c.name.label("owner"), owner.c.title, owner.c.search_version.label("version"))
+        .join(owner, owner.c.id == item.c.environment_id)
+        .where(owner.c.deleted.is_(None), owner.c.search_version >= 0)
+    )
+    if form == "all":
+        return query
+    if form == "range":
+        return query.where(item.c.environment >= bindparam("first"), item.c.environment < bindparam("end"))
+    if sqlite:
+        ids = func.json_each(bindparam("ids", type_=Text)).table_valued("value").c.value
+        return query.where(item.c.environment_id.in_(select(ids)))
+    return query.where(item.c.environment_id == any_(bindparam("ids", type_=ARRAY(Text))))
+
+
+@lru_cache
+def _all_query(*, sqlite: bool) -> Select[Any]:
+    """Select all items of few environments that contain the text."""
+    return _items("few", sqlite=sqlite).where(_has_text(sqlite=sqlite))
+
+
+@lru_cache
+def _ordered_query(rank: int, form: Form, *, sqlite: bool) -> CompoundSelect[Any]:
+    """Select the first items of each kind whose name or id equals the text, or begins with it."""
     item = tables.search_item
+    needle, last = bindparam("needle", type_=Text), bindparam("last", type_=Text)
     queries = []
     for kind in range(len(ORDER)):
         for by_id, text in enumerate((item.c.folded, item.c.folded_id)):
-            condition = text == needle if rank == EQUAL else and_(text > needle, text < needle + LAST)
+            condition = text == needle if rank == EQUAL else and_(text > needle, text < last)
+            query = _items(form, sqlite=sqlite).add_columns(literal_column(str(by_id)).label("by_id"))
+            query = query.where(item.c.kind == literal_column(str(kind)), condition)
             order = (text, item.c.environment, item.c.level, item.c.feature)
-            query = scope.items().add_columns(literal(by_id).label("by_id")).where(item.c.kind == kind, condition)
-            queries.append(select(query.order_by(*order).limit(limit).subquery()))
-    rows = connection.execute(union_all(*queries))
-    return sorted(_match(row, rank, by_id=bool(row.by_id)) for row in rows)
+            queries.append(select(query.order_by(*order).limit(bindparam("limit", type_=Integer)).subquery()))
+    return union_all(*queries)
 
 
-def _has_text(needle: str, *, sqlite: bool) -> ColumnElement[bool]:
-    """Return a condition: the name or id contains a text, whose characters stand for themselves."""
+@lru_cache
+def _part_query(form: Form, *, is_short: bool, sqlite: bool) -> Select[Any]:
+    """Select items of a kind that contain the text, by the index of three characters in a row."""
     item = tables.search_item
+    query = _items(form, sqlite=sqlite).where(_has_text(sqlite=sqlite)).limit(bindparam("limit", type_=Integer))
+    if not sqlite:
+        wanted = cast(bindparam("wanted", type_=Text), TSQUERY)
+        return query.where(item.c.kind == bindparam("kind"), item.c.grams.op("@@")(wanted))
+    if is_short:
+        term = _SEARCH_TERM.c
+        begins = term.term >= bindparam("needle"), term.term < bindparam("last"), term.col == bindparam("column")
+        rows = select(term.doc).where(*begins).distinct().subquery()
+        return query.join(rows, rows.c.doc == item.c.id)
+    text = _SEARCH_TEXT.c
+    return query.join(_SEARCH_TEXT, text.rowid == item.c.id).where(text.search_text.op("MATCH")(bindparam("wanted")))
+
+
+def _has_text(*, sqlite: bool) -> ColumnElement[bool]:
+    """Return a condition: the name or id contains the text, whose characters stand for themselves."""
+    item, needle = tables.search_item, bindparam("needle", type_=Text)
     position = func.instr if sqlite else func.strpos
     return or_(position(item.c.folded, needle) > 0, position(item.c.folded_id, needle) > 0)
 
 
+def _wanted(needle: str, kind: int, *, sqlite: bool) -> str:
+    """Return the query of the index of three characters in a row; on PostgreSQL shorter texts are prefixes of three."""
+    windows = sorted({needle[k : k + GRAM] for k in range(max(1, len(needle) - GRAM + 1))})
+    if sqlite:
+        return f"{ORDER[kind]} : ({' AND '.join(_quoted(window, DOUBLE) for window in windows)})"
+    return " & ".join(_quoted(window, SINGLE) + (":*" if len(window) < GRAM else "") for window in windows)
+
+
 def _quoted(text: str, quote: str) -> str:
     """Quote a text for a query of the index: quotes, and on PostgreSQL backslashes, are doubled."""
-    escaped = text.replace("\\", "\\\\") if quote == "'" else text
+    escaped = text.replace("\\", "\\\\") if quote == SINGLE else text
     return quote + escaped.replace(quote, 2 * quote) + quote
 
 
