@@ -96,6 +96,7 @@ class _Housekeeping:
             store.versions.remove_expired_dry_runs()
             store.drafts.remove_expired()
             store.search_index.refresh(SEARCH_BATCH)
+            store.robot_counts.join()
             if is_beat:
                 store.sessions.sweep()
                 self._services.jobs.sweep()

@@ -31,6 +31,7 @@ from app.store.made_maps import MadeMaps
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
+from app.store.robot_counts import RobotCounts
 from app.store.robots import Robots
 from app.store.search import Search
 from app.store.search_index import SearchIndex
@@ -76,6 +77,7 @@ class Store:
         self.channels = Channels(database)
         self.overlays = Overlays(database)
         self.robots = Robots(database)
+        self.robot_counts = RobotCounts(database)
         self.events = Outbox(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)

@@ -1,4 +1,4 @@
-"""An index of names in the database, and indexes that find the environments whose indexes are behind.
+"""An index of names, indexes that find the environments whose indexes are behind, and counts of robots.
 
 Revision ID: 0020
 Revises: 0019
@@ -65,6 +65,51 @@ def upgrade() -> None:
     else:
         _create_text_index()
 
+    _create_tally()
+
+
+TALLIED = ("channel", "state", "root", "held_root", "held_overlays", "vouched")
+"""Columns of ``robot`` by which robots are counted."""
+
+
+def _create_tally() -> None:
+    """Create the counts of robots, with the triggers that keep them, whichever release writes."""
+    op.create_table(
+        "robot_tally",
+        sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), nullable=False),
+        sa.Column("environment_id", sa.String(32), nullable=False),
+        sa.Column("channel", sa.String(63), nullable=False),
+        sa.Column("state", sa.String(16), nullable=False),
+        sa.Column("root", sa.String(64), nullable=False),
+        sa.Column("held_root", sa.String(64), nullable=True),
+        sa.Column("held_overlays", sa.String(64), nullable=True),
+        sa.Column("vouched", sa.Boolean, nullable=False),
+        sa.Column("number", sa.Integer, nullable=False),
+        sa.PrimaryKeyConstraint("id", name="pk_robot_tally"),
+    )
+    op.create_index("ix_robot_tally_environment", "robot_tally", ["environment_id", "id"])
+    op.create_index("ix_robot_held", "robot", ["environment_id", "channel", "held_since"])
+    columns = ", ".join(("environment_id", *TALLIED))
+    target = f"INSERT INTO robot_tally ({columns}, number)"
+    op.execute(f"{target} SELECT {columns}, count(*) FROM robot GROUP BY {columns}")  # noqa: S608 - only names
+    values = {row: ", ".join(f"{row}.{name}" for name in ("environment_id", *TALLIED)) for row in ("new", "old")}
+    come, go = f"{target} VALUES ({values['new']}, 1)", f"{target} VALUES ({values['old']}, -1)"
+    events = (("insert", "INSERT", come), ("delete", "DELETE", go), ("update", "UPDATE", f"{go}; {come}"))
+    is_postgres = op.get_bind().dialect.name == "postgresql"
+    different = "IS DISTINCT FROM" if is_postgres else "IS NOT"
+    changed = " OR ".join(f"old.{name} {different} new.{name}" for name in TALLIED)
+    for name, event, statements in events:
+        condition = f"WHEN ({changed}) " if event == "UPDATE" else ""
+        trigger = f"CREATE TRIGGER robot_tally_{name} AFTER {event} ON robot FOR EACH ROW {condition}"
+        if is_postgres:
+            op.execute(
+                f"CREATE FUNCTION robot_tally_{name}() RETURNS trigger LANGUAGE plpgsql AS "
+                f"$$ BEGIN {statements}; RETURN NULL; END $$"
+            )
+            op.execute(f"{trigger} EXECUTE FUNCTION robot_tally_{name}()")
+        else:
+            op.execute(f"{trigger} BEGIN {statements}; END")
+
 
 def _create_text_index() -> None:
     """Create the index of all three characters in a row, without a copy of the texts.
@@ -85,6 +130,13 @@ def _create_text_index() -> None:
 
 
 def downgrade() -> None:
+    for name in ("insert", "delete", "update"):
+        if op.get_bind().dialect.name == "sqlite":
+            op.execute(f"DROP TRIGGER robot_tally_{name}")
+        else:
+            op.execute(f"DROP FUNCTION robot_tally_{name} CASCADE")
+    op.drop_index("ix_robot_held", "robot")
+    op.drop_table("robot_tally")
     if op.get_bind().dialect.name == "sqlite":
         op.execute("DROP TABLE search_term")
         op.execute("DROP TABLE search_text")
