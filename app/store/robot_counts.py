@@ -129,10 +129,10 @@ def _groups_query() -> Select[Any]:
 def _online_query() -> Select[Any]:
     """Count robots by the rule of ``app.fleet.is_online``."""
     table, presence = tables.robot, tables.presence
-    there, seen = func.coalesce(presence.c.there, false()), presence_seen()
+    on_bus, seen = func.coalesce(presence.c.there, false()), presence_seen()
     has_left = and_(presence.c.there.is_(False), seen >= table.c.time)
     is_heard = and_(table.c.time > bindparam("heard_after", type_=UtcDateTime), func.coalesce(~has_left, true()))
-    is_online = or_(and_(there, seen > bindparam("on_bus_after", type_=UtcDateTime)), is_heard)
+    is_online = or_(and_(on_bus, seen > bindparam("on_bus_after", type_=UtcDateTime)), is_heard)
     return (
         select(table.c.channel, func.count().label("number"))
         .select_from(table)
