@@ -56,6 +56,9 @@ BATCH: Final = 500
 SLICE: Final = 2000
 """Maximum number of rows in one transaction, so that other writers on SQLite do not wait long."""
 
+TOGETHER: Final = 50
+"""Maximum number of environments in one transaction."""
+
 AT_ONCE: Final = 200
 """Maximum number of environments that a search brings up to date; after a mass change further searches continue."""
 
@@ -106,8 +109,16 @@ class SearchIndex:
         An environment with damaged content keeps its rows until it changes again.
         """
         stale = self._stale(limit)
+        plans: list[_Plan] = []
         for environment_id in stale:
-            self._refresh(environment_id)
+            plan = self._read_plan(environment_id)
+            if plan is None:
+                continue
+            plans.append(plan)
+            if sum(len(plan.added) for plan in plans) >= SLICE or len(plans) >= TOGETHER:
+                self._apply(plans)
+                plans = []
+        self._apply(plans)
         return len(stale)
 
     def rebuild(self) -> None:
@@ -124,20 +135,21 @@ class SearchIndex:
             rows = connection.execute(query.limit(limit + len(self._damaged))).all()
         return [row.id for row in rows if self._damaged.get(row.id) != row.sequence][:limit]
 
-    def _refresh(self, environment_id: str) -> None:
+    def _read_plan(self, environment_id: str) -> _Plan | None:
+        """Plan what brings an environment up to date; None if nothing does, or nothing can."""
         table = tables.environment
         with self._database.snapshot() as connection:
             row = connection.execute(select(table).where(table.c.id == environment_id)).one_or_none()
             if row is None or not row.search_stale:
-                return
+                return None
             try:
                 plan = self._plan(connection, row)
             except Damaged as error:
                 self._damaged[environment_id] = row.sequence
                 log.critical("search: %s is not up to date, its content is damaged (%s)", row.name, error.detail)
-                return
+                return None
         self._damaged.pop(environment_id, None)
-        self._apply(plan)
+        return plan
 
     # --- what has to change ---
 
@@ -164,33 +176,57 @@ class SearchIndex:
 
     # --- writing it ---
 
-    def _apply(self, plan: _Plan) -> None:
-        """Write a plan, in several transactions if it is long.
+    def _apply(self, plans: Sequence[_Plan]) -> None:
+        """Write plans in one transaction; long ones follow, each in several.
 
         Between these the environment has a negative number of its own as ``search_version``: it is not found, and
         whoever else begins to write takes it over.
         """
-        rest = list(plan.added)
+        short = [plan for plan in plans if len(plan.added) <= SLICE]
+        if short:
+            with self._database.write(notify=False, upkeep=True) as connection:
+                rows: list[dict[str, Any]] = []
+                for plan in sorted(
+                    short, key=lambda plan: str(plan.row.id)
+                ):  # an order in which none waits for another
+                    if _claim(connection, plan.row, plan.row.search_version):
+                        _begin(connection, plan)
+                        _end(connection, plan)
+                        rows += plan.added
+                if rows:
+                    connection.execute(insert(tables.search_item), rows)
+        for plan in plans:
+            if len(plan.added) > SLICE:
+                self._apply_long(plan)
+
+    def _apply_long(self, plan: _Plan) -> None:
         current = plan.row.search_version
-        while True:
-            some, rest = rest[:SLICE], rest[SLICE:]
-            following = -2 - secrets.randbelow(2**30) if rest else -1 if plan.version is None else plan.version
+        for start in range(0, len(plan.added), SLICE):
             with self._database.write(notify=False, upkeep=True) as connection:
                 if not _claim(connection, plan.row, current):
                     return
-                if current == plan.row.search_version:
-                    _remove(connection, plan)
-                if plan.version is not None:
-                    _put_environment(connection, plan.row)
-                if some:
-                    connection.execute(insert(tables.search_item), some)
-                values: dict[str, Any] = {"search_version": following}
-                if not rest:
-                    values |= {"search_sequence": plan.row.sequence, "search_updated": plan.row.updated}
-                connection.execute(_of(plan.row).values(values))
-            if not rest:
-                return
-            current = following
+                if not start:
+                    _begin(connection, plan)
+                connection.execute(insert(tables.search_item), plan.added[start : start + SLICE])
+                if start + SLICE >= len(plan.added):
+                    _end(connection, plan)
+                else:
+                    current = -2 - secrets.randbelow(2**30)
+                    connection.execute(_of(plan.row).values(search_version=current))
+
+
+def _begin(connection: Connection, plan: _Plan) -> None:
+    """Remove what a plan replaces, and write the environment's own row."""
+    _remove(connection, plan)
+    if plan.version is not None:
+        _put_environment(connection, plan.row)
+
+
+def _end(connection: Connection, plan: _Plan) -> None:
+    """Note that the rows show the planned version."""
+    version = -1 if plan.version is None else plan.version
+    seen = {"search_sequence": plan.row.sequence, "search_updated": plan.row.updated}
+    connection.execute(_of(plan.row).values(search_version=version, **seen))
 
 
 def _of(row: Row[Any]) -> Update:
