@@ -27,6 +27,9 @@ TICK_SECONDS = 1.0
 CLOCK_TOLERANCE = timedelta(seconds=60)
 """Maximum backward step of the clock that is not logged."""
 
+SEARCH_BATCH = 100
+"""Maximum number of environments whose names are brought up to date in one run."""
+
 COLLECT_EVERY = timedelta(hours=24)
 COLLECT_GRACE = timedelta(hours=6)
 """Minimum age of unreferenced data that the daily garbage collection removes; uploads may still use younger data."""
@@ -92,6 +95,8 @@ class _Housekeeping:
             store.overlays.end_due(datetime.now(UTC))
             store.versions.remove_expired_dry_runs()
             store.drafts.remove_expired()
+            store.search_index.refresh(SEARCH_BATCH)
+            store.robot_counts.join()
             if is_beat:
                 store.sessions.sweep()
                 self._services.jobs.sweep()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -20,7 +19,7 @@ from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import CHANNEL, ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.errors import Invalid, Problem
-from app.store.fleet_values import Channel, Robot, Rollout, RolloutState
+from app.store.fleet_values import Channel, FleetCounts, Rollout, RolloutState
 from app.store.values import LATEST, rfc3339
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
@@ -133,10 +132,10 @@ ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="Name of the chan
 router = api_router("channels", "/environments/{env}/channels")
 
 
-def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> dict[str, Any]:
+def as_dict(channel: Channel, robots: FleetCounts | None) -> dict[str, Any]:
     """Convert a channel to JSON, with the status of its robots.
 
-    robots: robots of the environment; None omits their status and the closures.
+    robots: counts of the environment's robots; None omits their status and the closures.
     """
     planned = None
     if channel.planned is not None:
@@ -164,12 +163,12 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
             "sequence": channel.closures_sequence,
         }
         root = channel.planned.root if channel.planned else None
-        out["robots"] = fleet.channel_convergence(robots, channel, now, root).as_dict()
+        out["robots"] = fleet.channel_convergence(robots, channel, root).as_dict()
     return out
 
 
 def _channel_as_json(services: Services, env: str, channel: Channel) -> dict[str, Any]:
-    return as_dict(channel, services.store.robots.all(env), datetime.now(UTC))
+    return as_dict(channel, fleet.count_robots(services.store.robot_counts, env, datetime.now(UTC)))
 
 
 @router.get("", responses=problem_responses(list[ChannelOut], 404), summary="List channels")
@@ -199,8 +198,8 @@ async def list_channels(
 
 def _list_response(services: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
     generation, now = services.response_cache.generation(), datetime.now(UTC)
-    fleet_of = services.store.robots.all(env) if robots else None
-    data = json_bytes([as_dict(channel, fleet_of, now) for channel in services.store.channels.all(env)])
+    counts = fleet.count_robots(services.store.robot_counts, env, now) if robots else None
+    data = json_bytes([as_dict(channel, counts) for channel in services.store.channels.all(env)])
     headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
     if not robots:  # the request that all robots of a fleet send at once
         services.response_cache.store_response(request, env, headers, data, generation)

@@ -13,7 +13,7 @@ from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import problem_responses
 from app.errors import Invalid, Problem
-from app.store.search import SearchKind
+from app.store.search_index import SearchKind
 
 
 class SearchItemOut(BaseModel):
@@ -60,7 +60,8 @@ def search(
     """Find environments by name and title, and nodes, zones and objects by name and id.
 
     Searched are the accessible environments, in the version of `production` if this channel exists, else in the newest
-    one. Order: equal names, then prefixes, then other parts of names; in each environments, nodes, zones, objects.
+    one. Order: equal names and ids, then prefixes, then other parts; in each environments, nodes, zones, objects, by
+    the text that matches. Of more than 1000 that match in the middle of their name or id, some are chosen.
     """
     text = q.strip()
     if not text or not text.isprintable():

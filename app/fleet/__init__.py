@@ -7,7 +7,7 @@ messages.
 
 from app.fleet.report_queue import WARN_SECONDS, ReportQueue, report_from_status, wait_until_stored
 from app.fleet.rollout import next_step
-from app.fleet.status import ChannelConvergence, Lag, channel_convergence, is_online, robot_lag
+from app.fleet.status import ChannelConvergence, Lag, channel_convergence, count_robots, is_online, robot_lag
 
 __all__ = [
     "WARN_SECONDS",
@@ -15,6 +15,7 @@ __all__ = [
     "Lag",
     "ReportQueue",
     "channel_convergence",
+    "count_robots",
     "is_online",
     "next_step",
     "report_from_status",

@@ -5,12 +5,13 @@ All times are by the server's clock; robots' clocks are ignored.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from app.store.fleet_values import Channel, ChannelMove, Robot
+from app.store.fleet_values import Channel, ChannelMove, FleetCounts, Robot, RobotGroup
+from app.store.robot_counts import RobotCounts
 from app.store.values import rfc3339
 
 REPORT_FRESH = timedelta(seconds=180)
@@ -110,25 +111,30 @@ def is_ready(robot: Robot, root: str) -> bool:
     return loaded or (robot.active_map is not None and robot.active_map.root == root)
 
 
-def channel_convergence(
-    robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None
-) -> ChannelConvergence:
-    """Compute the convergence of a channel. robots: of its environment; planned: root of the planned version."""
-    channel_robots = [robot for robot in robots if robot.report.channel == channel.name]
+def count_robots(counts: RobotCounts, environment: str, now: datetime) -> FleetCounts:
+    """Count an environment's robots, those online by the rule of ``is_online``. Raises NotFound."""
+    return counts.read(environment, on_bus_after=now - PRESENCE_FRESH, heard_after=now - REPORT_FRESH)
+
+
+def channel_convergence(counts: FleetCounts, channel: Channel, planned: str | None = None) -> ChannelConvergence:
+    """Compute the convergence of a channel. counts: of its environment; planned: root of the planned version."""
+    groups = [group for group in counts.groups if group.channel == channel.name]
     overlays = channel.closures.digest
-    hold, behind = [], []
-    for robot in channel_robots:
-        if robot.active_map is not None and robot.active_map.shows(channel.root, overlays):
-            hold.append(robot.active_map.since)
-        else:
-            behind.append(robot)
-    failed = sum(robot.report.state == "failed" for robot in behind)
+    total = sum(group.number for group in groups)
+    behind = [group for group in groups if not group.shows(channel.root, overlays)]
+    lagging = sum(group.number for group in behind)
+    failed = sum(group.number for group in behind if group.state == "failed")
+    changed = counts.last_held.get(channel.name)
     return ChannelConvergence(
-        total=len(channel_robots),
-        online=sum(is_online(robot, now) for robot in channel_robots),
-        holding=len(hold),
-        lagging=len(behind) - failed,
+        total=total,
+        online=min(total, counts.online.get(channel.name, 0)),
+        holding=total - lagging,
+        lagging=lagging - failed,
         failed=failed,
-        ready=0 if planned is None else sum(robot.vouched and is_ready(robot, planned) for robot in channel_robots),
-        since=max([*hold, channel.time]) if channel_robots and not behind else None,
+        ready=0 if planned is None else sum(g.number for g in groups if g.vouched and _has_fetched(g, planned)),
+        since=max(changed or channel.time, channel.time) if total and not behind else None,
     )
+
+
+def _has_fetched(group: RobotGroup, root: str) -> bool:
+    return (group.state in ("ready", "active") and group.root == root) or group.held_root == root

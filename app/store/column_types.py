@@ -5,7 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import DateTime, Dialect, LargeBinary
+from sqlalchemy import DateTime, Dialect, LargeBinary, String, Text
+from sqlalchemy.dialects.postgresql import TSVECTOR
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.elements import BindParameter, ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
@@ -45,9 +46,16 @@ class as_wkb(FunctionElement[bytes]):  # noqa: N801 - an SQL function
     inherit_cache = True
 
 
+class as_grams(FunctionElement[Any]):  # noqa: N801 - an SQL function
+    """SQL function from an array of texts to the column's form."""
+
+    inherit_cache = True
+
+
 @compiles(from_wkb)
 @compiles(as_wkb)
-def _as_is(element: FunctionElement[bytes], compiler: Any, **kw: Any) -> str:
+@compiles(as_grams)
+def _as_is(element: FunctionElement[Any], compiler: Any, **kw: Any) -> str:
     return str(compiler.process(next(iter(element.clauses)), **kw))
 
 
@@ -82,3 +90,32 @@ class WkbGeometry(TypeDecorator[bytes]):
     def column_expression(self, column: ColumnElement[Any]) -> ColumnElement[Any]:
         """Convert the column's form into WKB."""
         return as_wkb(column)
+
+
+def binary_text(length: int | None = None) -> String:
+    """Return the type of a text that both databases compare and sort by code points, whatever language theirs have."""
+    return String(length).with_variant(String(length, collation="C"), "postgresql")
+
+
+@compiles(as_grams, "postgresql")
+def _as_grams(element: as_grams, compiler: Any, **kw: Any) -> str:
+    return f"array_to_tsvector(CAST({compiler.process(next(iter(element.clauses)), **kw)} AS TEXT[]))"
+
+
+class Grams(TypeDecorator[list[str]]):
+    """A set of short texts with an index by each, also by its beginning: a tsvector on PostgreSQL, unused on SQLite."""
+
+    impl = Text
+    cache_ok = True
+
+    def load_dialect_impl(self, dialect: Dialect | None) -> TypeEngine[Any]:
+        """Return PostgreSQL's type."""
+        return TSVECTOR() if dialect is not None and dialect.name == "postgresql" else Text()
+
+    def process_bind_param(self, value: list[str] | None, dialect: Dialect) -> Any:
+        """Return the texts on PostgreSQL, nothing on SQLite."""
+        return value if dialect.name == "postgresql" else None
+
+    def bind_expression(self, bindparam: BindParameter[Any]) -> ColumnElement[Any]:
+        """Convert an array of texts."""
+        return as_grams(bindparam)

@@ -231,6 +231,8 @@ class Environments:
                 raise Conflict(f"the environment {name!r} is not deleted: delete it first, then purge it")
             _retire(connection, name, row.sequence)
             connection.execute(delete(table).where(table.c.id == row.id))
+            tally = tables.robot_tally
+            connection.execute(delete(tally).where(tally.c.environment_id == row.id))
             connection.execute(update(tables.collection).values(purges=tables.collection.c.purges + 1))
 
 

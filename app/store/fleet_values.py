@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any, Final, Literal
@@ -182,6 +182,39 @@ class Robot:
     def has_failed_with(self, root: str) -> bool:
         """Return whether it reports a failure of a version."""
         return self.report.state == "failed" and self.report.root == root
+
+
+@dataclass(frozen=True, slots=True)
+class RobotGroup:
+    """Robots of a channel with equal reports. held_root, held_overlays: of the active map, None without one."""
+
+    channel: str
+    state: RobotState
+    root: str
+    held_root: str | None
+    held_overlays: str | None
+    vouched: bool
+    number: int
+
+    def shows(self, root: str | None, overlays: str) -> bool:
+        """Return whether the active map has a root and closures, given by their digest."""
+        return (
+            self.held_root is not None
+            and self.held_root == root
+            and (self.held_overlays or NO_CLOSURES.digest) == overlays
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FleetCounts:
+    """Counts of an environment's robots.
+
+    online: number of robots that are online, by channel. last_held: when a robot of the channel last changed its map.
+    """
+
+    groups: Sequence[RobotGroup]
+    online: Mapping[str, int]
+    last_held: Mapping[str, datetime | None]
 
 
 @dataclass(frozen=True, slots=True)

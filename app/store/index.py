@@ -125,7 +125,7 @@ class SpatialIndex:
         """Update the index of every environment to its head; returns how many were behind."""
         table = tables.environment
         with self._database.read() as connection:
-            behind = list(connection.execute(select(table.c.id).where(table.c.indexed != table.c.head)).scalars())
+            behind = list(connection.execute(select(table.c.id).where(table.c.index_stale)).scalars())
         for environment_id in behind:
             self._refresh(environment_id)
         return len(behind)

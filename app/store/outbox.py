@@ -17,15 +17,16 @@ from app.store.database import Database
 from app.store.values import Event, PartEntry, rfc3339
 
 LOG_SEARCH_WINDOW = 100_000
-"""Number of newest log positions that are searched for the last events of environments and of former names."""
+"""Number of newest log positions in which former names are searched, and in which environments compete for history."""
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryRange:
-    """Events of one environment from a log position on."""
+    """Events of one environment from a log position on, at most the last ``most``."""
 
     environment_id: str
     first: int
+    most: int
 
 
 def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> list[dict[str, Any]]:
@@ -154,7 +155,8 @@ class Outbox:
         """Choose the last ``each`` events up to a position of all environments, also purged ones, newest first.
 
         If these are more than ``limit``, each environment has fewer; if even one per environment is too many, those
-        with the oldest events have none.
+        with the oldest events have none. Environments without an event in the newest LOG_SEARCH_WINDOW positions come
+        last and share what is left; purged ones of that age have none.
         """
         table = tables.event
         rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
@@ -170,10 +172,17 @@ class Outbox:
             .limit(limit)
             .subquery()
         )
-        query = select(chosen.c.environment_id, func.min(chosen.c.position).label("first"))
+        number = func.count().label("number")
+        query = select(chosen.c.environment_id, func.min(chosen.c.position).label("first"), number)
         query = query.group_by(chosen.c.environment_id).order_by(func.max(chosen.c.position).desc())
+        owner = tables.environment
         with self._database.read() as connection:
-            return [HistoryRange(row.environment_id, row.first) for row in connection.execute(query)]
+            rows = connection.execute(query).all()
+            names = connection.execute(select(owner.c.id).order_by(owner.c.updated.desc())).scalars().all()
+        ranges = [HistoryRange(row.environment_id, row.first, each) for row in rows]
+        left, known = limit - sum(row.number for row in rows), {row.environment_id for row in rows}
+        quiet = [name for name in names if name not in known][: max(0, left)]
+        return ranges + [HistoryRange(name, 0, min(each, left // len(quiet))) for name in quiet]
 
     def last(self, chosen: HistoryRange, each: int, position: int) -> list[Event]:
         """List an environment's chosen events and later ones up to a position, at most the last ``each``, in order."""
@@ -186,7 +195,7 @@ class Outbox:
                 table.c.position <= position,
             )
             .order_by(table.c.sequence.desc())
-            .limit(each)
+            .limit(min(each, chosen.most))
         )
         with self._database.read() as connection:
             rows = connection.execute(query).all()

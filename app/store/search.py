@@ -1,60 +1,67 @@
-"""Search by name in all environments: an index in memory for each vector part, built on first use.
+"""Search by name in all environments, by SQL on the index that ``search_index`` keeps.
 
-Parts are addressed by their content, so an index stays valid for all versions that contain the part.
+Texts that equal the query or begin with it come in the order of an index on the texts, so that they cost what is
+returned. Others that contain it come from an index of groups of three characters, if there are too few of the former.
 """
 
 from __future__ import annotations
 
-import sys
-import threading
-from array import array
-from bisect import bisect_left, bisect_right
-from collections import OrderedDict
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+import heapq
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple
 
-import numpy as np
-import shapely
-from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, func, select
+import orjson
+from sqlalchemy import (
+    ARRAY,
+    ColumnElement,
+    CompoundSelect,
+    Connection,
+    Integer,
+    Row,
+    Select,
+    Text,
+    and_,
+    any_,
+    bindparam,
+    cast,
+    column,
+    func,
+    literal_column,
+    or_,
+    select,
+    table,
+    union_all,
+)
+from sqlalchemy.dialects.postgresql import TSQUERY
 
-from app.errors import Unavailable
-from app.model.frame import Datum
-from app.model.geodesy import local_frame
-from app.model.layers import Layer
-from app.store import tables, tree
-from app.store.chunks import Chunks
+from app.store import tables
 from app.store.database import Database
-from app.store.encode import from_wkb
 from app.store.environments import reaches
-from app.store.manifest import unpack_manifest
-from app.store.parts.features import leaf_items
-from app.store.parts.roots import read_root
-from app.store.values import PartEntry
+from app.store.search_index import GRAM, ORDER, SEPARATOR, SearchIndex, SearchKind, fold
 
-SearchKind = Literal["environment", "node", "object", "zone"]
+MAX_CANDIDATES: Final = 1000
+"""Maximum number of matches in the middle of a text, of each kind, that are put in order."""
 
-KINDS: Final[dict[Layer, SearchKind]] = {"topology": "node", "objects": "object", "zones": "zone"}
-"""Kind of hit by layer."""
+FEW: Final = 5
+"""Number of environments whose rows are all looked at, instead of the rows of all environments with the text."""
 
-ORDER: Final[tuple[SearchKind, ...]] = ("environment", "node", "zone", "object")
+EQUAL: Final = 0
+PREFIX: Final = 1
+PART: Final = 2
+"""Ranks: the name or id equals the query, begins with it, contains it."""
 
-PRODUCTION: Final = "production"
+LAST: Final = "\U0010ffff"
+"""Sorts after all texts that begin alike."""
 
-MAX_INDEX_BYTES: Final = 128 * 2**20
-"""Maximum size of all indexes in memory, in bytes; the least recently used ones are built again when needed."""
+WILDCARDS: Final = "*?["
+SINGLE, DOUBLE = "'", '"'
 
-MAX_VERSIONS: Final = 2000
-"""Maximum number of versions whose list of parts is cached."""
+_COLUMNS: Final = ("id", "kind", "level", "feature", "name", "folded", "folded_id", "x", "y")
 
-MAX_BUILDERS: Final = 4
-"""Maximum number of searches that wait for missing indexes; further ones are refused, so that threads stay free."""
-
-MAX_FIELD: Final = 256
-"""Maximum number of characters of a name that are searched."""
-
-SEPARATOR: Final = "\n"
+_SEARCH_TEXT: Final = table("search_text", column("rowid"), column("search_text"))
+_SEARCH_TERM: Final = table("search_term", column("term"), column("doc"), column("col"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,256 +82,208 @@ class SearchHit:
     title: str
 
 
-class NameIndex:
-    """Names and ids of a part's items, as one text that Python searches at the speed of memory."""
-
-    def __init__(
-        self, items: Iterable[tuple[str, str | None]], xy: NDArray[np.float64], local: NDArray[np.bool_]
-    ) -> None:
-        """Index items (id, name). xy: coordinates [n, 2], NaN without geometry. local: metres, else degrees."""
-        self._xy, self._local = xy, local
-        fields: list[str] = []
-        self._owners = array("i")
-        for row, (item, name) in enumerate(items):
-            if name and name != item:
-                fields.append(name)
-                self._owners.append(row)
-            fields.append(item)
-            self._owners.append(row)
-        fields = [text[:MAX_FIELD].replace(SEPARATOR, " ") for text in fields]
-        lengths = np.fromiter(map(len, fields), np.int64, len(fields)) + len(SEPARATOR)
-        self._starts = array("i", (np.cumsum(lengths) - lengths + len(SEPARATOR)).tolist())
-        self._text = SEPARATOR.join(["", *fields, ""])
-        folded = fold(self._text)
-        self._folded = self._text if folded == self._text else folded
-        texts = {id(text): sys.getsizeof(text) for text in (self._text, self._folded)}
-        self.size = sum(texts.values()) + 8 * len(self._starts) + xy.nbytes + local.nbytes + 1000
-
-    def find(self, query: str, limit: int, worst: int = 2) -> dict[int, int]:
-        """Find items by a folded query: row -> rank (0 equal, 1 prefix, 2 part of the name or id).
-
-        At least the best ``limit`` by rank are found, if there are so many. worst: the last rank of interest.
-        """
-        ranks: dict[int, int] = {}
-        needles = (query, SEPARATOR + query, SEPARATOR + query + SEPARATOR)
-        for needle in needles[2 - worst :]:
-            if self._scan(needle, query, limit, ranks):
-                break  # further needles find nothing else
-        return ranks
-
-    def _scan(self, needle: str, query: str, limit: int, ranks: dict[int, int]) -> bool:
-        """Add up to ``limit`` items that contain a text; returns whether these are all."""
-        shift = len(SEPARATOR) if needle.startswith(SEPARATOR) else 0
-        at, rows = self._folded.find(needle), set[int]()
-        while at >= 0:
-            place = bisect_right(self._starts, at + shift) - 1
-            start, row = self._starts[place], self._owners[place]
-            rows.add(row)
-            if len(rows) > limit:
-                return False
-            ranks[row] = min(ranks.get(row, 2), self._rank(start, query))
-            at = self._folded.find(needle, self._end(start))
-        return True
-
-    def _rank(self, start: int, query: str) -> int:
-        if not self._folded.startswith(query, start):
-            return 2
-        return 0 if self._folded.startswith(SEPARATOR, start + len(query)) else 1
-
-    def _end(self, start: int) -> int:
-        return self._folded.index(SEPARATOR, start)
-
-    def item(self, row: int) -> tuple[str, str]:
-        """Return (id, name) of an item; without a name, the name is the id."""
-        first, last = bisect_left(self._owners, row), bisect_right(self._owners, row) - 1
-        name, item = (self._text[start : self._end(start)] for start in (self._starts[first], self._starts[last]))
-        return item, name
-
-    def position(self, row: int, datum: Datum | None) -> tuple[float, float] | None:
-        """Return the position of an item in metres, None if it has none."""
-        xy = self._xy[row : row + 1]
-        if np.isnan(xy).any():
-            return None
-        if not self._local[row]:
-            if datum is None:
-                return None
-            xy = local_frame(datum).to_local(xy)
-        return round(float(xy[0, 0]), 9), round(float(xy[0, 1]), 9)
-
-
-class _Content(NamedTuple):
-    """Searched parts of a version, and its datum."""
-
-    datum: Datum | None
-    parts: tuple[PartEntry, ...]
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class _Match:
-    """Match, in the order of the results. index: None for the environment itself."""
+class _Match(NamedTuple):
+    """Match, in the order of the results: by the text that matches, names before ids."""
 
     rank: int
-    order: int
-    name: str
+    kind: int
+    text: str
     environment: str
     level: str
-    row: int
-    owner: Row[Any] = field(compare=False)
-    datum: Datum | None = field(compare=False)
-    index: NameIndex | None = field(compare=False)
-
-    def as_hit(self) -> SearchHit:
-        version, title = self.owner.version, self.owner.title
-        if self.index is None:
-            name = self.environment
-            return SearchHit("environment", name, version, name, name, None, None, title)
-        item, name = self.index.item(self.row)
-        position = self.index.position(self.row, self.datum)
-        return SearchHit(ORDER[self.order], self.environment, version, item, name, self.level, position, title)
+    by_id: bool
+    feature: str
+    id: int
+    row: Row[Any]
 
 
 class Search:
     """Search by name. Thread-safe."""
 
-    def __init__(self, database: Database, chunks: Chunks, max_bytes: int = MAX_INDEX_BYTES) -> None:
-        self._database, self._chunks, self._max_bytes = database, chunks, max_bytes
-        self._indexes: OrderedDict[str, NameIndex] = OrderedDict()
-        self._contents: OrderedDict[tuple[str, int], _Content] = OrderedDict()
-        self._size = 0
-        self._lock, self._building = threading.Lock(), threading.Lock()
-        self._builders = threading.Semaphore(MAX_BUILDERS)
+    def __init__(self, database: Database, index: SearchIndex) -> None:
+        self._database, self._index = database, index
 
     def find(self, query: str, *, limit: int, allowed: str | None = None) -> tuple[list[SearchHit], bool]:
         """Find environments by name and title, and nodes, zones and objects by name and id.
 
         In the version of the channel ``production`` if it exists, else in the head. Case-insensitive. Order: equal
-        names before prefixes before other parts of names; of each environments, nodes, zones, objects, by name.
+        texts before prefixes before other parts of texts; of each environments, nodes, zones, objects, by the text that
+        matches. Of more than MAX_CANDIDATES of a kind that match in the middle, some are chosen.
 
         allowed: a name pattern (fnmatch) of environments. Returns also whether there are more than ``limit``. Raises
-        Unavailable while other searches build the index.
+        Unavailable while the index is being built.
         """
+        self._index.catch_up()
         needle = fold(query.replace(SEPARATOR, " "))
-        versions = self._read_versions(allowed)
-        best = sorted(match for owner, _ in versions if (match := _environment_match(owner, needle)))[: limit + 1]
-        for owner, content in versions:
-            for entry in content.parts:
-                order, worst = ORDER.index(KINDS[entry.key.layer]), 2
-                if len(best) > limit:
-                    worst = best[-1].rank - (best[-1].order <= order)
-                if worst >= 0:
-                    best += self._matches(owner, content.datum, entry, needle, limit + 1, worst)
-                    best = sorted(best)[: limit + 1]
-        return [match.as_hit() for match in best[:limit]], len(best) > limit
-
-    def _matches(
-        self, owner: Row[Any], datum: Datum | None, entry: PartEntry, needle: str, limit: int, worst: int
-    ) -> list[_Match]:
-        index, order = self._index(entry), ORDER.index(KINDS[entry.key.layer])
-        return [
-            _Match(rank, order, fold(index.item(row)[1]), owner.name, entry.key.level, row, owner, datum, index)
-            for row, rank in index.find(needle, limit, worst).items()
-            if rank <= worst
-        ]
-
-    def _read_versions(self, allowed: str | None) -> list[tuple[Row[Any], _Content]]:
-        """Read the accessible environments with their searched version, by name."""
-        table, channel = tables.environment, tables.channel
-        production = (channel.c.environment_id == table.c.id) & (channel.c.name == PRODUCTION)
-        number = func.coalesce(channel.c.version, table.c.head).label("version")
-        query: Any = select(table.c.id, table.c.name, table.c.title, number).outerjoin(channel, production)
+        if "\x00" in needle:  # no stored text has one
+            return [], False
+        hits: dict[int, SearchHit] = {}
         with self._database.read() as connection:
-            rows = connection.execute(query.where(table.c.deleted.is_(None)).order_by(table.c.name)).all()
-            return [(row, self._content(connection, row)) for row in rows if reaches(allowed, row.name)]
+            scope = _scope(connection, allowed)
+            for match in self._matches(connection, scope, needle, limit + 1):
+                if reaches(allowed, match.row.owner):
+                    hits.setdefault(match.id, _as_hit(match.row))
+                if len(hits) > limit:
+                    break
+        return list(hits.values())[:limit], len(hits) > limit
 
-    def _content(self, connection: Connection, row: Row[Any]) -> _Content:
-        key = (row.id, row.version)
-        with self._lock:
-            content = self._contents.get(key)
-            if content is not None:
-                self._contents.move_to_end(key)
-                return content
-        table = tables.version
-        query = select(table.c.manifest).where(table.c.environment_id == row.id, table.c.number == row.version)
-        datum, _, parts, _ = unpack_manifest(bytes(connection.execute(query).scalar_one()))
-        content = _Content(datum, tuple(e for e in parts if e.key.layer in KINDS and e.count))
-        with self._lock:
-            self._contents[key] = content
-            while len(self._contents) > MAX_VERSIONS:
-                self._contents.popitem(last=False)
-        return content
-
-    def _index(self, entry: PartEntry) -> NameIndex:
-        index = self._cached(entry.hash)
-        if index is not None:
-            return index
-        if not self._builders.acquire(blocking=False):
-            raise Unavailable("the search index is being built: try again in a few seconds")
-        try:
-            with self._building:  # one at a time: concurrent searches need the same ones
-                index = self._cached(entry.hash)
-                return self._build(entry) if index is None else index
-        finally:
-            self._builders.release()
-
-    def _cached(self, name: str) -> NameIndex | None:
-        with self._lock:
-            index = self._indexes.get(name)
-            if index is not None:
-                self._indexes.move_to_end(name)
-            return index
-
-    def _build(self, entry: PartEntry) -> NameIndex:
-        index = self._read_index(entry)
-        with self._lock:
-            self._indexes[entry.hash] = index
-            self._size += index.size
-            while self._size > self._max_bytes and len(self._indexes) > 1:
-                self._size -= self._indexes.popitem(last=False)[1].size
-        return index
-
-    def _read_index(self, entry: PartEntry) -> NameIndex:
-        draft = self._chunks.stage()
-        root = read_root(draft, bytes.fromhex(entry.hash))
-        items: list[tuple[str, str | None]] = []
-        wkb: list[bytes] = []
-        local = 0
-        for anchor, name in enumerate(("local", "wgs84")):
-            node = root.trees[name]
-            for item_id, item in leaf_items(draft, tree.leaves(draft, [node])[0] if node else [], anchor):
-                properties = item.properties
-                if entry.key.layer == "topology" and properties.get("kind") != "node":
-                    continue
-                title = properties.get("name")
-                items.append((item_id, title if isinstance(title, str) else None))
-                wkb.append(item.wkb)
-                local += anchor == 0
-        return NameIndex(items, _positions(from_wkb(wkb)), np.arange(len(items)) < local)
+    def _matches(self, connection: Connection, scope: _Scope, needle: str, limit: int) -> Iterator[_Match]:
+        """Find the best ``limit`` items, best first; one that matches by name and id may come twice."""
+        sqlite = self._database.sqlite
+        values = {**scope.values, "needle": needle, "last": needle + LAST}
+        if scope.form == "few":
+            rows = connection.execute(_all_query(sqlite=sqlite), values)
+            yield from heapq.nsmallest(limit, (_best_match(row, needle) for row in rows))
+            return
+        seen: set[int] = set()
+        for rank in (EQUAL, PREFIX):
+            ordered = _ordered_query(rank, scope.form, sqlite=sqlite)
+            rows = connection.execute(ordered, {**values, "limit": limit + len(seen)})
+            for match in sorted(_match(row, rank, by_id=bool(row.by_id)) for row in rows):
+                seen.add(match.id)
+                yield match
+        query = _part_query(scope.form, is_short=len(needle) < GRAM, sqlite=sqlite)
+        for kind in range(len(ORDER)):
+            wanted = _wanted(needle, kind, sqlite=sqlite)
+            more = {"wanted": wanted, "kind": kind, "column": ORDER[kind], "limit": MAX_CANDIDATES + limit}
+            rows = connection.execute(query, {**values, **more})
+            matches = (_best_match(row, needle) for row in rows)
+            yield from sorted(match for match in matches if match.rank == PART)
 
 
-def _environment_match(owner: Row[Any], needle: str) -> _Match | None:
-    """Compare the name and title of an environment."""
-    texts = [fold(text) for text in (owner.name, owner.title)]
-    ranks = [0 if text == needle else 1 if text.startswith(needle) else 2 for text in texts if needle in text]
-    return _Match(min(ranks), 0, owner.name, owner.name, "", -1, owner, None, None) if ranks else None
+# --- which environments ---
+
+Form = Literal["all", "range", "ids", "few"]
 
 
-def fold(text: str) -> str:
-    """Convert to lower case without changing the number of characters."""
-    lower = text.lower()
-    if len(lower) != len(text):
-        lower = "".join([c.lower() if len(c.lower()) == 1 else c for c in text])
-    return lower.replace("ς", "σ")  # the only letter whose lower case depends on its neighbours
+@dataclass(frozen=True, slots=True)
+class _Scope:
+    """Environments that a search looks at, as a form of the queries and its values.
+
+    ``range``: names from ``first`` to ``end``. ``ids``, ``few``: these; of few environments all items are read.
+    """
+
+    form: Form
+    values: Mapping[str, Any]
 
 
-def _positions(geometry: NDArray[np.object_]) -> NDArray[np.float64]:
-    """Return a position [n, 2] on each geometry; NaN for empty ones."""
-    out = np.full((len(geometry), 2), np.nan)
-    used = np.flatnonzero(~shapely.is_empty(geometry))
-    points = geometry[used]
-    shapes = shapely.get_type_id(points) != 0
-    try:
-        points[shapes] = shapely.point_on_surface(points[shapes])
-    except shapely.errors.GEOSException:  # of an invalid polygon
-        points[shapes] = shapely.centroid(points[shapes])
-    out[used] = shapely.get_coordinates(points)
-    return out
+def _scope(connection: Connection, allowed: str | None) -> _Scope:
+    """Return the environments that a name pattern allows."""
+    if allowed is None:
+        return _Scope("all", {})
+    prefix = allowed[: min((k for k in map(allowed.find, WILDCARDS) if k >= 0), default=len(allowed))]
+    is_range = allowed == prefix + "*"
+    owner = tables.environment
+    names = select(owner.c.id, owner.c.name).where(owner.c.deleted.is_(None))
+    names = names.where(owner.c.name.startswith(prefix, autoescape=True)) if prefix else names
+    rows = connection.execute(names.limit(FEW + 1) if is_range else names)
+    ids = [row.id for row in rows if reaches(allowed, row.name)]
+    if is_range and len(ids) > FEW:
+        return _Scope("range", {"first": prefix, "end": prefix + LAST})
+    listed = orjson.dumps(ids).decode() if connection.dialect.name == "sqlite" else ids
+    return _Scope("few" if len(ids) <= FEW else "ids", {"ids": listed})
+
+
+# --- queries: made once, since making one takes longer than executing it ---
+
+
+def _items(form: Form, *, sqlite: bool) -> Select[Any]:
+    """Select items, with what a result says of their environment."""
+    item, owner = tables.search_item, tables.environment
+    columns = (item.c[name] for name in _COLUMNS)
+    query = (
+        select(*columns, owner.c.name.label("owner"), owner.c.title, owner.c.search_version.label("version"))
+        .join(owner, owner.c.id == item.c.environment_id)
+        .where(owner.c.deleted.is_(None), owner.c.search_version >= 0)
+    )
+    if form == "all":
+        return query
+    if form == "range":
+        return query.where(item.c.environment >= bindparam("first"), item.c.environment < bindparam("end"))
+    if sqlite:
+        ids = func.json_each(bindparam("ids", type_=Text)).table_valued("value").c.value
+        return query.where(item.c.environment_id.in_(select(ids)))
+    return query.where(item.c.environment_id == any_(bindparam("ids", type_=ARRAY(Text))))
+
+
+@lru_cache
+def _all_query(*, sqlite: bool) -> Select[Any]:
+    """Select all items of few environments that contain the text."""
+    return _items("few", sqlite=sqlite).where(_has_text(sqlite=sqlite))
+
+
+@lru_cache
+def _ordered_query(rank: int, form: Form, *, sqlite: bool) -> CompoundSelect[Any]:
+    """Select the first items of each kind whose name or id equals the text, or begins with it."""
+    item = tables.search_item
+    needle, last = bindparam("needle", type_=Text), bindparam("last", type_=Text)
+    queries = []
+    for kind in range(len(ORDER)):
+        for by_id, text in enumerate((item.c.folded, item.c.folded_id)):
+            condition = text == needle if rank == EQUAL else and_(text > needle, text < last)
+            query = _items(form, sqlite=sqlite).add_columns(literal_column(str(by_id)).label("by_id"))
+            query = query.where(item.c.kind == literal_column(str(kind)), condition)
+            order = (text, item.c.environment, item.c.level, item.c.feature)
+            queries.append(select(query.order_by(*order).limit(bindparam("limit", type_=Integer)).subquery()))
+    return union_all(*queries)
+
+
+@lru_cache
+def _part_query(form: Form, *, is_short: bool, sqlite: bool) -> Select[Any]:
+    """Select items of a kind that contain the text, by the index of three characters in a row."""
+    item = tables.search_item
+    query = _items(form, sqlite=sqlite).where(_has_text(sqlite=sqlite)).limit(bindparam("limit", type_=Integer))
+    if not sqlite:
+        wanted = cast(bindparam("wanted", type_=Text), TSQUERY)
+        return query.where(item.c.kind == bindparam("kind"), item.c.grams.op("@@")(wanted))
+    if is_short:
+        term = _SEARCH_TERM.c
+        begins = term.term >= bindparam("needle"), term.term < bindparam("last"), term.col == bindparam("column")
+        rows = select(term.doc).where(*begins).distinct().subquery()
+        return query.join(rows, rows.c.doc == item.c.id)
+    text = _SEARCH_TEXT.c
+    return query.join(_SEARCH_TEXT, text.rowid == item.c.id).where(text.search_text.op("MATCH")(bindparam("wanted")))
+
+
+def _has_text(*, sqlite: bool) -> ColumnElement[bool]:
+    """Return a condition: the name or id contains the text, whose characters stand for themselves."""
+    item, needle = tables.search_item, bindparam("needle", type_=Text)
+    position = func.instr if sqlite else func.strpos
+    return or_(position(item.c.folded, needle) > 0, position(item.c.folded_id, needle) > 0)
+
+
+def _wanted(needle: str, kind: int, *, sqlite: bool) -> str:
+    """Return the query of the index of three characters in a row; on PostgreSQL shorter texts are prefixes of three."""
+    windows = sorted({needle[k : k + GRAM] for k in range(max(1, len(needle) - GRAM + 1))})
+    if sqlite:
+        return f"{ORDER[kind]} : ({' AND '.join(_quoted(window, DOUBLE) for window in windows)})"
+    return " & ".join(_quoted(window, SINGLE) + (":*" if len(window) < GRAM else "") for window in windows)
+
+
+def _quoted(text: str, quote: str) -> str:
+    """Quote a text for a query of the index: quotes, and on PostgreSQL backslashes, are doubled."""
+    escaped = text.replace("\\", "\\\\") if quote == SINGLE else text
+    return quote + escaped.replace(quote, 2 * quote) + quote
+
+
+def _best_match(row: Row[Any], needle: str) -> _Match:
+    """Return the better match of an item's name and id."""
+    ranks = [
+        (EQUAL if text == needle else PREFIX if text.startswith(needle) else PART, by_id)
+        for by_id, text in enumerate((row.folded, row.folded_id))
+        if text is not None and needle in text
+    ]
+    rank, by_id = min(ranks)
+    return _match(row, rank, by_id=bool(by_id))
+
+
+def _match(row: Row[Any], rank: int, *, by_id: bool) -> _Match:
+    text = row.folded_id if by_id else row.folded
+    return _Match(rank, row.kind, text, row.owner, row.level, by_id, row.feature, row.id, row)
+
+
+def _as_hit(row: Row[Any]) -> SearchHit:
+    of_item = row.kind != 0
+    position = None if row.x is None else (row.x, row.y)
+    name = row.name if of_item else row.owner
+    item_id, level = (row.feature, row.level) if of_item else (row.owner, None)
+    return SearchHit(ORDER[row.kind], row.owner, row.version, item_id, name, level, position, row.title)

@@ -31,8 +31,10 @@ from app.store.made_maps import MadeMaps
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
+from app.store.robot_counts import RobotCounts
 from app.store.robots import Robots
 from app.store.search import Search
+from app.store.search_index import SearchIndex
 from app.store.sessions import Sessions
 from app.store.tokens import Tokens
 from app.store.verify import Progress, Verifier
@@ -75,10 +77,12 @@ class Store:
         self.channels = Channels(database)
         self.overlays = Overlays(database)
         self.robots = Robots(database)
+        self.robot_counts = RobotCounts(database)
         self.events = Outbox(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)
-        self.search = Search(database, self.chunks)
+        self.search_index = SearchIndex(database, self.chunks)
+        self.search = Search(database, self.search_index)
         self.tokens = Tokens(database)
         self.sessions = Sessions(database, self.tokens)
         self.wrong_tokens = WrongTokens(database)

@@ -12,12 +12,13 @@ from sqlalchemy import (
     BigInteger,
     Boolean,
     Column,
+    Computed,
     Float,
     ForeignKey,
     Index,
     Integer,
     LargeBinary,
-    MetaData,
+    SmallInteger,
     String,
     Table,
     Text,
@@ -25,30 +26,16 @@ from sqlalchemy import (
     true,
 )
 
-from app.store.column_types import UtcDateTime, WkbGeometry
+from app.store import fleet_tables, table_base
+from app.store.column_types import Grams, UtcDateTime, WkbGeometry, binary_text
+from app.store.table_base import POSTGRESQL, box, environment_key
 
+metadata = table_base.metadata
 
-def _box() -> list[Column[float]]:
-    """Return columns of a box in degrees; west > east crosses the antimeridian."""
-    return [Column(name, Float(53), nullable=True) for name in ("west", "south", "east", "north")]
+robot, robot_history = fleet_tables.robot, fleet_tables.robot_history
+robot_tally, presence = fleet_tables.robot_tally, fleet_tables.presence
 
-
-POSTGRESQL = {"dialect": "postgresql"}
-"""Mark of objects that only PostgreSQL has: the comparison of models and migrations ignores ddl_if."""
-
-metadata = MetaData(
-    naming_convention={
-        "ix": "ix_%(table_name)s_%(column_0_name)s",
-        "uq": "uq_%(table_name)s_%(column_0_name)s",
-        "fk": "fk_%(table_name)s_%(column_0_name)s",
-        "pk": "pk_%(table_name)s",
-    }
-)
-
-
-def _environment(**options: Any) -> Column[str]:
-    return Column("environment_id", String(32), ForeignKey("environment.id", ondelete="CASCADE"), **options)
-
+SEARCH_STALE = "(search_sequence = sequence AND search_updated = updated) IS NOT TRUE"
 
 environment = Table(
     "environment",
@@ -67,13 +54,22 @@ environment = Table(
     Column("created", UtcDateTime, nullable=False),
     Column("updated", UtcDateTime, nullable=False),
     Column("deleted", UtcDateTime, nullable=True),
-    *_box(),
+    *box(),
     Column("extent", WkbGeometry, nullable=True),
     Column("area_stale", Boolean, nullable=False, server_default=true(), index=True),
+    Column("index_stale", Boolean, Computed("indexed <> head"), index=True),
+    Column("search_version", Integer, nullable=False, server_default="-1"),
+    Column("search_sequence", BigInteger, nullable=False, server_default="-1"),
+    Column("search_updated", UtcDateTime, nullable=True),
+    Column("search_stale", Boolean, Computed(SEARCH_STALE), index=True),
 )
 """Environments. head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event
 that changed the closures in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be
 computed from the head before it is read.
+
+search_version: the version that ``search_item`` shows; negative while there is none. search_sequence, search_updated:
+``sequence`` and ``updated`` at that time; every change raises one of them. index_stale, search_stale: whether ``place``
+and ``search_item`` may be behind, as the database computes it.
 """
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
@@ -84,11 +80,11 @@ Index("ix_environment_box", environment.c.south, environment.c.north, environmen
 area = Table(
     "area",
     metadata,
-    _environment(primary_key=True),
+    environment_key(primary_key=True),
     Column("piece", Integer, primary_key=True, autoincrement=False),
     Column("basis", String(8), nullable=False),
     Column("size", Float(53), nullable=False),
-    *_box(),
+    *box(),
     Column("geometry", WkbGeometry, nullable=False),
 )
 """Areas of the heads on earth, see ``app.store.area``: for queries by position.
@@ -103,7 +99,7 @@ Index("ix_area_box", area.c.south, area.c.north, area.c.west, area.c.east)
 version = Table(
     "version",
     metadata,
-    _environment(primary_key=True),
+    environment_key(primary_key=True),
     Column("number", Integer, primary_key=True, autoincrement=False),
     Column("root", String(64), nullable=False),
     Column("parent", Integer, nullable=True),
@@ -120,7 +116,7 @@ version = Table(
 source = Table(
     "source",
     metadata,
-    _environment(primary_key=True),
+    environment_key(primary_key=True),
     Column("number", Integer, primary_key=True, autoincrement=False),
     Column("position", Integer, primary_key=True, autoincrement=False),
     Column("name", Text, nullable=False),
@@ -149,7 +145,7 @@ dry_run = Table(
     "dry_run",
     metadata,
     Column("id", String(32), primary_key=True),
-    _environment(nullable=False, index=True),
+    environment_key(nullable=False, index=True),
     *_pending_content(),
     Column("author", Text, nullable=False),
     Column("message", Text, nullable=False),
@@ -164,7 +160,7 @@ draft = Table(
     "draft",
     metadata,
     Column("id", String(32), primary_key=True),
-    _environment(nullable=False),
+    environment_key(nullable=False),
     *_pending_content(),
     Column("name", Text, nullable=False),
     Column("owner", Text, nullable=False),
@@ -267,7 +263,7 @@ made_file = Table(
 channel = Table(
     "channel",
     metadata,
-    _environment(primary_key=True),
+    environment_key(primary_key=True),
     Column("name", String(63), primary_key=True),
     Column("version", Integer, nullable=True),
     Column("sequence", BigInteger, nullable=False),
@@ -323,7 +319,7 @@ from there, since robots reject a lower sequence.
 idempotency = Table(
     "idempotency",
     metadata,
-    _environment(primary_key=True),
+    environment_key(primary_key=True),
     Column("key", String(255), primary_key=True),
     Column("fingerprint", Text, nullable=False),
     Column("version", Integer, nullable=False),
@@ -393,55 +389,6 @@ location: address of what the task makes. outcome: of the task, for servers. fol
 """
 
 
-def _report() -> list[Column[Any]]:
-    """Columns of a robot's report. said: time by the robot's clock; time: of receipt, by the server's clock."""
-    return [
-        Column("channel", String(63), nullable=False),
-        Column("version", BigInteger, nullable=False),
-        Column("root", String(64), nullable=False),
-        Column("state", String(16), nullable=False),
-        Column("detail", Text, nullable=True),
-        Column("sequence", BigInteger, nullable=True),
-        Column("overlays", String(64), nullable=True),
-        Column("said", UtcDateTime, nullable=True),
-        Column("time", UtcDateTime, nullable=False),
-    ]
-
-
-robot = Table(
-    "robot",
-    metadata,
-    _environment(primary_key=True),
-    Column("robot", String(128), primary_key=True, index=True),
-    *_report(),
-    Column("since", UtcDateTime, nullable=False),
-    Column("held_version", BigInteger, nullable=True),
-    Column("held_root", String(64), nullable=True),
-    Column("held_sequence", BigInteger, nullable=True),
-    Column("held_overlays", String(64), nullable=True),
-    Column("held_since", UtcDateTime, nullable=True),
-    Column("vouched", Boolean, nullable=False, server_default=true()),
-    Column("place", JSON(none_as_null=True), nullable=True),
-    Column("placed", UtcDateTime, nullable=True),
-)
-"""Current state of robots, for each environment. since: when they first reported it.
-
-held: the active map, which a report
-of a map that is still being fetched does not change. vouched: whether any report was authenticated. place: result of
-``RobotPlace.as_dict``, from the report at ``placed``.
-"""
-
-robot_history = Table(
-    "robot_history",
-    metadata,
-    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
-    _environment(nullable=False),
-    Column("robot", String(128), nullable=False),
-    *_report(),
-    Index("ix_robot_history_robot", "environment_id", "robot", "id"),
-)
-"""Changed reports of robots; the newest of each robot are retained."""
-
 server = Table(
     "server",
     metadata,
@@ -488,7 +435,7 @@ overlay = Table(
     "overlay",
     metadata,
     Column("id", String(32), primary_key=True),
-    _environment(nullable=False),
+    environment_key(nullable=False),
     Column("kind", String(16), nullable=False),
     Column("state", String(16), nullable=False),
     Column("level", String(256), nullable=False),
@@ -511,25 +458,16 @@ version: the one that made it permanent; in rows of releases before closures,
 the version that it was put into.
 """
 
-presence = Table(
-    "presence",
-    metadata,
-    Column("robot", String(128), primary_key=True),
-    Column("there", Boolean, nullable=False),
-    Column("time", UtcDateTime, nullable=False),
-)
-"""Robots' liveliness on the bus. time: of the last change; see also ``server.presence_checked``."""
-
 place = Table(
     "place",
     metadata,
     Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
-    _environment(nullable=False),
+    environment_key(nullable=False),
     Column("layer", String(16), nullable=False),
     Column("level", String(256), nullable=False),
     Column("name", String(256), nullable=False),
     Column("feature", String(512), nullable=False),
-    *_box(),
+    *box(),
     Column("geometry", WkbGeometry, nullable=False),
     Index("ix_place_feature", "environment_id", "feature"),
 )
@@ -537,6 +475,35 @@ place = Table(
 
 Index("ix_place_geometry", place.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
 Index("ix_place_box", place.c.south, place.c.north, place.c.west, place.c.east)
+
+search_item = Table(
+    "search_item",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    environment_key(nullable=False),
+    Column("environment", binary_text(63), nullable=False),
+    Column("kind", SmallInteger, nullable=False),
+    Column("level", String(256), nullable=False),
+    Column("part", String(256), nullable=False),
+    Column("feature", String(512), nullable=False),
+    Column("name", Text, nullable=False),
+    Column("folded", binary_text(), nullable=False),
+    Column("folded_id", binary_text(), nullable=True),
+    Column("x", Float(53), nullable=True),
+    Column("y", Float(53), nullable=True),
+    Column("grams", Grams, nullable=True),
+    Index("ix_search_item_feature", "environment_id", "feature"),
+    Index("ix_search_item_folded", "kind", "folded", "environment"),
+    Index("ix_search_item_folded_id", "kind", "folded_id", "environment"),
+)
+"""What a search by name finds: environments, and items of their searched versions. Can be rebuilt from the trees.
+
+kind: see ``app.store.search_index``. name: of the item, else its id. folded: the name in lower case; folded_id: the id,
+of an environment the title, if it differs. x, y: metres in the local frame. grams: of both texts, on PostgreSQL; on
+SQLite the virtual tables ``search_text`` and ``search_term`` have them.
+"""
+
+Index("ix_search_item_grams", search_item.c.grams, postgresql_using="gin", info=POSTGRESQL).ddl_if(dialect="postgresql")
 
 audit = Table(
     "audit",

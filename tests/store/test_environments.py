@@ -14,6 +14,7 @@ from app.events.messages import Event
 from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import PartKey
+from app.store import outbox
 from app.store.changes import Delete, Put, Replace
 from app.store.extent import extent, geometry, join
 from app.store.store import Store
@@ -249,7 +250,7 @@ def test_renamed_environment_keeps_its_history(store: Store):
         store.environments.update("farm", new_name="NO")
 
 
-def test_outbox_lists_last_events_of_all_environments(store: Store):
+def test_outbox_lists_last_events_of_all_environments(store: Store, monkeypatch: pytest.MonkeyPatch):
     for name, moves in (("busy", 5), ("calm", 1), ("gone", 1), ("moved", 2)):
         store.environments.create(name)
         for k in range(moves):
@@ -261,7 +262,7 @@ def test_outbox_lists_last_events_of_all_environments(store: Store):
 
     def last(each: int, limit: int, position: int = end) -> list[tuple[str, int]]:
         ranges = store.events.history(position, each, limit)
-        pages = [store.events.last(chosen, each, position) for chosen in ranges]
+        pages = [page for chosen in ranges if (page := store.events.last(chosen, each, position))]
         assert [page[-1].position for page in pages] == sorted((p[-1].position for p in pages), reverse=True)
         assert all([e.sequence for e in page] == sorted(e.sequence for e in page) for page in pages)
         events = sorted((e for page in pages for e in page), key=lambda e: e.position)
@@ -274,6 +275,11 @@ def test_outbox_lists_last_events_of_all_environments(store: Store):
     assert last(9, 7) == [("busy", 6), ("calm", 1), ("calm", 2), ("gone", 2), *ended], "each has its last events"
     assert last(9, 2) == [("gone", 3), ("here", 5)], "those with the oldest events have none"
     assert last(9, 99, position=2) == [("busy", 1), ("busy", 2)]
+    monkeypatch.setattr(outbox, "LOG_SEARCH_WINDOW", 3)
+    newest = [("gone", 3), ("moved", 4), ("here", 5)]
+    assert last(9, 99) == [*begun[:8], *newest]
+    assert last(9, 7) == [("busy", 5), ("busy", 6), ("calm", 1), ("calm", 2), *newest], "the others share what is left"
+    assert last(9, 4) == [("calm", 2), *newest]
 
 
 def test_events_have_the_documented_members(store: Store):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -10,11 +12,12 @@ from typing import Any
 import pytest
 
 from app.errors import Conflict, NotFound
-from app.fleet import channel_convergence, is_online, robot_lag
-from app.store import robots
+from app.fleet import channel_convergence, count_robots, is_online, robot_lag
+from app.store import robot_counts, robots
 from app.store.changes import Replace
 from app.store.fleet_values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from app.store.store import Store
+from tests.store.conftest import count
 from tests.store.samples import DATUM, GRID, grid, save
 
 NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)
@@ -228,7 +231,8 @@ def test_convergence_requires_reports_of_root(farm: Store):
         farm.robots.note_reports([ReceivedReport("farm", robot, report, base + timedelta(seconds=seconds))])
 
     def convergence(seconds: float = 60) -> Any:
-        return channel_convergence(farm.robots.all("farm"), channel, base + timedelta(seconds=seconds))
+        counts = count_robots(farm.robot_counts, "farm", base + timedelta(seconds=seconds))
+        return channel_convergence(counts, channel)
 
     assert convergence().as_dict() == {
         "total": 0, "online": 0, "holding": 0, "lagging": 0, "failed": 0, "ready": 0, "since": None,
@@ -254,12 +258,57 @@ def test_convergence_requires_reports_of_root(farm: Store):
     assert planned.planned is not None
     assert planned.planned.root == old
     report_status("a", 20, old, "ready")
-    ready = channel_convergence(farm.robots.all("farm"), planned, base, old)
+    ready = channel_convergence(count_robots(farm.robot_counts, "farm", base), planned, old)
     assert (ready.holding, ready.ready) == (1, 1)
     report = RobotReport("production", 1, old, "ready")
     farm.robots.note_reports([ReceivedReport("farm", "unvouched", report, base + timedelta(seconds=21), vouched=False)])
-    ready = channel_convergence(farm.robots.all("farm"), planned, base, old)
+    ready = channel_convergence(count_robots(farm.robot_counts, "farm", base), planned, old)
     assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the rollout"
+
+
+def test_counts_equal_a_count_of_the_robots(farm: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot_counts, "MAX_ROWS", 10)
+    farm.environments.create("yard")
+    dice = random.Random(4)
+    present: set[str] = set()
+    for step in range(120):
+        robot, minute = f"r{dice.randrange(12)}", step / 20
+        more = {"channel": dice.choice(["production", "staging"]), "environment": dice.choice(["farm", "yard"])}
+        state = dice.choice(["active", "ready", "failed", "downloading"])
+        report = received_report(robot, minute, dice.choice([A, B]), state, **more)
+        farm.robots.note_reports([replace(report, vouched=dice.random() < 0.7)])
+        if step % 10 == 0:
+            present ^= {robot}
+            now = NOW + timedelta(minutes=minute)
+            farm.robots.note_presence(present & {robot}, {robot} - present, now)
+        if step in (50, 90):
+            farm.robot_counts.join()
+        if step == 70:
+            farm.robots.forget("farm", farm.robots.all("farm")[0].robot)
+    assert count(farm, "robot_tally") < 80, "rows were joined"
+    for environment in ("farm", "yard"):
+        now = NOW + timedelta(minutes=8)
+        counts = count_robots(farm.robot_counts, environment, now)
+        listed = farm.robots.all(environment)
+        expected = Counter(
+            (r.report.channel, r.report.state, r.report.root, r.active_map and r.active_map.root, r.vouched)
+            for r in listed
+        )
+        groups: Counter[Any] = Counter()
+        for g in counts.groups:
+            groups[g.channel, g.state, g.root, g.held_root, g.vouched] += g.number
+        assert groups == expected
+        assert counts.online == Counter(r.report.channel for r in listed if is_online(r, now))
+        for channel, last in counts.last_held.items():
+            held = [r.active_map.since for r in listed if r.report.channel == channel and r.active_map]
+            assert last == max(held, default=None)
+
+
+def test_counts_end_with_the_environment(farm: Store) -> None:
+    farm.robots.note_reports([received_report("r", 0)])
+    farm.environments.delete("farm")
+    farm.environments.purge("farm")
+    assert count(farm, "robot_tally") == 0
 
 
 def test_lag_counts_unapplied_events(sqlite_store: Store):
@@ -301,6 +350,8 @@ def test_robot_is_online_by_presence_or_recent_report(
         sqlite_store.robots.note_presence({"r"} if present else set(), set() if present else {"r"}, at)
     (robot,) = sqlite_store.robots.all()
     assert is_online(robot, NOW) is online
+    counts = count_robots(sqlite_store.robot_counts, "farm", NOW)
+    assert counts.online == ({"production": 1} if online else {})
 
 
 def test_repeated_report_is_stored_once_a_minute(farm: Store):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from sqlalchemy import delete, select
 
 from app.errors import Unavailable
 from app.model.features import features
@@ -17,8 +18,11 @@ from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from app.model.layers import PartKey
 from app.store import search as search_module
-from app.store.changes import Replace
-from app.store.search import NameIndex, Search, SearchHit, fold
+from app.store import search_index as index_module
+from app.store import tables
+from app.store.changes import Put, Replace
+from app.store.search import Search, SearchHit
+from app.store.search_index import SearchIndex, fold
 from app.store.store import Store
 from tests.store import samples
 
@@ -69,8 +73,8 @@ def site(store: Store) -> Store:
 def test_equal_names_come_first_then_prefixes_then_parts(site: Store) -> None:
     hits, more = site.search.find("DOCK", limit=50)
     assert summary(hits) == [
-        ("node", "farm", "n1"),
         ("node", "farm", "dock"),
+        ("node", "farm", "n1"),
         ("environment", "docklands", "docklands"),
         ("node", "farm", "n2"),
         ("node", "docklands", "old"),
@@ -143,59 +147,139 @@ def test_changes_are_found_at_once(site: Store) -> None:
     assert site.search.find("old dock", limit=5)[0] == []
 
 
-def test_memory_is_limited(site: Store) -> None:
-    tiny = Search(site._database, site.chunks, max_bytes=1)
-    for _ in range(2):
-        assert tiny.find("dock", limit=50) == site.search.find("dock", limit=50)
-        assert len(tiny._indexes) == 1
-
-
-def test_index_equals_a_search_in_each_name() -> None:
+def test_search_equals_comparison_with_each_text(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(index_module, "SLICE", 50)
     rng = random.Random(3)
-    alphabet = "aAbBß İ1_%ΣÄ"
-    words = ["".join(rng.choices(alphabet, k=rng.randint(1, 6))) for _ in range(400)]
-    items = [(f"{rng.choice(words)}{k}", rng.choice([*words, None])) for k in range(300)]
-    index = NameIndex(items, np.zeros((len(items), 2)), np.ones(len(items), bool))
-    for query in {fold(word[: rng.randint(1, 3)]) for word in words} | {fold(items[7][0]), "nothing"}:
-        expected = {}
-        for row, (item, name) in enumerate(items):
+    alphabet = "aAbBß İ1_%'\\\"ΣÄ&:"
+    words = ["".join(rng.choices(alphabet, k=rng.randint(1, 6))).strip() or "x" for _ in range(100)]
+    items: list[tuple[str, str, str | None]] = []
+    for environment in ("yy", "zz"):
+        store.environments.create(environment)
+        of_it = [(f"{rng.choice(words)}{k}", rng.choice([*words, None])) for k in range(80)]
+        items += [(environment, *item) for item in of_it]
+        part = features([node(item, 0.0, name) for item, name in of_it], "local")
+        samples.save(store, environment, Replace(samples.TOPOLOGY, part))
+    queries = {fold(word[: rng.randint(1, 4)]).strip() for word in words} | {
+        fold(items[7][1]),
+        "nothing",
+        "'",
+        '"',
+        ":*",
+    }
+    for query in sorted(queries - {""})[::4]:
+        expected: dict[tuple[str, str], int] = {}
+        for environment, item, name in items:
             texts = [fold(item), fold(name or item)]
             ranks = [0 if t == query else 1 if t.startswith(query) else 2 for t in texts if query in t]
             if ranks:
-                expected[row] = min(ranks)
-        assert index.find(query, 10_000) == expected, query
-        best = index.find(query, 5)
-        assert all(expected[row] <= rank for row, rank in best.items())
-        good = sorted(rank for row, rank in best.items())[:5]
-        assert good == sorted(expected.values())[:5], query
-    for row, (item, name) in enumerate(items):
-        assert index.item(row) == (item, name or item)
+                expected[environment, item] = min(ranks)
+        for allowed, few in ((None, 5), ("y*", 5), ("y*", 0), ("y?", 0)):
+            monkeypatch.setattr(search_module, "FEW", few)
+            here = {k: rank for k, rank in expected.items() if allowed is None or k[0] == "yy"}
+            hits, more = store.search.find(query, limit=200, allowed=allowed)
+            found = [(hit.environment, hit.id) for hit in hits]
+            assert not more
+            assert sorted(found) == sorted(here), query
+            assert [here[k] for k in found] == sorted(here.values()), query
+            assert store.search.find(query, limit=5, allowed=allowed) == (hits[:5], len(hits) > 5)
+
+
+def test_tokens_for_many_environments_find_only_these(store: Store) -> None:
+    network = features([node("n1", 1.0, "Dock")], "local")
+    for name in (*(f"farm-{k}" for k in range(8)), "farmer", "yard-1"):
+        store.environments.create(name, title="Dock yard")
+        samples.save(store, name, Replace(samples.TOPOLOGY, network))
+    for allowed, expected in (
+        ("farm-*", {f"farm-{k}" for k in range(8)}),
+        ("*-[!7]", {f"farm-{k}" for k in range(7)} | {"yard-1"}),
+        ("farm-1", {"farm-1"}),
+        ("farm-?", {f"farm-{k}" for k in range(8)}),
+        ("_arm*", set()),
+    ):
+        for query in ("dock", "ock", "k"):
+            hits, _ = store.search.find(query, limit=50, allowed=allowed)
+            assert {hit.environment for hit in hits} == expected, (allowed, query)
+            assert {hit.kind for hit in hits} == ({"environment", "node"} if expected else set())
+
+
+def test_only_the_difference_is_written(site: Store) -> None:
+    site.search.find("dock", limit=5)
+    with site._database.read() as connection:
+        query = select(tables.search_item.c.id, tables.search_item.c.feature)
+        before = {row.id: row.feature for row in connection.execute(query)}
+        network = features([node("n2", 2.0, "dock two")], "local")
+        samples.save(site, "farm", Put(samples.TOPOLOGY, network))
+        site.search.find("dock", limit=5)
+    with site._database.read() as connection:
+        after = {row.id: row.feature for row in connection.execute(query)}
+    assert [before[k] for k in before.keys() - after.keys()] == ["n2"]
+    assert [after[k] for k in after.keys() - before.keys()] == ["n2"]
+    assert site.search_index.refresh(10) == 0
+
+
+def test_new_title_and_purge_are_seen(site: Store) -> None:
+    site.search.find("dock", limit=5)
+    site.environments.update("farm", title="Small holding")
+    assert summary(site.search.find("small", limit=5)[0]) == [("environment", "farm", "farm")]
+    assert site.search.find("große", limit=5)[0] == []
+    site.environments.delete("farm")
+    site.environments.purge("farm")
+    assert {hit.environment for hit in site.search.find("dock", limit=50)[0]} == {"docklands"}
+    site.environments.create("farm")
+    assert site.search.find("old dock", limit=5)[0] == []
+
+
+def test_rebuild_gives_the_same(site: Store) -> None:
+    before = site.search.find("dock", limit=50)
+    site.search_index.rebuild()
+    assert site.search.find("dock", limit=50) == before
+
+
+def test_damaged_environment_is_skipped(site: Store) -> None:
+    site.search.find("dock", limit=5)
+    samples.save(site, "farm", Replace(samples.TOPOLOGY, features([node("n9", 1.0, "New dock")], "local")))
+    entry = next(e for e in site.versions.get("farm").parts if e.key == samples.TOPOLOGY)
+    with site._database.write() as connection:
+        connection.execute(delete(tables.chunk).where(tables.chunk.c.hash == bytes.fromhex(entry.hash)))
+    site.chunks.forget()
+    for _ in range(2):
+        hits, _ = site.search.find("dock", limit=50)
+        assert {hit.environment for hit in hits} == {"farm", "docklands"}
+        assert "n9" not in {hit.id for hit in hits}
+
+
+def test_search_after_mass_change_asks_to_try_again(site: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(index_module, "AT_ONCE", 1)
+    with pytest.raises(Unavailable, match="being built"):
+        site.search.find("dock", limit=5)
+    assert site.search.find("dock", limit=5)[0]
 
 
 def test_searches_do_not_queue_while_the_index_is_built(site: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    fresh = Search(site._database, site.chunks)
+    index = SearchIndex(site._database, site.chunks)
+    fresh = Search(site._database, index)
     reached, go = threading.Event(), threading.Event()
-    build = fresh._build
+    refresh = index.refresh
 
-    def slow(entry: Any) -> Any:
+    def slow(limit: int) -> int:
         reached.set()
         assert go.wait(20)
-        return build(entry)
+        return refresh(limit)
 
-    monkeypatch.setattr(fresh, "_build", slow)
+    monkeypatch.setattr(index, "refresh", slow)
     results: list[Any] = []
     threads = [
         threading.Thread(target=lambda: results.append(fresh.find("dock", limit=5)))
-        for _ in range(search_module.MAX_BUILDERS)
+        for _ in range(index_module.MAX_BUILDERS)
     ]
     for thread in threads:
         thread.start()
     assert reached.wait(20)
-    while fresh._builders._value:  # until all searches wait
+    while index._builders._value:  # until all searches wait
         time.sleep(0.01)
     with pytest.raises(Unavailable, match="being built"):
         fresh.find("dock", limit=5)
     go.set()
     for thread in threads:
         thread.join(20)
-    assert len(results) == search_module.MAX_BUILDERS
+    assert len(results) == index_module.MAX_BUILDERS
