@@ -358,6 +358,7 @@ def _api_options(settings: Settings) -> ApiOptions:
         zenoh_advertise=settings.zenoh_advertise,
         ros2=bool(settings.ros2_environments.strip()),
         manifest_seconds=int(settings.manifest_seconds),
+        delegation_seconds=int(settings.delegation_seconds),
         public_url=settings.public_url,
         basemap_url=settings.basemap_url,
         basemap_attribution=settings.basemap_attribution.strip(),

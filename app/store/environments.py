@@ -275,7 +275,7 @@ def _first_version(connection: Connection, start: Version, datum: Datum | None, 
     """Return the content of version 1. A clone is read again in this transaction, so that its chunks still exist."""
     base, message = start, "datum set"
     if clone is not None:
-        origin = environment_row(connection, clone.environment, lock=True)
+        origin = environment_row(connection, clone.environment, lock=True, mirrored=True)
         base = read_version(connection, origin, clone.number)
         message = f"cloned from {clone.environment}, version {clone.number}"
     place = datum or base.datum

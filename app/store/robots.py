@@ -173,6 +173,10 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     again = row is not None and all(getattr(row, name) == value for name, value in report_columns.items())
     if row is not None and again and _is_recent(connection, received, row):
         return None
+    if row is not None and received.late and received.time < row.time:
+        if not again and not _is_duplicate_report(connection, environment_id, received, report_columns):
+            _remember(connection, environment_id, received, report_columns)
+        return None
     if row is not None and not again and _is_duplicate_report(connection, environment_id, received, report_columns):
         connection.execute(
             update(table).where(*conditions).values(time=received.time, vouched=row.vouched or received.vouched)

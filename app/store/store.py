@@ -23,11 +23,15 @@ from app.store.content import ContentReader
 from app.store.database import Database
 from app.store.documents import StoredDocument
 from app.store.drafts import Drafts
+from app.store.edge_changes import EdgeChanges
 from app.store.environments import Environments
 from app.store.garbage_collection import GarbageCollector
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.made_maps import MadeMaps
+from app.store.mirror_source import MirrorSource
+from app.store.mirror_state import Mirrors
+from app.store.mirror_target import MirrorTarget
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
@@ -75,6 +79,10 @@ class Store:
         self.channels = Channels(database)
         self.overlays = Overlays(database)
         self.robots = Robots(database)
+        self.mirror_source = MirrorSource(database, self.chunks)
+        self.mirror_target = MirrorTarget(database)
+        self.mirrors = Mirrors(database)
+        self.edge_changes = EdgeChanges(database)
         self.events = Outbox(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)

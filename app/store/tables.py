@@ -70,10 +70,14 @@ environment = Table(
     *_box(),
     Column("extent", WkbGeometry, nullable=True),
     Column("area_stale", Boolean, nullable=False, server_default=true(), index=True),
+    Column("centre", Text, nullable=True),
+    Column("centre_epoch", BigInteger, nullable=True),
+    Column("edge_sequence", BigInteger, nullable=False, server_default="0"),
 )
 """Environments. head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event
 that changed the closures in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be
-computed from the head before it is read.
+computed from the head before it is read. centre, centre_epoch: URL and epoch of the server that a mirror follows, NULL
+for an environment of this server. edge_sequence: number of changes of closures that a mirror made by itself.
 """
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
@@ -483,6 +487,48 @@ wrong_token = Table(
     Column("since", UtcDateTime, nullable=False),
 )
 """Wrong tokens that all servers counted, by network. since: begin of the period that the count is of."""
+
+mirror = Table(
+    "mirror",
+    metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("url", Text, nullable=False),
+    Column("key", LargeBinary, nullable=False),
+    Column("epoch", BigInteger, nullable=False),
+    Column("position", BigInteger, nullable=False),
+    Column("reported", BigInteger, nullable=False),
+    Column("seen", UtcDateTime, nullable=True),
+    Column("centre_keys", JSON, nullable=False),
+    Column("contact", UtcDateTime, nullable=True),
+    Column("problem", Text, nullable=True),
+    Column("failures", JSON, nullable=False),
+)
+"""One row on a server that mirrors another, its centre. key: the centre's public key that is trusted. position: of the
+centre's log, up to which everything is mirrored. reported: newest row of ``robot_history`` that the centre has; seen:
+newest time of a robot's status that it has. contact: of the last success. failures: problems by environment.
+"""
+
+delegation = Table(
+    "delegation",
+    metadata,
+    _environment(primary_key=True),
+    Column("statement", LargeBinary, nullable=False),
+    Column("signed_by", String(16), nullable=False),
+    Column("signature", LargeBinary, nullable=False),
+    Column("key", LargeBinary, nullable=False),
+    Column("expires", UtcDateTime, nullable=False),
+)
+"""Statements of the centre that this server's key may sign manifests of an environment, until ``expires``."""
+
+edge_change = Table(
+    "edge_change",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    _environment(nullable=False, index=True),
+    Column("overlay_id", String(32), nullable=False),
+    Column("body", JSON, nullable=False),
+)
+"""Changes of overlays that a mirror made and its centre does not have yet, in their order."""
 
 overlay = Table(
     "overlay",
