@@ -29,7 +29,7 @@ from app.store import blob_coding
 from app.store.blob_rows import BlobRow
 from app.store.edge_changes import OverlayChange
 from app.store.fleet_values import Overlay, ReceivedReport
-from app.store.mirror_source import PREFIX_BYTES, Content
+from app.store.mirror_source import PREFIX_BYTES
 from app.store.values import rfc3339
 
 TYPE = "application/octet-stream"
@@ -236,20 +236,16 @@ def get_mirror_content(env: EnvironmentPath, body: ContentBody, services: Servic
     if lost is not None:
         raise NotFound(f"the file {lost} is lost on the centre: run `fleetmap verify --repair` there")
     return StreamingResponse(
-        _stream(services, chosen, [rows[name] for name in body.blobs], content, whole=body.whole), media_type=TYPE
+        _stream(services, chosen, [rows[name] for name in body.blobs], whole=body.whole), media_type=TYPE
     )
 
 
-def _stream(
-    services: Services, chunks: Sequence[bytes], rows: Iterable[BlobRow], content: Content, *, whole: bool
-) -> Iterator[bytes]:
+def _stream(services: Services, chunks: Sequence[bytes], rows: Iterable[BlobRow], *, whole: bool) -> Iterator[bytes]:
     for start in range(0, len(chunks), STREAM_BATCH):
-        yield b"".join(
-            len(data).to_bytes(4) + data
-            for _, data in services.store.chunks.stored(chunks[start : start + STREAM_BATCH])
-        )
+        stored = services.store.chunks.stored(chunks[start : start + STREAM_BATCH])
+        yield b"".join(len(data).to_bytes(4) + data for _, data in stored)
     for row in rows:
-        if row.base is not None and (whole or row.base not in content.blobs):
+        if row.base is not None and whole:
             plain = services.store.blobs.get(row.name)
             packed = blob_coding.compress_bytes(plain)
             data = plain if packed is None else packed

@@ -1,8 +1,9 @@
 """Environments of a centre in the database of a server that mirrors it.
 
-A page of ``mirror_source`` is applied in one transaction: versions with their own numbers, times and sequences, channels,
-overlays and the events, which the relay then publishes like any other. The environment's row is the checkpoint. The
-content of the versions must be stored before. What the mirror has changed by itself stays until the centre has it.
+A page of ``mirror_source`` is applied in one transaction: versions with their own numbers, times and sequences,
+channels, overlays and the events, which the relay then publishes like any other. The environment's row is the
+checkpoint. The content of the versions must be stored before. What the mirror has changed by itself stays until the
+centre has it.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ def parse_page(body: Mapping[str, Any]) -> MirrorPage:
     """Check a page. Raises Untrusted if it cannot be what a centre writes, or is of a newer release."""
     if body.get("form") != FORM:
         raise Untrusted(
-            f"the centre writes pages of form {body.get('form')!r:.20}, this server reads form {FORM}: update the older one"
+            f"the centre writes pages of form {body.get('form')!r:.20}, this server reads form {FORM}: update the "
+            "older one"
         )
     try:
         name = check_environment_name(str(body["environment"]["name"]))
@@ -290,16 +292,10 @@ def _claim_row(connection: Connection, page: MirrorPage, centre: str) -> Row[Any
 def _clear(connection: Connection, row: Row[Any]) -> None:
     """Remove versions, channels, events and overlays of an environment, except what the centre has to get."""
     queued = select(tables.edge_change.c.overlay_id)
-    removals = (
-        (tables.source, True),
-        (tables.version, True),
-        (tables.channel, True),
-        (tables.event, True),
-        (tables.overlay, tables.overlay.c.id.not_in(queued)),
-    )
-    for table, condition in removals:
-        removal = delete(table).where(table.c.environment_id == row.id)
-        connection.execute(removal if condition is True else removal.where(condition))
+    for table in (tables.source, tables.version, tables.channel, tables.event):
+        connection.execute(delete(table).where(table.c.environment_id == row.id))
+    overlay = tables.overlay
+    connection.execute(delete(overlay).where(overlay.c.environment_id == row.id, overlay.c.id.not_in(queued)))
     owner = tables.environment
     values = {"head": -1, "root": "", "sequence": 0, "closures_sequence": 0, "indexed": -1, "area_stale": True}
     connection.execute(update(owner).where(owner.c.id == row.id).values(values))

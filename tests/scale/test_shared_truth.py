@@ -13,7 +13,7 @@ import httpx
 import psycopg
 import pytest
 
-from app.agent.signed_manifest import key_id, verify_signature
+from app.agent.signatures import key_id, verify_signature
 from tests.agent.conftest import network
 from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess
