@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import threading
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -21,6 +22,7 @@ from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.environments import reaches
 from app.store.manifest import read_sources, unpack_manifest
+from app.store.tree import ChunkStage
 from app.store.values import rfc3339
 
 FORM: Final = 1
@@ -125,7 +127,9 @@ class MirrorSource:
             sources = read_sources(connection, row.id, sorted(manifests))
         if last > after and last not in manifests:
             raise NotFound(f"{name} has no version {last}")
-        content = self._walk(manifests, after)
+        roots = {number: [entry.hash for entry in unpack_manifest(data)[2]] for number, data in manifests.items()}
+        new = {root for number, listed in roots.items() if number > after for root in listed}
+        content = new_content(self._chunks.stage(), roots.get(after, ()), new)
         uploads = {source.sha256 for listed in sources.values() for source in listed}
         content = Content(content.chunks, content.blobs | uploads)
         with self._lock:
@@ -134,22 +138,22 @@ class MirrorSource:
                 self._contents.popitem(last=False)
         return content
 
-    def _walk(self, manifests: dict[int, bytes], after: int) -> Content:
-        draft = self._chunks.stage()
-        known: set[bytes] = set()
-        seen: set[str] = set()
-        blobs: set[str] = set()
-        out: set[bytes] = set()
-        for number in sorted(manifests):
-            roots = {entry.hash for entry in unpack_manifest(manifests[number])[2]}
-            for root in sorted(roots - seen):
-                names, files = parts.all_chunks(draft, bytes.fromhex(root), known)
-                if number > after:
-                    out |= names - known
-                    blobs |= files
-                known |= names
-            seen |= roots
-        return Content(tuple(sorted(out)), frozenset(blobs))
+
+def new_content(draft: ChunkStage, before: Iterable[str], after: Iterable[str]) -> Content:
+    """Name the content of some parts that others do not have. before, after: hashes of parts.
+
+    Reads inner nodes only. Raises Damaged if one is missing.
+    """
+    known: set[bytes] = set()
+    for root in sorted(set(before)):
+        known |= parts.all_chunks(draft, bytes.fromhex(root), known)[0]
+    out: set[bytes] = set()
+    blobs: set[str] = set()
+    for root in sorted(set(after) - set(before)):
+        names, files = parts.all_chunks(draft, bytes.fromhex(root), known | out)
+        out |= names - known
+        blobs |= files
+    return Content(tuple(sorted(out)), frozenset(blobs))
 
 
 def _environment_as_json(row: Row[Any]) -> dict[str, Any]:

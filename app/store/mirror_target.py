@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
@@ -18,8 +18,8 @@ from typing import Any, Final
 from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from app.errors import Conflict, Damaged, Unavailable, Untrusted
+from app.store import blob_rows, outbox, tables
 from app.store import chunks as chunk_rows
-from app.store import outbox, tables
 from app.store.base import check_environment_name, upsert
 from app.store.database import Database
 from app.store.manifest import unpack_manifest, warnings_from_row
@@ -178,11 +178,14 @@ class MirrorTarget:
         with self._database.write(notify=False, upkeep=True) as connection:
             chunk_rows.insert(connection, chunks)
 
-    def apply(self, page: MirrorPage, centre: str, names: Sequence[bytes], *, anew: bool = False) -> None:
+    def apply(
+        self, page: MirrorPage, centre: str, names: Sequence[bytes], blobs: Collection[str], *, anew: bool = False
+    ) -> None:
         """Apply a page in one transaction.
 
         Args:
             names: hashes of all chunks that its versions need and that the mirror's versions do not refer to.
+            blobs: files of their parts, likewise.
             anew: remove what the mirror has of the environment before, since the centre's history is another one.
 
         Raises Conflict if this server has an environment of its own under that name, Unavailable if content is missing.
@@ -194,6 +197,7 @@ class MirrorTarget:
                 row = _row_by_id(connection, page.id)
             digest = read_closures_anew(connection, row).digest
             _keep_chunks(connection, names)
+            blob_rows.lock(connection, blobs, kept=True)
             for version, sequence in page.versions:
                 if version.number <= row.head:
                     continue
