@@ -281,7 +281,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     service.cache.on_damage = metrics.cache_damaged.inc
     access = _authenticator(settings, store)
 
-    keys, secrets = _signing_keys(settings, store), _link_secrets(settings, store)
+    keys, secrets = signing_keys(settings, store), _link_secrets(settings, store)
     with contextlib.suppress(OSError):  # create now: later the disk may be full
         keys.public()
         secrets.newest()
@@ -331,7 +331,7 @@ def _conversion_jobs(
     return jobs, work
 
 
-def _signing_keys(settings: Settings, store: Store) -> SigningKeys:
+def signing_keys(settings: Settings, store: Store) -> SigningKeys:
     """Return the keys of a mounted file, of the database that servers share, or of the data folder."""
     folder = settings.data_dir / "keys"
     if settings.signing_key is not None:

@@ -319,7 +319,7 @@ def _sign_manifest(
     if isinstance(listed, _PendingConversion):
         return listed
     files, missing = listed
-    now = datetime.now(UTC).timestamp()
+    now = services.store.now().timestamp()
     signed = (int(now) // STEP_SECONDS) * STEP_SECONDS
     body: dict[str, Any] = {"environment": env}
     if channel is not None:

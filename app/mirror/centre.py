@@ -83,10 +83,7 @@ class Centre:
     def keys(self) -> list[dict[str, Any]]:
         """List the public keys, newest first. Each endorses its successor; nothing else vouches for them."""
         data, _ = self._read("GET", "/keys")
-        try:
-            lines = json.loads(data)
-        except ValueError as error:
-            raise Unavailable(f"{self.url} returned no list of keys") from error
+        lines = self._parsed(data)
         return [line for line in lines if isinstance(line, dict)] if isinstance(lines, list) else []
 
     # --- content ---
@@ -112,7 +109,7 @@ class Centre:
         """Hand on statuses of robots and changes of overlays; returns the outcome of each."""
         path = f"/environments/{quote(environment, safe='')}/mirror/reports"
         data, _ = self._read("POST", path, json={"statuses": list(statuses), "changes": list(changes)})
-        outcome = json.loads(data)
+        outcome = self._parsed(data)
         if len(outcome["statuses"]) != len(statuses) or len(outcome["changes"]) != len(changes):
             raise Unavailable(f"{self.url} answered for another number of reports: they will be sent again")
         return dict(outcome)
@@ -121,7 +118,7 @@ class Centre:
         """Request statements that a key may sign the manifests of environments."""
         body = {"public_key": base64.b64encode(public).decode(), "environments": list(environments)}
         data, _ = self._read("POST", "/mirror/delegations", json=body)
-        return list(json.loads(data))
+        return list(self._parsed(data))
 
     def wait_for_event(self, position: int) -> bool:
         """Wait until the centre has an event after a position of its log; False if the connection ends before."""
@@ -137,6 +134,12 @@ class Centre:
                     if line.startswith("data:"):
                         return True
         return False
+
+    def _parsed(self, data: bytes) -> Any:
+        try:
+            return json.loads(data)
+        except ValueError as error:
+            raise Unavailable(f"{self.url} returned no JSON: check the proxies in between") from error
 
     def _read(self, method: str, path: str, **more: Any) -> tuple[bytes, httpx.Headers]:
         with (

@@ -82,9 +82,18 @@ def environment_row(
         raise NotFound(f"unknown environment {name[:80]!r}")
     if row.deleted is not None and not deleted:
         raise Gone(f"the environment {name!r} is deleted: restore it with POST /api/v1/environments/{name}/restore")
-    if lock and row.centre is not None and not mirrored:
-        raise Mirrored(f"the environment {name!r} is a mirror of the one at {row.centre}: make the change there")
+    if lock and not mirrored:
+        check_own(row)
     return row
+
+
+def check_own(environment: Row[Any]) -> None:
+    """Raise Mirrored for an environment that follows another server."""
+    if environment.centre is not None:
+        raise Mirrored(
+            f"the environment {environment.name!r} is a mirror of the one at {environment.centre}: make the change "
+            "there"
+        )
 
 
 def nearest_channel(connection: Connection, environment: Row[Any], name: str) -> str:

@@ -21,6 +21,7 @@ from app.store.area import area_after
 from app.store.base import (
     as_environment,
     check_environment_name,
+    check_own,
     check_tags,
     checked_text,
     environment_row,
@@ -110,6 +111,11 @@ class Environments:
         """Read an environment. Raises Gone if it is deleted (unless ``deleted``), NotFound if it never existed."""
         with self._database.read() as connection:
             return as_environment(environment_row(connection, name, deleted=deleted))
+
+    def check_own(self, name: str) -> None:
+        """Raise Mirrored for an environment that follows another server, where it is changed; NotFound."""
+        with self._database.read() as connection:
+            check_own(environment_row(connection, name))
 
     def page(
         self,

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from typing import Any
+from datetime import datetime, timedelta
+from typing import Any, Final
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import func, select, update
 
 from app.store import tables
 from app.store.base import upsert
 from app.store.database import Database
+from app.store.values import rfc3339
+
+CUT_OFF_AFTER: Final = timedelta(seconds=60)
+"""Time without contact after which a mirror counts as cut off: four times the interval of its passes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +112,48 @@ class Mirrors:
                 values = {name: getattr(one, name) for name in StoredDelegation.__slots__ if name != "environment_id"}
                 upsert(connection, table, {"environment_id": one.environment_id}, values)
 
-    def forget(self) -> None:
-        """Remove the state, so that this server follows no other; released environments stay."""
-        with self._database.write(upkeep=True) as connection:
-            connection.execute(delete(tables.mirror))
+    def describe(self) -> dict[str, Any] | None:
+        """Describe the mirror for operators, as JSON; None if this server mirrors no other.
+
+        ``state``: ``connected``, ``cut off``, or ``starting`` before the first complete pass. ``waiting``: number of
+        changes that the centre does not have yet. ``serves_until``: the first end of a permission to sign manifests.
+        """
+        state, now = self.state(), self._database.now()
+        if state is None:
+            return None
+        owner, table, queue = tables.environment, tables.delegation, tables.edge_change
+        query = (
+            select(owner, table.c.expires)
+            .outerjoin(table, table.c.environment_id == owner.c.id)
+            .where(owner.c.centre.is_not(None), owner.c.deleted.is_(None))
+            .order_by(owner.c.name)
+        )
+        with self._database.read() as connection:
+            rows = connection.execute(query).all()
+            waiting = connection.execute(select(func.count()).select_from(queue)).scalar_one()
+        failures = dict(state.failures or {})
+        environments = [
+            {
+                "name": r.name,
+                "version": r.head,
+                "sequence": r.sequence,
+                "serves_until": None if r.expires is None else rfc3339(r.expires),
+                "problem": failures.pop(r.name, None),
+            }
+            for r in rows
+        ]
+        environments += [{"name": name, "problem": problem} for name, problem in sorted(failures.items())]
+        is_recent = state.contact is not None and now - state.contact < CUT_OFF_AFTER and state.problem is None
+        ends = [r.expires for r in rows if r.expires is not None]
+        return {
+            "state": "connected" if is_recent else "starting" if state.contact is None else "cut off",
+            "centre": state.url,
+            "key": hashlib.sha256(state.key).hexdigest()[:16],
+            "epoch": state.epoch,
+            "position": state.position,
+            "contact": None if state.contact is None else rfc3339(state.contact),
+            "problem": state.problem,
+            "waiting": waiting,
+            "serves_until": rfc3339(min(ends)) if ends and len(ends) == len(rows) else None,
+            "environments": environments,
+        }

@@ -192,6 +192,8 @@ class MirrorTarget:
         """
         with self._database.write(upkeep=True) as connection:
             row = _claim_row(connection, page, centre)
+            if page.upto < row.sequence and not anew:
+                return  # another process has applied a newer one
             if anew:
                 _clear(connection, row)
                 row = _row_by_id(connection, page.id)
@@ -224,15 +226,17 @@ class MirrorTarget:
             connection.execute(update(tables.collection).values(purges=tables.collection.c.purges + 1))
 
     def release(self, name: str) -> bool:
-        """Make a mirrored environment one of this server, which is changed here; False if it is none."""
+        """Make a mirrored environment one of this server, which is changed here; False if it is none.
+
+        The centre's permission to sign stays valid until it ends.
+        """
         table = tables.environment
         with self._database.write() as connection:
             query = select(table).where(table.c.name == name, table.c.centre.is_not(None))
             row = connection.execute(query.with_for_update()).one_or_none()
             if row is None:
                 return False
-            for queue in (tables.edge_change, tables.delegation):
-                connection.execute(delete(queue).where(queue.c.environment_id == row.id))
+            connection.execute(delete(tables.edge_change).where(tables.edge_change.c.environment_id == row.id))
             connection.execute(update(table).where(table.c.id == row.id).values(centre=None))
             return True
 

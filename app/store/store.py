@@ -162,6 +162,10 @@ class Store:
         """Return a document in the database, for what several servers share."""
         return StoredDocument(self._database, self.generation, name)
 
+    def now(self) -> datetime:
+        """Return the present by the store's clock."""
+        return self._database.now()
+
     def epoch(self) -> int:
         """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""
         with self._database.read() as connection:

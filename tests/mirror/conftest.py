@@ -20,7 +20,8 @@ from tests.api.conftest import Api, empty_database, running, settings_for
 class Wire(httpx.BaseTransport):
     """Transport that counts the bytes of bodies in both directions.
 
-    cut: no connection. change: called with each answer's path and body, returns another body.
+    cut: no connection. change: called with each answer's path and body, returns another body. limit: bytes after which
+    content is cut off. repeats: answers by path, each of which is sent again.
     """
 
     def __init__(self) -> None:
@@ -29,6 +30,7 @@ class Wire(httpx.BaseTransport):
         self.cut = False
         self.change: Callable[[str, bytes], bytes] | None = None
         self.limit: int | None = None
+        self.repeats: dict[str, tuple[bytes, httpx.Headers]] | None = None
         self.paths: list[str] = []
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
@@ -37,14 +39,16 @@ class Wire(httpx.BaseTransport):
         self.sent += len(request.read())
         self.paths.append(request.url.path)
         answer = self._inner.handle_request(request)
-        data = b"".join(answer.stream)  # type: ignore[arg-type]
+        data, fields = b"".join(answer.stream), answer.headers  # type: ignore[arg-type]
         answer.close()
+        if self.repeats is not None:
+            data, fields = self.repeats.setdefault(request.url.path, (data, fields))
         self.received += len(data)
-        if self.change is not None and "content-encoding" not in answer.headers:
+        if self.change is not None and "content-encoding" not in fields:
             data = self.change(request.url.path, data)
         if self.limit is not None and request.url.path.endswith("/content"):
             data = data[: self.limit]
-        headers = [(k, v) for k, v in answer.headers.items() if k not in ("content-length", "transfer-encoding")]
+        headers = [(k, v) for k, v in fields.items() if k not in ("content-length", "transfer-encoding")]
         return httpx.Response(answer.status_code, headers=headers, stream=httpx.ByteStream(data))
 
     def close(self) -> None:
