@@ -182,8 +182,8 @@ def _with_delegation(services: Services, lines: list[dict[str, Any]], environmen
         "signature": base64.b64encode(delegation.signature).decode(),
     }
     out = [{**line, "delegations": [texts]} if line["public_key"] == public else line for line in lines]
-    own = {line["id"] for line in lines}
-    return out + [dict(line) for line in mirror.centre_keys if line["id"] not in own]
+    listed = {line["id"] for line in lines}
+    return out + [dict(line) for line in mirror.centre_keys if line["id"] not in listed]
 
 
 @router.post(

@@ -144,14 +144,14 @@ def new_content(draft: ChunkStage, before: Iterable[str], after: Iterable[str]) 
 
     Reads inner nodes only. Raises Damaged if one is missing.
     """
-    known: set[bytes] = set()
+    present: set[bytes] = set()
     for root in sorted(set(before)):
-        known |= parts.all_chunks(draft, bytes.fromhex(root), known)[0]
+        present |= parts.all_chunks(draft, bytes.fromhex(root), present)[0]
     out: set[bytes] = set()
     blobs: set[str] = set()
     for root in sorted(set(after) - set(before)):
-        names, files = parts.all_chunks(draft, bytes.fromhex(root), known | out)
-        out |= names - known
+        names, files = parts.all_chunks(draft, bytes.fromhex(root), present | out)
+        out |= names - present
         blobs |= files
     return Content(tuple(sorted(out)), frozenset(blobs))
 

@@ -428,11 +428,9 @@ robot = Table(
     Column("place", JSON(none_as_null=True), nullable=True),
     Column("placed", UtcDateTime, nullable=True),
 )
-"""Current state of robots, for each environment. since: when they first reported it.
-
-held: the active map, which a report
-of a map that is still being fetched does not change. vouched: whether any report was authenticated. place: result of
-``RobotPlace.as_dict``, from the report at ``placed``.
+"""Current state of robots, for each environment. since: when they first reported it. held: the active map, which a
+report of a map that is still being fetched does not change. vouched: whether any report was authenticated. place:
+result of ``RobotPlace.as_dict``, from the report at ``placed``.
 """
 
 robot_history = Table(
@@ -551,10 +549,8 @@ overlay = Table(
     Index("ix_overlay_environment", "environment_id", "state"),
     Index("ix_overlay_expires", "state", "expires"),
 )
-"""Overlays. expires: end of the obstruction.
-
-version: the one that made it permanent; in rows of releases before closures,
-the version that it was put into.
+"""Overlays. expires: end of the obstruction. version: the one that made it permanent; in rows of releases before
+closures, the version that it was put into.
 """
 
 presence = Table(

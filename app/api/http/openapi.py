@@ -84,6 +84,7 @@ TAGS = {
     "templates": "Values that are filled in if a format needs more than the layers contain.",
     "formats": "File formats that can be read, exported and converted.",
     "jobs": "Conversions that outlive their request.",
+    "mirrors": "For servers that follow this one.",
     "stored data": "Stored bytes, for the repair of another server.",
     "tokens": "Access tokens.",
     "session": "Sign-in of browsers.",
