@@ -15,6 +15,7 @@ from app.mirror.follow import Mirror
 from app.signing import Keys
 from app.store.store import Store
 from tests.api.conftest import Api, empty_database, running, settings_for
+from tests.events.conftest import free_port
 
 
 class Wire(httpx.BaseTransport):
@@ -83,9 +84,16 @@ def centre(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """The server of the edge."""
-    with running(settings_for(tmp_path_factory.mktemp("edge"))) as api:
+def port() -> int:
+    """Port of the edge's Zenoh router."""
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Api]:
+    """The server of the edge, with a Zenoh router."""
+    folder = tmp_path_factory.mktemp("edge")
+    with running(settings_for(folder, zenoh_mode="router", zenoh_listen=f"tcp/127.0.0.1:{port}")) as api:
         yield api
 
 

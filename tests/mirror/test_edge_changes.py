@@ -8,9 +8,12 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+import zenoh
 
 from app.errors import Unavailable
+from app.events import messages
 from tests.api.conftest import Api, create_farm
+from tests.events.conftest import Listener, client_config, eventually
 from tests.mirror.conftest import Edge
 
 Make = Callable[..., Edge]
@@ -164,3 +167,20 @@ def test_closure_ends_at_its_time_while_cut_off(centre: Api, site: Api, farm: st
     assert overlays(site, farm)[0]["state"] == "ended"
     assert manifest(site, farm)["edge_sequence"] == 1
     assert store.edge_changes.count_waiting() == 0, "the centre ends it by itself"
+
+
+def test_edge_publishes_events_of_both(centre: Api, site: Api, port: int, farm: str, follower: Make) -> None:
+    eventually(lambda: site.get("/readyz").json()["events"]["state"] == "connected")
+    with zenoh.open(client_config(port)) as session:
+        listener = Listener(session, messages.events_key("fleetmap", farm))
+        edge = follower(farm)
+        edge.follow()
+        centre("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
+        edge.follow()
+        listener.wait(lambda one: len(one.events) >= 5)
+        site.post(f"environments/{farm}/overlays", {"kind": "blocked", "edge": "gate_barn", "state": "accepted"})
+        listener.wait(lambda one: len(one.events) >= 6)
+        edge.follow()
+        listener.wait(lambda one: one.events[-1]["sequence"] == 6)
+        shown = [(event["sequence"], event.get("edge_sequence")) for event in listener.events]
+        assert list(dict.fromkeys(shown)) == [(1, None), (2, None), (3, None), (4, None), (5, None), (5, 1), (6, None)]
