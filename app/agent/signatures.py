@@ -112,29 +112,28 @@ def _permission(
             continue
         if by != trusted and not _is_endorsed(by, server_keys, trusted, pinned):
             continue
-        times = _delegated_times(statement, public, environment)
-        if times is None:
+        until = _delegated_until(statement, public, environment)
+        if until is None:
             continue
-        start, until = times
-        if not start - MAX_CLOCK_SKEW <= now <= until + MAX_CLOCK_SKEW:
+        if now > until + MAX_CLOCK_SKEW:
             raise Unendorsed(
-                f"manifest is signed by a mirror with key {name}, which key {by} permits from {start:%Y-%m-%d %H:%M} "
-                f"to {until:%Y-%m-%d %H:%M} UTC; the time is {now:%Y-%m-%d %H:%M} UTC: connect the mirror to its "
+                f"manifest is signed by a mirror with key {name}, which key {by} permits until "
+                f"{until:%Y-%m-%d %H:%M} UTC; the time is {now:%Y-%m-%d %H:%M} UTC: connect the mirror to its "
                 "centre, and check the clocks"
             )
         return voucher, until
     return None
 
 
-def _delegated_times(statement: bytes, public: bytes, environment: str) -> tuple[datetime, datetime] | None:
-    """Return the times of a permission; None if it is about another key or environment, or cannot be read."""
+def _delegated_until(statement: bytes, public: bytes, environment: str) -> datetime | None:
+    """Return the end of a permission; None if it is about another key or environment, or cannot be read."""
     try:
         body = json.loads(statement)
         about = (body["kind"], _bytes(body["public_key"]), body["environment"])
-        times = read_time(body["from"]), read_time(body["until"])
+        until = read_time(body["until"])
     except (ValueError, KeyError, TypeError, RecursionError):
         return None
-    return times if about == ("delegation", public, environment) else None
+    return until if about == ("delegation", public, environment) else None
 
 
 def verify_signature(

@@ -9,8 +9,9 @@ from __future__ import annotations
 import base64
 import binascii
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import ormsgpack
 from fastapi import Query
@@ -21,6 +22,7 @@ from app.api.http.auth import MirrorRole
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import NAME, ApiTime, EnvironmentPath, RequestModel, problem_responses
+from app.api.overlays import check_place, parse_polygon, shown_versions
 from app.errors import Conflict, FleetMapError, Invalid, NotFound, Problem, Unavailable
 from app.events.messages import ROBOT_NAME, SIGNATURE, RobotStatus
 from app.fleet import report_from_status
@@ -60,13 +62,13 @@ class MirroredItem(BaseModel):
 
 
 class MirrorListOut(BaseModel):
-    """Environments that the token may mirror, also deleted ones."""
+    """Environments that the token may mirror, also deleted ones; null if nothing has happened since `position`."""
 
     form: int = Field(description="Number of the form of these documents.")
     epoch: int
     position: int = Field(description="Position of the event log.")
     allowed: str | None = Field(description="Pattern of the token's environments; null: all.")
-    environments: list[MirroredItem]
+    environments: list[MirroredItem] | None
     nonce: str
 
 
@@ -116,14 +118,14 @@ class EdgeOverlayBody(RequestModel):
     """An overlay after a change that a mirror made."""
 
     id: str = Field(pattern=r"^[0-9a-f]{1,32}$")
-    kind: str = Field(min_length=1, max_length=16)
+    kind: Literal["blocked"]
     level: str = Field(min_length=1, max_length=256)
     reporter: str = Field(max_length=1000)
     created: ApiTime
     expires: ApiTime
     polygon: dict[str, Any] | None = None
     edge: str | None = Field(None, max_length=512)
-    crs: str | None = Field(None, max_length=8)
+    crs: Literal["local", "wgs84"] | None = None
     detail: str | None = Field(None, max_length=20_000)
     decided_by: str | None = Field(None, max_length=1000)
     decided: ApiTime | None = None
@@ -187,9 +189,17 @@ router = api_router("mirrors")
 
 
 @router.get("/mirror", responses=problem_responses(MirrorListOut), summary="List what a mirror may follow")
-def list_mirrored(services: ServicesDep, principal: MirrorRole, nonce: Nonce) -> Response:
+def list_mirrored(
+    services: ServicesDep,
+    principal: MirrorRole,
+    nonce: Nonce,
+    position: Annotated[
+        int, Query(ge=0, lt=2**63, description="Position of the event log up to which the mirror has everything.")
+    ] = 0,
+) -> Response:
     """List environments with their last sequence, also deleted ones, signed as a manifest is."""
-    return _signed(services, {**services.store.mirror_source.listing(principal.environments), "nonce": nonce})
+    listing = services.store.mirror_source.listing(principal.environments, position)
+    return _signed(services, {**listing, "nonce": nonce})
 
 
 @router.get(
@@ -305,6 +315,11 @@ def _apply_change(services: Services, env: str, change: EdgeChangeBody, now: dat
     members["created"] = _not_ahead(change.overlay.created, now)
     overlay = Overlay(environment=env, **members)
     try:
+        if (overlay.polygon is None) == (overlay.edge is None):
+            raise Invalid("an overlay is either a polygon or an edge")
+        if overlay.polygon is not None:
+            overlay = replace(overlay, polygon=parse_polygon(overlay.polygon))
+            check_place(overlay, shown_versions(services, env))
         stored = services.store.edge_changes.apply(
             env, OverlayChange(change.event, overlay, change.author, _not_ahead(change.time, now))
         )
@@ -337,11 +352,17 @@ def delegate(body: DelegationsBody, services: ServicesDep, principal: MirrorRole
         public = b""
     if len(public) != 32:
         raise Invalid("invalid public_key", [Problem("must be 32 bytes in base64", where="body.public_key")])
+    for name in body.environments:
+        principal.require_environment(name)
+    with services.store.audit.changing():  # it has a row in the audit log, like a new key
+        return json_response(_statements(services, public, body.environments))
+
+
+def _statements(services: Services, public: bytes, environments: Sequence[str]) -> list[dict[str, Any]]:
     start = datetime.now(UTC)
     until = start + timedelta(seconds=services.options.delegation_seconds)
     out = []
-    for name in dict.fromkeys(body.environments):
-        principal.require_environment(name)
+    for name in dict.fromkeys(environments):
         environment = services.store.environments.get(name, deleted=True)
         statement = delegation_statement(public, name, start, until)
         key, signature = services.keys.sign(statement)
@@ -355,7 +376,7 @@ def delegate(body: DelegationsBody, services: ServicesDep, principal: MirrorRole
                 "until": rfc3339(until),
             }
         )
-    return json_response(out)
+    return out
 
 
 def _signed(services: Services, body: dict[str, Any]) -> Response:

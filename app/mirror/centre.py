@@ -49,9 +49,12 @@ class Centre:
 
     # --- what is signed ---
 
-    def listing(self) -> dict[str, Any]:
-        """Read the environments that may be mirrored. Raises Untrusted, Denied or Unavailable."""
-        return self._signed("/mirror", {})
+    def listing(self, position: int = 0) -> dict[str, Any]:
+        """Read the environments that may be mirrored; null if the log still ends at a position.
+
+        Raises Untrusted, Denied or Unavailable.
+        """
+        return self._signed("/mirror", {"position": position})
 
     def page(self, environment: str, after: int, sequence: int) -> dict[str, Any]:
         """Read what follows a version and an event. Raises NotFound, Untrusted, Denied or Unavailable."""

@@ -43,6 +43,10 @@ RENEWALS: Final = 24
 MIN_RENEWAL: Final = timedelta(minutes=10)
 
 
+FULL_PASS: Final = timedelta(minutes=10)
+"""Time after which all environments are compared again, also without a new event."""
+
+
 class Mirror:
     """Follows a centre. Not thread-safe. position: of the centre's log, as of the last pass.
 
@@ -62,6 +66,7 @@ class Mirror:
         self._store, self._keys, self._centre, self._names, self._clock = store, keys, centre, tuple(names), clock
         self._fetcher = Fetcher(store, centre)
         self.position = 0
+        self._complete: tuple[datetime, int] | None = None
 
     def run_once(self) -> MirrorState:
         """Run one pass; returns the state after it.
@@ -77,26 +82,40 @@ class Mirror:
         return state
 
     def _run_once(self) -> MirrorState:
-        listing = self._centre.listing()
-        state = self._check(listing)
         failures: dict[str, str] = {}
-        if self._hand_on(state, failures):  # it is in the centre's log by now
+        listing = self._centre.listing(self._seen_position())
+        state = self._check(listing)
+        if int(listing["epoch"]) != state.epoch:
+            self._complete = None
             listing = self._centre.listing()
+        if self._hand_on(state, failures):  # it is in the centre's log by now
+            listing = self._centre.listing(self._seen_position())
         self.position = int(listing["position"])
+        changes: dict[str, Any] = {"epoch": int(listing["epoch"]), "url": self._centre.url, "key": self._centre.key}
+        if listing["environments"] is not None:
+            self._take_over(listing, failures)
+            keys = self._centre.keys()
+            changes |= {"centre_keys": keys} if keys != list(state.centre_keys) else {}
+            changes |= {} if failures else {"position": self.position}
+            self._complete = None if failures else (self._clock(), self.position)
+        self._renew_permissions(failures)
+        changes |= {"contact": self._clock(), "problem": None, "failures": failures}
+        self._store.mirrors.save(**changes)
+        return self._store.mirrors.state() or state
+
+    def _seen_position(self) -> int:
+        """Return the position of the last pass that was complete; 0 if it is too old: titles change without events."""
+        if self._complete is None or not timedelta(0) <= self._clock() - self._complete[0] < FULL_PASS:
+            return 0
+        return self._complete[1]
+
+    def _take_over(self, listing: Mapping[str, Any], failures: dict[str, str]) -> None:
         self._remove_purged(listing)
         local = self._store.mirror_target.environments()
         for item in listing["environments"]:
             if self._is_chosen(str(item["name"])):
                 with self._noting(failures, str(item["name"])):
                     self._sync(item, local.get(str(item["id"])), int(listing["epoch"]))
-        self._renew_permissions(failures)
-        keys = self._centre.keys()
-        changes: dict[str, Any] = {"contact": self._clock(), "problem": None, "failures": failures}
-        changes |= {"epoch": int(listing["epoch"]), "url": self._centre.url, "key": self._centre.key}
-        changes |= {"centre_keys": keys} if keys != list(state.centre_keys) else {}
-        changes |= {} if failures else {"position": self.position}
-        self._store.mirrors.save(**changes)
-        return self._store.mirrors.state() or state
 
     def _noting(self, failures: dict[str, str], environment: str) -> _NotedFailure:
         return _NotedFailure(failures, environment)

@@ -53,20 +53,30 @@ class MirrorSource:
         self._lock = threading.Lock()
         self._contents: OrderedDict[tuple[str, int, int, str], Content] = OrderedDict()
 
-    def listing(self, allowed: str | None) -> dict[str, Any]:
-        """List the environments that a name pattern allows, also deleted ones, with the position of the log."""
+    def listing(self, allowed: str | None, since: int = 0) -> dict[str, Any]:
+        """List the environments that a name pattern allows, also deleted ones, with the position of the log.
+
+        since: position of the log for which the environments are null, if it is still the present one.
+        """
         table = tables.environment
         columns = (table.c.id, table.c.name, table.c.sequence, table.c.updated, table.c.centre)
         with self._database.snapshot() as connection:
             position = connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one()
             epoch = connection.execute(select(tables.server.c.epoch)).scalar_one_or_none() or 0
-            rows = connection.execute(select(*columns).order_by(table.c.name)).all()
+            is_new = position != since or not since
+            rows = connection.execute(select(*columns).order_by(table.c.name)).all() if is_new else []
         environments = [
             {"id": r.id, "name": r.name, "sequence": r.sequence, "updated": rfc3339(r.updated)}
             for r in rows
             if r.centre is None and reaches(allowed, r.name)
         ]
-        return {"form": FORM, "epoch": epoch, "position": position, "allowed": allowed, "environments": environments}
+        return {
+            "form": FORM,
+            "epoch": epoch,
+            "position": position,
+            "allowed": allowed,
+            "environments": environments if is_new else None,
+        }
 
     def page(self, name: str, after: int, sequence: int) -> dict[str, Any]:
         """Read the next page of an environment, also of a deleted one.

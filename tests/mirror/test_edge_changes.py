@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -14,7 +15,7 @@ from app.errors import Unavailable
 from app.events import messages
 from tests.api.conftest import Api, create_farm
 from tests.events.conftest import Listener, client_config, eventually
-from tests.mirror.conftest import Edge
+from tests.mirror.conftest import Edge, mirror_token
 
 Make = Callable[..., Edge]
 _count = itertools.count(1)
@@ -184,3 +185,31 @@ def test_edge_publishes_events_of_both(centre: Api, site: Api, port: int, farm: 
         listener.wait(lambda one: one.events[-1]["sequence"] == 6)
         shown = [(event["sequence"], event.get("edge_sequence")) for event in listener.events]
         assert list(dict.fromkeys(shown)) == [(1, None), (2, None), (3, None), (4, None), (5, None), (5, 1), (6, None)]
+
+
+def test_invalid_report_of_an_edge_is_refused(centre: Api, farm: str) -> None:
+    edge = centre.as_(mirror_token(centre))
+    now = datetime.now(UTC).isoformat()
+    overlay = {"id": "ab", "kind": "blocked", "level": "ground", "reporter": "r", "created": now, "expires": now}
+    shapes: list[dict[str, Any]] = [
+        {},
+        {"edge": "gate_barn", "polygon": {"type": "Polygon", "coordinates": []}},
+        {"polygon": {"type": "Point", "coordinates": [0, 0]}, "crs": "local"},
+        {"polygon": {"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [1, 0], [0, 1], [0, 0]]]}, "crs": "local"},
+    ]
+    changes = [
+        {"event": "overlay.accepted", "overlay": {**overlay, **shape}, "author": "r", "time": now} for shape in shapes
+    ]
+    changes.append({**changes[0], "event": "overlay.expired", "overlay": {**overlay, "edge": "gate_barn"}})
+    statuses = [{"robot": "r1", "status": {"state": "flying"}, "received": now, "vouched": True}]
+    path = f"environments/{farm}/mirror/reports"
+    outcome = edge.post(path, {"statuses": statuses, "changes": changes}, 200).json()
+    assert "state must be" in outcome["statuses"][0]
+    assert [result["overlay"] for result in outcome["changes"]] == [None] * 5
+    assert all(result["problem"] for result in outcome["changes"])
+    assert overlays(centre, farm) == []
+    audit = centre.get(f"audit?environment={farm}").json()
+    assert not any("mirror/reports" in entry["path"] for entry in audit)
+    key = base64.b64encode(bytes(32)).decode()
+    edge.post("mirror/delegations", {"public_key": key, "environments": [farm]}, 200)
+    assert centre.get("audit").json()[0]["path"].endswith("/mirror/delegations"), "a permission to sign is recorded"

@@ -159,6 +159,7 @@ def test_restored_centre_replaces_the_history_only_with_a_higher_epoch(
             .where(tables.environment.c.id == row.id)
             .values(head=2, root=before.root, sequence=before.sequence)
         )
+        connection.execute(update(tables.log).values(position=tables.log.c.position - 1))
     failures = edge.mirror.run_once().failures
     assert failures is not None
     assert "not the one mirrored before" in failures[farm]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 import pytest
 from sqlalchemy import func, select
 
 from app.errors import Mirrored
+from app.mirror.follow import FULL_PASS
 from app.store import tables
 from app.store.store import Store
 from tests.api import samples
@@ -92,15 +94,15 @@ def test_mirror_follows_every_change(centre: Api, site: Api, farm: str, follower
 
 
 def test_catch_up_transfers_only_what_is_missing(centre: Api, farm: str, alone: Make) -> None:
-    nodes = {f"n{k}": (float(k % 70), k / 70.0) for k in range(5000)}
-    edges = tuple((f"n{k}", f"n{k + 1}") for k in range(4999))
+    nodes = {f"n{k}": (float(k % 70), k / 70.0) for k in range(2000)}
+    edges = tuple((f"n{k}", f"n{k + 1}") for k in range(1999))
     centre.upload(farm, {"network.tmap2.yaml": samples.tmap2(nodes, edges)})
     edge = alone(farm)
     edge.follow()
     before = stored_bytes(edge.store)
-    for step in range(1, 6):
+    for step in range(1, 4):
         moved = {
-            name: (x, y + (step if 900 * step < k < 900 * step + 300 else 0))
+            name: (x, y + (step if 450 * step < k < 450 * step + 150 else 0))
             for k, (name, (x, y)) in enumerate(nodes.items())
         }
         centre.upload(farm, {"network.tmap2.yaml": samples.tmap2(moved, edges)})
@@ -168,6 +170,21 @@ def test_released_environment_is_changed_here(centre: Api, farm: str, alone: Mak
     assert edge.store.mirror_target.release(farm)
     edge.store.environments.update(farm, title="mine")
     centre("PATCH", f"environments/{farm}", 200, json={"title": "theirs"})
+    centre("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
     edge.follow()
     assert edge.store.environments.get(farm).title == "mine"
+    assert [channel.name for channel in edge.store.channels.all(farm)] == ["latest"]
     assert not edge.store.mirror_target.release(farm)
+
+
+def test_title_is_followed_although_it_is_no_event(centre: Api, farm: str, alone: Make) -> None:
+    edge = alone(farm)
+    edge.follow()
+    centre("PATCH", f"environments/{farm}", 200, json={"title": "Another title"})
+    edge.wire.sent = edge.wire.received = 0
+    edge.follow()
+    assert edge.wire.received < 1000, "a pass without news costs next to nothing"
+    assert edge.store.environments.get(farm).title == "Farm"
+    edge.now = lambda: datetime.now(UTC) + FULL_PASS
+    edge.follow()
+    assert edge.store.environments.get(farm).title == "Another title"
