@@ -322,6 +322,14 @@ class Settings(BaseSettings):
         description="Validity of a signed manifest. Robots request a new one long before it expires.",
     )
 
+    delegation_seconds: float = Field(
+        default=604_800.0,
+        ge=3600,
+        le=31_536_000,
+        description="Time for which a mirror of this server may sign manifests while it is cut off. It renews the "
+        "permission while it is connected.",
+    )
+
     link_seconds: float = Field(
         default=86_400.0,
         ge=1,

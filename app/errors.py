@@ -122,6 +122,10 @@ class Conflict(FleetMapError):
     """The request conflicts with the current state (name already exists, idempotency key reused)."""
 
 
+class Mirrored(Conflict):
+    """A change of an environment that follows another server, where it must be made."""
+
+
 class StaleParent(Conflict):
     """The head has moved since the version that the request was based on."""
 

@@ -166,6 +166,7 @@ class ChannelMoved:
     channel: str = member("production")
     rollback: bool = member(False)
     reason: str | None = member()
+    edge_sequence: int | None = member()
 
 
 @event("overlay.created", previous=None, layers=[], message=_MESSAGE)
@@ -173,6 +174,7 @@ class OverlayCreated:
     """A robot or an editor reports an obstruction. It is pending and not part of any map."""
 
     overlay: Mapping[str, Any] = member(_overlay("pending"))
+    edge_sequence: int | None = member()
 
 
 @event("overlay.accepted", previous=None, layers=[], message=_MESSAGE)
@@ -180,6 +182,7 @@ class OverlayAccepted:
     """An editor accepts an obstruction. It is then a closure in force and part of maps on all channels."""
 
     overlay: Mapping[str, Any] = member(_overlay("accepted", decided_by="administrator", decided=_TIME))
+    edge_sequence: int | None = member()
     overlays_digest: str = member(_DIGEST)
 
 
@@ -188,6 +191,7 @@ class OverlayRejected:
     """An editor rejects an obstruction."""
 
     overlay: Mapping[str, Any] = member(_overlay("rejected", decided_by="administrator", decided=_TIME))
+    edge_sequence: int | None = member()
 
 
 @event("overlay.expired", previous=None, layers=[], message=_MESSAGE)
@@ -195,6 +199,7 @@ class OverlayExpired:
     """An obstruction reaches its expiry without a decision."""
 
     overlay: Mapping[str, Any] = member(_overlay("expired", decided=_TIME))
+    edge_sequence: int | None = member()
 
 
 @event("overlay.ended", previous=None, layers=[], message=_MESSAGE)
@@ -202,6 +207,7 @@ class OverlayEnded:
     """A closure ends at its expiry or by an editor. It is no longer part of maps."""
 
     overlay: Mapping[str, Any] = member(_overlay("ended", decided_by="administrator", decided=_TIME))
+    edge_sequence: int | None = member()
     overlays_digest: str = member(_DIGEST)
 
 

@@ -285,7 +285,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     service.cache.on_damage = metrics.cache_damaged.inc
     access = _authenticator(settings, store)
 
-    keys, secrets = _signing_keys(settings, store), _link_secrets(settings, store)
+    keys, secrets = signing_keys(settings, store), _link_secrets(settings, store)
     with contextlib.suppress(OSError):  # create now: later the disk may be full
         keys.public()
         secrets.newest()
@@ -335,7 +335,7 @@ def _conversion_jobs(
     return jobs, work
 
 
-def _signing_keys(settings: Settings, store: Store) -> SigningKeys:
+def signing_keys(settings: Settings, store: Store) -> SigningKeys:
     """Return the keys of a mounted file, of the database that servers share, or of the data folder."""
     folder = settings.data_dir / "keys"
     if settings.signing_key is not None:
@@ -362,6 +362,7 @@ def _api_options(settings: Settings) -> ApiOptions:
         zenoh_advertise=settings.zenoh_advertise,
         ros2=bool(settings.ros2_environments.strip()),
         manifest_seconds=int(settings.manifest_seconds),
+        delegation_seconds=int(settings.delegation_seconds),
         public_url=settings.public_url,
         basemap_url=settings.basemap_url,
         basemap_attribution=settings.basemap_attribution.strip(),

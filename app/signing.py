@@ -289,6 +289,18 @@ def _unpack(content: bytes) -> tuple[list[PublicKey], Ed25519PrivateKey]:
     return keys, _from_pem(members["private"].encode(), "the key in the database")
 
 
+def delegation_statement(public: bytes, environment: str, start: datetime, until: datetime) -> bytes:
+    """Return the text of which the signature lets another key sign the manifests of one environment for a time."""
+    members = {
+        "kind": "delegation",
+        "public_key": base64.b64encode(public).decode(),
+        "environment": environment,
+        "from": start.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "until": until.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ"),
+    }
+    return json.dumps(members, separators=(",", ":")).encode()
+
+
 def key_id(public: bytes) -> str:
     """Compute the id of a raw public key."""
     return hashlib.sha256(public).hexdigest()[:16]

@@ -12,7 +12,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from app.agent import signed_manifest
+from app.agent import signatures, signed_manifest
 from app.agent.activation import ACTIVE, BEFORE_SWITCH_SECONDS, Activation, LogEvent, Outcome, Retries, changed_files
 from app.agent.download import Downloads
 from app.agent.freshness import Freshness, SignedClock
@@ -26,7 +26,7 @@ from app.agent.router import find_router
 from app.agent.signed_manifest import Manifest, ManifestFile
 from app.agent.state import AgentState, StateStore
 from app.agent.status import StatusReporter, Subject, describe_status, loaded_version
-from app.agent.waking import CLOSURE_EVENTS, LATEST, Alarm, is_relevant
+from app.agent.waking import CLOSURE_EVENTS, LATEST, Alarm, is_newer, is_relevant
 from app.agent.zenoh_client import ZenohClient
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.event_types import RobotState
@@ -53,7 +53,7 @@ class Agent:
 
     def __init__(self, options: AgentOptions, log: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
-            options = dataclasses.replace(options, key=signed_manifest.check_key(options.key))
+            options = dataclasses.replace(options, key=signatures.check_key(options.key))
         self.options, self._log_event, self._clock = options, log, clock
         self._robot = robot_name(options.robot)
         self._login = options.zenoh_login
@@ -111,7 +111,7 @@ class Agent:
         """
         self._folder.open()
         self._store.load()
-        state = signed_manifest.pin_key(self._state, self.options.key)
+        state = signatures.pin_key(self._state, self.options.key)
         if state.key is None and self._state.key is not None:
             self._log_event("trusting", key=state.given, detail="the key pinned before is no longer trusted")
         installed = self._folder.manifest(self._folder.current_version)
@@ -207,7 +207,7 @@ class Agent:
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
-        if not 0 < event.sequence - self._accepted_sequence <= signed_manifest.MAX_SEQUENCE_AHEAD + 1:
+        if not is_newer(event, self._state.marks.get(channel or "")):
             return
         if is_relevant(event, channel, {self.options.channel} if self.options.channel else {PRODUCTION, channel}):
             is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)

@@ -162,9 +162,10 @@ class ServerClient:
         """Get the server's readiness document; its member ``events`` has the address of the router."""
         return self._json("/readyz")
 
-    def keys(self) -> list[Mapping[str, Any]]:
-        """List the signing keys, newest first."""
-        body = self._json(f"{API}/keys")
+    def keys(self, environment: str | None = None) -> list[Mapping[str, Any]]:
+        """List the signing keys, newest first. environment: of a mirror also its centre's, and why it may sign."""
+        query = "" if environment is None else f"?environment={quote(environment, safe='')}"
+        body = self._json(f"{API}/keys{query}")
         return [line for line in body if isinstance(line, dict)] if isinstance(body, list) else []
 
     def channels(self, environment: str) -> list[Mapping[str, Any]]:

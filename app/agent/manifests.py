@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
+from typing import Any
 
-from app.agent import signed_manifest
+from app.agent import signatures, signed_manifest
 from app.agent.freshness import Freshness, SignedClock
 from app.agent.http_client import ServerClient
 from app.agent.map_directory import MapDirectory
 from app.agent.options import AgentOptions
 from app.agent.requests import FormatRequest, encode_entries
+from app.agent.signatures import Trust
 from app.agent.signed_manifest import Manifest
 from app.agent.state import Mark, StateStore
-from app.errors import Unavailable, Untrusted
+from app.errors import FleetMapError, Unavailable, Untrusted
 
 
 class Manifests:
@@ -42,6 +45,7 @@ class Manifests:
         if options.optional:
             self._query += f"&optional={encode_entries(requests[count:])}"
         self._latest: tuple[str, str | None, Manifest] | None = None
+        self._mirror_keys: Sequence[Mapping[str, Any]] = ()
 
     def fetch_latest(self, channel: str, accept: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
         """Fetch the channel's manifest; None if it has not changed or ``accept`` returns False.
@@ -63,7 +67,8 @@ class Manifests:
         response = self._web.manifest(self._options.environment, channel, self._query, etag)
         if response is None:
             return cached if cached is not None and accept(cached) else None
-        manifest, key = self._verify(response[0], response[1], channel, mark)
+        manifest, trust = self._verify(response[0], response[1], channel, mark)
+        key = trust.root
         if self._clock.is_plausible(manifest):
             self._freshness.observe(manifest, self._clock.local)
         if not accept(manifest):
@@ -73,7 +78,7 @@ class Manifests:
             self._clock.floor = 0.0
         self._clock.observe(manifest)
         if state.key != key:
-            self._log("trusting", key=signed_manifest.key_id(key), detail="rotated" if state.key else "first contact")
+            self._log("trusting", key=signatures.key_id(key), detail="rotated" if state.key else "first contact")
         state = dataclasses.replace(state, key=key, newest_time=self._clock.floor)
         self._store.save(state.with_mark(channel, manifest.mark))
         self._latest = (request_key, response[2], manifest)
@@ -125,11 +130,14 @@ class Manifests:
         reasons = [f"{name} ({manifest.missing[name]})" if name in manifest.missing else name for name in lacking]
         return f"missing optional formats: {', '.join(reasons)}" if reasons else None
 
-    def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
-        """Verify a manifest; return it and the key that signed it. Raises Untrusted."""
+    def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, Trust]:
+        """Verify a manifest; return it, and why it is trusted. Raises Untrusted."""
         state = self._store.value
-        key = signed_manifest.verify_signature(data, signature, state.key, state.given, self._web.keys)
+        trust = self._trust(data, signature)
+        key = trust.root
         manifest = signed_manifest.parse(data, signature)
+        if trust.until is not None:
+            manifest = dataclasses.replace(manifest, expires=min(manifest.expires, trust.until))
         signed_manifest.check_manifest(
             manifest,
             environment=self._options.environment,
@@ -143,4 +151,33 @@ class Manifests:
                 self._clock.now() if state.key in (None, key) else self._clock.local, timezone.utc
             ),
         )
-        return manifest, key
+        return manifest, trust
+
+    def _trust(self, data: bytes, signature: str) -> Trust:
+        """Verify a signature with the server's keys, of a mirror also with its centre's. Raises Untrusted."""
+        state, environment = self._store.value, self._options.environment
+        now = datetime.fromtimestamp(self._clock.now(), timezone.utc)
+
+        def verify(keys: Callable[[], Sequence[Mapping[str, Any]]]) -> Trust:
+            return signatures.verify_manifest(
+                data, signature, state.key, state.given, keys, environment=environment, now=now
+            )
+
+        if self._mirror_keys:
+            with contextlib.suppress(Untrusted):
+                return verify(lambda: self._mirror_keys)
+        try:
+            return verify(self._web.keys)
+        except signatures.Unendorsed as error:
+            try:
+                lines = self._web.keys(environment)
+            except FleetMapError:
+                raise error from None
+            try:
+                trust = verify(lambda: lines)
+            except signatures.Unendorsed:  # a permission that has ended
+                raise
+            except Untrusted:
+                raise error from None
+            self._mirror_keys = lines
+            return trust

@@ -10,21 +10,14 @@ bytes, or a foreign key).
 
 from __future__ import annotations
 
-import base64
-import binascii
-import dataclasses
-import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-
-from app.agent.state import AgentState, Mark
+from app.agent.state import Mark
 from app.errors import Untrusted
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
@@ -45,7 +38,6 @@ MAX_DEPTH = 100
 _HASH = re.compile(r"[0-9a-f]{64}")
 _FORMAT = re.compile(r"[a-z0-9][a-z0-9_]{0,62}")
 _LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_KEY_ID = re.compile(r"[0-9a-f]{16}")
 _TIME = re.compile(
     r"(?P<date>\d{4}-\d\d-\d\d)[Tt ](?P<clock>\d\d:\d\d:\d\d)(\.(?P<fraction>\d{1,30}))?(?P<zone>[Zz]|[+-]\d\d:\d\d)",
     re.ASCII,
@@ -100,6 +92,7 @@ class Manifest:
         overlays: closures in force, as the server lists them.
         overlays_digest: None if the server applies no closures.
         closures, parameters: echo of the request: how closures are shown, and format -> its parameters.
+        edge_sequence: number of changes that a mirror made by itself.
     """
 
     environment: str
@@ -121,11 +114,12 @@ class Manifest:
     overlays_digest: str | None = None
     closures: str = "apply"
     parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    edge_sequence: int = 0
 
     @property
     def mark(self) -> Mark:
         """Position in the channel's history."""
-        return Mark(self.epoch, self.sequence, self.root, self.overlays_digest)
+        return Mark(self.epoch, self.sequence, self.root, self.overlays_digest, self.edge_sequence)
 
     @property
     def map_key(self) -> tuple[Any, ...]:
@@ -172,12 +166,19 @@ def parse(data: bytes, signature: str) -> Manifest:
             body.get("overlays_digest"),
             body.get("closures", "apply"),
             {format_: dict(values) for format_, values in body.get("parameters", {}).items()},
+            body.get("edge_sequence", 0),
         )
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Untrusted(f"invalid manifest from the server: {type(error).__name__}: {error}") from None
     valid_numbers = all(
         type(n) is int and 0 <= n < 2**63
-        for n in (manifest.sequence, manifest.version, manifest.epoch, *(f.size for f in files))
+        for n in (
+            manifest.sequence,
+            manifest.version,
+            manifest.epoch,
+            manifest.edge_sequence,
+            *(f.size for f in files),
+        )
     )
     texts = all(isinstance(t, str) for t in (manifest.environment, manifest.channel or "", manifest.root))
     hashes = texts and all(
@@ -284,78 +285,6 @@ def _check_paths(files: Sequence[ManifestFile]) -> None:
         raise Untrusted(f"manifest lists a file that is also a folder: {both[0]}")
 
 
-def key_id(public: bytes) -> str:
-    """Return the id of a raw public key: the first 16 hexadecimal digits of its SHA-256."""
-    return hashlib.sha256(public).hexdigest()[:16]
-
-
-def verify_signature(
-    data: bytes, signature: str, pinned: bytes | None, given: str | None, keys: Callable[[], list[Mapping[str, Any]]]
-) -> bytes:
-    """Verify a signature and return the raw public key that signed ``data``: the pinned one or one that it endorses.
-
-    Args:
-        signature: ``<key id>:<base64>``.
-        given: key to trust at first contact, set by the operator (id, or raw key in base64).
-        keys: fetches the server's keys, newest first; called only if another key than the pinned one signed.
-
-    Raises:
-        Untrusted: the signature or the key is not valid.
-    """
-    name, _, text = signature.partition(":")
-    signed = _bytes(text)
-    if not name or signed is None or len(signed) != 64:
-        raise Untrusted("manifest has no valid signature")
-    if pinned is None and given is not None:
-        pinned = _bytes(given) if not _KEY_ID.fullmatch(given) else None
-    is_pinned = pinned is not None and key_id(pinned) == name
-    key = pinned if pinned is not None and is_pinned else _from_server(name, pinned, given, keys())
-    if not _verifies(key, signed, data):
-        raise Untrusted(f"signature of the manifest does not match key {name}: the manifest was changed in transit")
-    return key
-
-
-def _from_server(name: str, pinned: bytes | None, given: str | None, keys: Sequence[Mapping[str, Any]]) -> bytes:
-    server_keys: dict[str, tuple[bytes, Mapping[str, Any]]] = {}
-    for line in keys:
-        public = _bytes(str(line.get("public_key", "")))
-        if public is not None and len(public) == 32 and line.get("id") == key_id(public):
-            server_keys[key_id(public)] = (public, line)
-    if name not in server_keys:
-        raise Untrusted(f"manifest is signed with key {name}, which the server does not list")
-    trusted = key_id(pinned) if pinned is not None else given
-    if trusted is None:
-        return server_keys[name][0]  # trust on first use
-    at = name
-    for _ in range(len(server_keys) + 1):
-        if at == trusted:
-            return server_keys[name][0]
-        if at not in server_keys:
-            break
-        public, line = server_keys[at]
-        by = str(line.get("endorsed_by", ""))
-        voucher = (
-            pinned if pinned is not None and by == key_id(pinned) else server_keys[by][0] if by in server_keys else None
-        )
-        endorsement = _bytes(str(line.get("endorsement", "")))
-        if voucher is None or endorsement is None or not _verifies(voucher, endorsement, public):
-            break
-        at = by
-    raise Untrusted(
-        f"manifest is signed with key {name}, which the trusted key {trusted} does not endorse: possibly another "
-        "server. If this is intended, set --key to its key and delete state.json"
-    )
-
-
-def check_key(text: str) -> str:
-    """Check a key of an operator: its id (16 hexadecimal digits) or the raw public key in base64. Raises Untrusted."""
-    text = text.strip()
-    raw = _bytes(text)
-    if _KEY_ID.fullmatch(text) or (raw is not None and len(raw) == 32):
-        return text
-    raise Untrusted("invalid --key: use the id (16 hexadecimal digits) or the public_key (base64) of GET /api/v1/keys")
-
-
 def check_manifest(
     manifest: Manifest,
     *,
@@ -400,20 +329,26 @@ def check_manifest(
     _check_ahead(manifest, mark)
     if mark is None:
         return
-    if (manifest.epoch, manifest.sequence) < (mark.epoch, mark.sequence):
+    if manifest.mark.position < mark.position:
         epoch = f" of epoch {manifest.epoch}" if manifest.epoch != mark.epoch else ""
+        if manifest.mark.position[:2] == mark.position[:2]:
+            raise Untrusted(
+                f"manifest of sequence {manifest.sequence} lacks closures that a mirror has reported to this robot "
+                f"(change {manifest.edge_sequence} instead of {mark.edge_sequence}): possible rollback. The server has "
+                "them once the mirror is connected to it"
+            )
         raise Untrusted(
             f"manifest sequence {manifest.sequence}{epoch} is lower than {mark.sequence}, which this robot has already "
             "accepted: possible rollback. If the server was reinstalled, delete state.json"
         )
-    if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and manifest.root != mark.root:
+    if manifest.mark.position == mark.position and manifest.root != mark.root:
         raise Untrusted(
             f"manifest of sequence {manifest.sequence} has root {manifest.root[:8]}, but this robot has accepted root "
             f"{mark.root[:8]} under the same sequence: two servers share one key, or the server was restored from a "
             "backup. After a restore, raise the server's epoch"
         )
     old, new = mark.overlays_digest, manifest.overlays_digest
-    if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and old not in (None, new):
+    if manifest.mark.position == mark.position and old not in (None, new):
         raise Untrusted(
             f"manifest of sequence {manifest.sequence} has closures {(new or 'none')[:8]}, but this robot has accepted "
             f"closures {(old or 'none')[:8]} under the same sequence: two servers share one key, or the server was "
@@ -442,40 +377,14 @@ def _check_request(manifest: Manifest, parameters: Mapping[str, Mapping[str, str
 
 def _check_ahead(manifest: Manifest, mark: Mark | None) -> None:
     """Refuse a position that is too far ahead of the last accepted one."""
-    epoch, sequence = (mark.epoch, mark.sequence) if mark is not None else (0, 0)
+    epoch, sequence, edge_sequence = mark.position if mark is not None else (0, 0, 0)
     for name, value, accepted, limit in (
         ("sequence", manifest.sequence, sequence, MAX_SEQUENCE_AHEAD),
         ("epoch", manifest.epoch, epoch, MAX_EPOCH_AHEAD),
+        ("edge_sequence", manifest.edge_sequence, edge_sequence, MAX_SEQUENCE_AHEAD),
     ):
         if value > accepted + limit:
             raise Untrusted(
                 f"manifest {name} {value} is more than {limit} ahead of {accepted}, the highest that this robot has "
                 "accepted: rotate the server's key if it may have been stolen"
             )
-
-
-def _verifies(public: bytes, signature: bytes, data: bytes) -> bool:
-    try:
-        Ed25519PublicKey.from_public_bytes(public).verify(signature, data)
-    except (InvalidSignature, ValueError):
-        return False
-    return True
-
-
-def _bytes(text: str) -> bytes | None:
-    try:
-        return base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError):
-        return None
-
-
-def pin_key(state: AgentState, key: str | None) -> AgentState:
-    """Return the state with a trusted key set by the operator (id, or public key in base64).
-
-    Another pinned key and its accepted positions are removed.
-    """
-    if key is None or key == state.given:
-        return state
-    if state.key is not None and key not in (key_id(state.key), base64.b64encode(state.key).decode()):
-        state = dataclasses.replace(state, key=None, marks={})
-    return dataclasses.replace(state, given=key)

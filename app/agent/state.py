@@ -28,12 +28,21 @@ STATE_FORMAT = 2
 
 
 class Mark(NamedTuple):
-    """Position of a manifest in its channel's history."""
+    """Position of a manifest in its channel's history.
+
+    edge_sequence: number of changes that a mirror made by itself; it orders manifests of equal sequence.
+    """
 
     epoch: int
     sequence: int
     root: str
     overlays_digest: str | None = None
+    edge_sequence: int = 0
+
+    @property
+    def position(self) -> tuple[int, int, int]:
+        """Position without the content."""
+        return self.epoch, self.sequence, self.edge_sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +91,11 @@ def load(path: Path, environment: str) -> AgentState:
             channel=body.get("channel"),
             marks={
                 str(c): Mark(
-                    int(m.get("epoch", 0)), int(m["sequence"]), str(m["root"]), _text(m.get("overlays_digest"))
+                    int(m.get("epoch", 0)),
+                    int(m["sequence"]),
+                    str(m["root"]),
+                    _text(m.get("overlays_digest")),
+                    int(m.get("edge_sequence", 0)),
                 )
                 for c, m in body["marks"].items()
             },

@@ -7,6 +7,8 @@ import threading
 import time
 from collections.abc import Collection
 
+from app.agent.signed_manifest import MAX_SEQUENCE_AHEAD
+from app.agent.state import Mark
 from app.agent.status import StatusReporter
 from app.events.messages import Event
 
@@ -55,6 +57,18 @@ class Alarm(threading.Event):
             debounce = DEBOUNCE_SECONDS * 2.0 ** min(MAX_DOUBLINGS, self.idle_wakeups)
             self._stopping.wait(REJOIN_SECONDS * random.random() if rejoined else debounce)  # noqa: S311
         return woken
+
+
+def is_newer(event: Event, mark: Mark | None) -> bool:
+    """Whether an event is newer than the newest accepted manifest, but not absurdly so.
+
+    Args:
+        mark: position of that manifest; None before the first one.
+    """
+    number = event.body.get("edge_sequence")
+    if mark is not None and event.sequence == mark.sequence and type(number) is int:  # a mirror's own change
+        return 0 < number - mark.edge_sequence <= MAX_SEQUENCE_AHEAD
+    return 0 < event.sequence - (-1 if mark is None else mark.sequence) <= MAX_SEQUENCE_AHEAD + 1
 
 
 def is_relevant(event: Event, channel: str | None, candidates: Collection[str | None]) -> bool:

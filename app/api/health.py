@@ -74,6 +74,8 @@ async def readyz(
     - `cache`: why maps are currently not cached on disk, or `ok`.
     - `events`: whether this server is connected to Zenoh, whether it is the one that publishes events (`leader`), and
       where robots find the router (`connect`, `prefix`). Maps are served even if events are not published.
+    - `mirror`: on a server that mirrors another one: `connected`, `starting` or `cut off`, the time of the last
+      contact, how many changes wait for the centre, and until when robots accept its manifests without contact.
     - `ros2`: number of published topics, if the ROS 2 publisher is enabled; `standby`: another server publishes them.
     """
     services: Services = request.app.state.services
@@ -101,7 +103,10 @@ async def readyz(
         "writes": refusal or "ok",
         "cache": services.maps.cache.problem or "ok",
     }
-    return json_response({**state, "events": events, **topics})
+    mirror = await run_in_threadpool(services.store.mirrors.describe)
+    shown = ("state", "contact", "waiting", "serves_until")
+    mirrored = {} if mirror is None else {"mirror": {name: mirror[name] for name in shown}}
+    return json_response({**state, "events": events, **topics, **mirrored})
 
 
 @root_router.get(

@@ -23,7 +23,7 @@ from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
 from app.api.http.parameters import parse_options, parse_version_ref, require_format
 from app.api.http.responses import api_router, json_bytes, json_response
-from app.api.http.schemas import EnvironmentPath, VersionPath, problem_responses
+from app.api.http.schemas import NAME, EnvironmentPath, VersionPath, problem_responses
 from app.convert import site
 from app.convert.cache import CachedMap
 from app.convert.recipe import Recipe, writer_options
@@ -45,6 +45,14 @@ UNAVAILABLE = (CannotConvert, NotFound, Invalid)
 LAYER_DIGITS = 16
 
 
+class KeyDelegationOut(BaseModel):
+    """Statement of a centre that a mirror's key may sign manifests of one environment for a time; bytes in base64."""
+
+    statement: str
+    signed_by: str
+    signature: str
+
+
 class KeyOut(BaseModel):
     """Public key; bytes in base64."""
 
@@ -54,6 +62,9 @@ class KeyOut(BaseModel):
     created: datetime
     endorsed_by: str | None = None
     endorsement: str | None = None
+    delegations: list[KeyDelegationOut] = Field(
+        [], description="On a mirror, for `environment`: why robots that trust its centre may trust this key."
+    )
 
 
 class ManifestFile(BaseModel):
@@ -94,6 +105,11 @@ class ManifestOut(BaseModel):
         "restore. Omitted if 0.",
     )
     sequence: int
+    edge_sequence: int = Field(
+        0,
+        description="Number of changes that a mirror made by itself while its centre was cut off: orders manifests of "
+        "equal `sequence`. Omitted if 0.",
+    )
     version: int
     root: str
     time: datetime = Field(description="Time of signing, in steps of ten minutes.")
@@ -132,12 +148,42 @@ router = api_router("manifest")
 
 
 @router.get("/keys", responses=problem_responses(list[KeyOut]), summary="List signing keys")
-def list_keys(services: ServicesDep, _: Viewer) -> Response:
+def list_keys(
+    services: ServicesDep,
+    principal: Viewer,
+    environment: Annotated[
+        str | None,
+        Query(
+            pattern=NAME,
+            description="On a mirror: also list the delegation for this environment, and the keys of its centre.",
+        ),
+    ] = None,
+) -> Response:
     """List the keys, newest first; the newest one signs.
 
     `endorsement` is the signature of the previous key over the raw public key.
     """
-    return json_response([key.as_dict() for key in services.keys.public()])
+    lines = [key.as_dict() for key in services.keys.public()]
+    if environment is not None:
+        principal.require_environment(environment)
+        lines = _with_delegation(services, lines, environment)
+    return json_response(lines)
+
+
+def _with_delegation(services: Services, lines: list[dict[str, Any]], environment: str) -> list[dict[str, Any]]:
+    """Add the delegation for an environment to the key that it is about, and the keys of the centre."""
+    mirror, delegation = services.store.mirrors.state(), services.store.mirrors.delegation(environment)
+    if mirror is None or delegation is None:
+        return lines
+    public = base64.b64encode(delegation.key).decode()
+    texts = {
+        "statement": base64.b64encode(delegation.statement).decode(),
+        "signed_by": delegation.signed_by,
+        "signature": base64.b64encode(delegation.signature).decode(),
+    }
+    out = [{**line, "delegations": [texts]} if line["public_key"] == public else line for line in lines]
+    listed = {line["id"] for line in lines}
+    return out + [dict(line) for line in mirror.centre_keys if line["id"] not in listed]
 
 
 @router.post(
@@ -267,19 +313,19 @@ def _sign_manifest(
     """
     channel = None if isinstance(parse_version_ref(v), int) else v
     generation = services.response_cache.generation()
-    version, sequence = services.store.channels.target(env, parse_version_ref(v), mode)
+    version, position = services.store.channels.target(env, parse_version_ref(v), mode)
     closures = version.closures or NO_CLOSURES
     listed = _list_files(services, version, entries, cached_maps)
     if isinstance(listed, _PendingConversion):
         return listed
     files, missing = listed
-    now = datetime.now(UTC).timestamp()
+    now = services.store.now().timestamp()
     signed = (int(now) // STEP_SECONDS) * STEP_SECONDS
     body: dict[str, Any] = {"environment": env}
     if channel is not None:
         body["channel"] = channel
     body |= {
-        "sequence": sequence,
+        "sequence": position.sequence,
         "version": version.number,
         "root": version.root,
         "time": _seconds(signed),
@@ -295,7 +341,9 @@ def _sign_manifest(
     parameters = {entry.format: entry.requested for entry in entries if entry.requested}
     body |= {"closures": shown} if shown != "apply" else {}
     body |= {"parameters": parameters} if parameters else {}
-    body |= {"epoch": epoch} if (epoch := services.store.epoch()) else {}
+    epoch = services.store.epoch() if position.epoch is None else position.epoch
+    body |= {"epoch": epoch} if epoch else {}
+    body |= {"edge_sequence": position.edge} if position.edge else {}
     body |= {"missing": missing} if missing else {}
     body |= {"overlays": [closure.as_dict() for closure in closures.items]} if closures.items else {}
     variables = services.maps.variables(version)

@@ -200,7 +200,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
         )
     if body.state == "accepted" and principal.role not in ("editor", "admin"):
         raise Denied("only editors can accept an overlay: report it without state, and an editor decides")
-    versions = list(_shown_versions(services, env))
+    versions = list(shown_versions(services, env))
     head = versions[0]
     now = datetime.now(UTC)
     crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
@@ -213,7 +213,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
         environment=env,
         kind=body.kind,
         level=level,
-        polygon=None if body.polygon is None else _polygon(body.polygon),
+        polygon=None if body.polygon is None else parse_polygon(body.polygon),
         edge=edge,
         crs=crs,
         detail=body.detail,
@@ -224,7 +224,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, services: ServicesDe
         decided_by=principal.name if body.state == "accepted" else None,
         decided=now if body.state == "accepted" else None,
     )
-    _check_place(reported, versions)
+    check_place(reported, versions)
     overlay, new = services.store.overlays.add(reported)
     return json_response(overlay.as_dict(), 201 if new else 200)
 
@@ -250,7 +250,7 @@ def _expiry_of(body: EndBody, now: datetime) -> datetime:
     return body.expires
 
 
-def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
+def check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
     """Raise Invalid if an area cannot be placed in any version that robots may run."""
     if overlay.polygon is None:
         return
@@ -260,7 +260,7 @@ def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
         raise Invalid(problem, [Problem(str(problems[0]), where="polygon")])
 
 
-def _shown_versions(services: Services, env: str) -> Iterator[Version]:
+def shown_versions(services: Services, env: str) -> Iterator[Version]:
     """Yield the head, then the versions of channels: robots report from any of them."""
     head = services.store.versions.get(env)
     yield head
@@ -269,7 +269,7 @@ def _shown_versions(services: Services, env: str) -> Iterator[Version]:
         yield services.store.versions.get(env, number)
 
 
-def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
+def parse_polygon(given: Mapping[str, Any]) -> dict[str, Any]:
     """Parse a valid GeoJSON polygon, without foreign members. Raises Invalid."""
     shape = parse_geometry(given)
     if shape.geom_type not in ("Polygon", "MultiPolygon") or shape.is_empty or not shape.is_valid:
@@ -294,10 +294,10 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, services: ServicesDep,
     if overlay.state == "pending" and overlay.expires <= now:
         raise Conflict(f"the overlay {id} has expired: report it again")
     if overlay.state == "pending":
-        versions = list(_shown_versions(services, env))
+        versions = list(shown_versions(services, env))
         if overlay.edge is not None:
             overlays.find_edge(services.store, versions, overlay.edge)
-        _check_place(overlay, versions)
+        check_place(overlay, versions)
     return json_response(services.store.overlays.decide(env, id, "pending", "accepted", principal.name, now).as_dict())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field
@@ -16,7 +16,7 @@ from app.api.http.schemas import ApiTime, RequestModel, problem_responses
 from app.api.session import sign_in_path
 from app.errors import Conflict, Invalid, NotFound, Problem
 from app.events.messages import ROBOT_NAME
-from app.store.values import Token, rfc3339
+from app.store.values import Role, Token, rfc3339
 
 
 class TokenBody(RequestModel):
@@ -29,7 +29,7 @@ class TokenBody(RequestModel):
     )
 
     name: str = Field(min_length=1, max_length=200, description="Name shown in lists and as author in the history.")
-    role: Literal["viewer", "robot", "editor", "admin"]
+    role: Role
     environments: str | None = Field(
         None,
         min_length=1,

@@ -55,6 +55,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
     "Server": (
         ("serve", "server:serve"),
         ("worker", "server:worker"),
+        ("mirror", "mirror:mirror"),
         ("demo", "server:demo"),
         ("token", "tokens:commands"),
         ("keys", "keys:commands"),

@@ -13,7 +13,7 @@ from app.cli.groups import Commands
 commands = Commands("Create, list and delete access tokens (as administrator).")
 
 
-ROLES = ("viewer", "robot", "editor", "admin")
+ROLES = ("viewer", "robot", "mirror", "editor", "admin")
 
 
 @commands.command("create")

@@ -333,6 +333,7 @@ class Ingest:
 
         task: what to do, for the error if all attempts fail. A repeated ``key`` returns the stored result.
         """
+        self._store.environments.check_own(environment)  # before the work
         replayed = self._previous_result(environment, key)
         if replayed is not None:
             return replayed

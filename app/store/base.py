@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, Row, Table, select
 from sqlalchemy.dialects import postgresql, sqlite
 
-from app.errors import Gone, Invalid, NotFound, Problem
+from app.errors import Gone, Invalid, Mirrored, NotFound, Problem
 from app.model.frame import Datum
 from app.model.names import did_you_mean
 from app.store import tables
@@ -67,10 +67,14 @@ def upsert(connection: Connection, table: Table, keys: Mapping[str, Any], values
     connection.execute(statement.on_conflict_do_update(index_elements=list(keys), set_=dict(values)))
 
 
-def environment_row(connection: Connection, name: str, *, lock: bool = False, deleted: bool = False) -> Row[Any]:
+def environment_row(
+    connection: Connection, name: str, *, lock: bool = False, deleted: bool = False, mirrored: bool = False
+) -> Row[Any]:
     """Read an environment's row, with ``lock`` locked until the transaction ends.
 
-    Raises Gone if it is deleted, NotFound if it is unknown.
+    mirrored: for a change that is also allowed in an environment that follows another server.
+
+    Raises Gone if it is deleted, NotFound if it is unknown, Mirrored for any other change of a mirrored environment.
     """
     query = select(tables.environment).where(tables.environment.c.name == name)
     row = connection.execute(query.with_for_update() if lock else query).one_or_none()
@@ -78,7 +82,18 @@ def environment_row(connection: Connection, name: str, *, lock: bool = False, de
         raise NotFound(f"unknown environment {name[:80]!r}")
     if row.deleted is not None and not deleted:
         raise Gone(f"the environment {name!r} is deleted: restore it with POST /api/v1/environments/{name}/restore")
+    if lock and not mirrored:
+        check_own(row)
     return row
+
+
+def check_own(environment: Row[Any]) -> None:
+    """Raise Mirrored for an environment that follows another server."""
+    if environment.centre is not None:
+        raise Mirrored(
+            f"the environment {environment.name!r} is a mirror of the one at {environment.centre}: make the change "
+            "there"
+        )
 
 
 def nearest_channel(connection: Connection, environment: Row[Any], name: str) -> str:

@@ -361,6 +361,15 @@ class Blobs:
             stack.pop_all()
         return file
 
+    def rows(self, hashes: Sequence[str]) -> dict[str, BlobRow]:
+        """Read where contents are and how they are kept, of those that are stored."""
+        with self._database.read() as connection:
+            return blob_rows.select_rows(connection, list(hashes))
+
+    def encoded(self, row: BlobRow) -> Iterator[bytes]:
+        """Read a content as it is kept, for another server that decodes and checks it."""
+        return self.files.stream(row.key, row.start, None if row.pack is None else row.stored)
+
     def path(self, sha256: str) -> Path | None:
         """Return the file in the folder that contains this, maybe compressed; None if it is in a pack. Not checked."""
         row = self._row(sha256)

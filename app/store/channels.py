@@ -28,7 +28,7 @@ from app.store.manifest import read_version
 from app.store.overlays import CHANGE_CLOSURES, read_closures
 from app.store.pending import check_committed
 from app.store.robots import channel_robots
-from app.store.values import LATEST, Version, rfc3339
+from app.store.values import LATEST, Position, Version, rfc3339
 
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 
@@ -73,8 +73,8 @@ class Channels:
         latest = Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time)
         return [replace(latest, closures=closures, closures_sequence=row.closures_sequence), *others]
 
-    def target(self, environment: str, ref: str | int, closures: ClosureMode | None = None) -> tuple[Version, int]:
-        """Read a version by number or channel as maps show it, with its sequence.
+    def target(self, environment: str, ref: str | int, closures: ClosureMode | None = None) -> tuple[Version, Position]:
+        """Read a version by number or channel as maps show it, with its position.
 
         closures: how maps show the closures in force; default: applied for a channel, ignored for a number (history).
         The sequence is that of the event that moved the channel to the version (or created the version) or, if later,
@@ -102,9 +102,11 @@ class Channels:
                 number, sequence = channel_row.version, channel_row.sequence
             stored_version, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
-                return stored_version, sequence
+                return stored_version, Position(sequence, int(row.edge_sequence), row.centre_epoch)
             in_force = read_closures(connection, row).for_mode(mode)
-            return replace(stored_version, closures=in_force), max(sequence, int(row.closures_sequence))
+            sequence = max(sequence, int(row.closures_sequence))
+            position = Position(sequence, int(row.edge_sequence), row.centre_epoch)
+            return replace(stored_version, closures=in_force), position
 
     def move(
         self,
@@ -179,13 +181,17 @@ class Channels:
             return write.read()
 
     def apply_due_moves(self, now: datetime) -> list[tuple[str, Channel]]:
-        """Carry out the planned moves that are due; returns (environment, channel) in the order of their times."""
+        """Carry out the planned moves that are due; returns (environment, channel) in the order of their times.
+
+        A mirror carries out the moves that wait for nothing but their time, since it may be cut off from its centre.
+        """
         table, owner = tables.channel, tables.environment
         query = (
             select(owner.c.name.label("environment"), table.c.name)
             .join(owner, owner.c.id == table.c.environment_id)
             .where(table.c.planned_at <= now, table.c.rollout_state.is_distinct_from("waiting"))
             .where(owner.c.deleted.is_(None))
+            .where(owner.c.centre.is_(None) | table.c.rollout_state.is_(None))
             .order_by(table.c.planned_at, owner.c.name, table.c.name)
         )
         with self._database.read() as connection:
@@ -193,7 +199,8 @@ class Channels:
         out = []
         for environment, name in due:
             with self._database.write() as connection:
-                write = _ChannelWrite(connection, environment_row(connection, environment, lock=True), name, now)
+                row = environment_row(connection, environment, lock=True, mirrored=True)
+                write = _ChannelWrite(connection, row, name, now)
                 channel_row = write.read_row()
                 if channel_row is None or channel_row.planned_at is None or channel_row.planned_at > now:
                     continue
@@ -213,7 +220,7 @@ class Channels:
         query = (
             select(table, owner.c.name.label("environment"))
             .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.rollout_state.in_(OPEN_ROLLOUTS), owner.c.deleted.is_(None))
+            .where(table.c.rollout_state.in_(OPEN_ROLLOUTS), owner.c.deleted.is_(None), owner.c.centre.is_(None))
             .order_by(owner.c.name, table.c.name)
         )
         with self._database.read() as connection:
@@ -364,7 +371,8 @@ def _move(
         if channel_row is not None and channel_row.planned_version not in (None, number):
             _append_cancelled_event(write, channel_row, "the channel stays at its version", author)
         return
-    sequence = write.environment.sequence + 1
+    # in a mirror the next sequence is its centre's: the move is in order by the number of the mirror's own changes
+    sequence = write.environment.sequence + (1 if write.environment.centre is None else 0)
     write.store(channel_row, version=number, sequence=sequence, author=author, time=write.now, **nothing)
     about = {"reason": reason} if reason else {}
     _append_event(write, "channel.moved", before, target, author, rollback=rollback, **about)
@@ -413,9 +421,13 @@ def _append_event(
     **about: Any,
 ) -> None:
     """Append the event of a channel that was moved, planned, or whose plan was cancelled."""
-    environment, sequence = write.environment, write.environment.sequence + 1
+    environment, sequence, edge = write.environment, write.environment.sequence + 1, None
+    values = {"sequence": sequence}
+    if environment.centre is not None:
+        sequence, edge = environment.sequence, environment.edge_sequence + 1
+        values = {"edge_sequence": edge}
     table = tables.environment
-    write.connection.execute(update(table).where(table.c.id == environment.id).values(sequence=sequence))
+    write.connection.execute(update(table).where(table.c.id == environment.id).values(values))
     outbox.append_event(
         write.connection,
         environment_id=environment.id,
@@ -433,5 +445,6 @@ def _append_event(
         sequence=sequence,
         author=author,
         time=write.now,
+        edge=edge,
         **about,
     )

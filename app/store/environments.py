@@ -21,6 +21,7 @@ from app.store.area import area_after
 from app.store.base import (
     as_environment,
     check_environment_name,
+    check_own,
     check_tags,
     checked_text,
     environment_row,
@@ -110,6 +111,11 @@ class Environments:
         """Read an environment. Raises Gone if it is deleted (unless ``deleted``), NotFound if it never existed."""
         with self._database.read() as connection:
             return as_environment(environment_row(connection, name, deleted=deleted))
+
+    def check_own(self, name: str) -> None:
+        """Raise Mirrored for an environment that follows another server, where it is changed; NotFound."""
+        with self._database.read() as connection:
+            check_own(environment_row(connection, name))
 
     def page(
         self,
@@ -277,7 +283,7 @@ def _first_version(connection: Connection, start: Version, datum: Datum | None, 
     """Return the content of version 1. A clone is read again in this transaction, so that its chunks still exist."""
     base, message = start, "datum set"
     if clone is not None:
-        origin = environment_row(connection, clone.environment, lock=True)
+        origin = environment_row(connection, clone.environment, lock=True, mirrored=True)
         base = read_version(connection, origin, clone.number)
         message = f"cloned from {clone.environment}, version {clone.number}"
     place = datum or base.datum

@@ -129,7 +129,8 @@ class RobotReport:
 class ReceivedReport:
     """A report with its robot, and the time of receipt by the server's clock.
 
-    vouched: whether it was authenticated: by a token that may report for the robot, or by a router with users.
+    vouched: whether it was authenticated: by a token that may report for the robot, or by a router with users. late:
+    whether a mirror has received it and hands it on: it is history if the robot has reported since.
     """
 
     environment: str
@@ -137,6 +138,7 @@ class ReceivedReport:
     report: RobotReport
     time: datetime
     vouched: bool = True
+    late: bool = False
 
 
 @dataclass(frozen=True, slots=True)

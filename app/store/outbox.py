@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -56,12 +57,17 @@ def append_event(
     message: str,
     author: str,
     time: datetime,
+    edge: int | None = None,
     **more: Any,
 ) -> None:
     """Add one event. The caller has locked the environment's row and stores ``sequence`` in it.
 
     Call it last: it takes the lock that puts all environments' events in one order. more: members of this type only.
+    edge: number of a change that a mirror made by itself; the environment's sequence then stays, since the next one is
+    its centre's, and the event is published but is not part of the environment's log.
     """
+    if edge is not None:
+        more["edge_sequence"] = edge
     check_members(kind, more)
     body = {
         "sequence": sequence,
@@ -85,13 +91,42 @@ def append_event(
     connection.execute(
         insert(tables.event).values(
             position=position,
-            environment_id=environment_id,
+            environment_id=environment_id if edge is None else _edge_stream(environment_id),
             environment=environment,
-            sequence=sequence,
+            sequence=sequence if edge is None else edge,
             body=body,
             time=time,
         )
     )
+
+
+def append_copies(connection: Connection, environment_id: str, events: Sequence[Event]) -> None:
+    """Add events of another server with their own sequences, in order. Call it last, as ``append_event``."""
+    if not events:
+        return
+    last = connection.execute(
+        update(tables.log)
+        .where(tables.log.c.id == 1)
+        .values(position=tables.log.c.position + len(events))
+        .returning(tables.log.c.position)
+    ).scalar_one()
+    rows = [
+        {
+            "position": last - len(events) + 1 + k,
+            "environment_id": environment_id,
+            "environment": event.environment,
+            "sequence": event.sequence,
+            "body": event.body,
+            "time": event.time,
+        }
+        for k, event in enumerate(events)
+    ]
+    connection.execute(insert(tables.event), rows)
+
+
+def _edge_stream(environment_id: str) -> str:
+    """Return the id under which a mirror logs its own changes of an environment."""
+    return hashlib.sha256(f"edge {environment_id}".encode()).hexdigest()[:32]
 
 
 def _reach(connection: Connection) -> int:

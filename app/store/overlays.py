@@ -24,6 +24,7 @@ from app.store import outbox, tables
 from app.store.base import checked_text, environment_row
 from app.store.database import Database
 from app.store.fleet_values import Overlay, OverlayState
+from app.store.values import rfc3339
 
 MAX_PENDING: Final = 1000
 """Maximum number of pending overlays of an environment."""
@@ -67,13 +68,17 @@ class Overlays:
         table = tables.overlay
         accepted = overlay.state == "accepted"
         with self._database.write() as connection:
-            row = environment_row(connection, overlay.environment, lock=True)
+            row = environment_row(connection, overlay.environment, lock=True, mirrored=True)
             if accepted:
-                _require_room(connection, row, overlay)
+                require_room(connection, row, overlay)
             elif (same := _pending_twin(connection, row, overlay)) is not None:
                 values = {"expires": overlay.expires, "detail": overlay.detail}
                 connection.execute(update(table).where(table.c.id == same).values(values))
-                return _read(connection, row, same), False
+                renewed = _read(connection, row, same)
+                if row.centre is not None:
+                    created = renewed.reporter, renewed.created
+                    _queue_for_centre(connection, row, renewed, "overlay.created", *created)
+                return renewed, False
             overlay_id = secrets.token_hex(8)
             connection.execute(
                 insert(table).values(
@@ -95,7 +100,7 @@ class Overlays:
             )
             stored = _read(connection, row, overlay_id)
             event: EventType = "overlay.accepted" if accepted else "overlay.created"
-            _append_event(connection, row, stored, event, stored.reporter, stored.created)
+            append_overlay_event(connection, row, stored, event, stored.reporter, stored.created)
             return stored, True
 
     def all(self, environment: str, state: OverlayState | None = None) -> list[Overlay]:
@@ -108,7 +113,7 @@ class Overlays:
             if state is not None:
                 query = query.where(table.c.state == state)
             rows = connection.execute(query.limit(MAX_LISTED)).all()
-        return [_as_overlay(environment, r) for r in reversed(rows)]
+        return [as_overlay(environment, r) for r in reversed(rows)]
 
     def get(self, environment: str, id: str) -> Overlay:
         """Read one overlay. Raises NotFound."""
@@ -132,24 +137,24 @@ class Overlays:
         """Change an overlay's state, with its event. Raises Conflict if its state is not ``before``."""
         table = tables.overlay
         with self._database.write() as connection:
-            row = environment_row(connection, environment, lock=True)
+            row = environment_row(connection, environment, lock=True, mirrored=True)
             stored = _read(connection, row, id)
             if stored.state != before:
                 raise Conflict(f"overlay {id} is {stored.state}: only {before} overlays can be {state}")
             if state == "accepted":
-                _require_room(connection, row, stored)
+                require_room(connection, row, stored)
             values: dict[str, Any] = {"state": state, "decided_by": checked_text(author, "an author"), "decided": now}
             connection.execute(update(table).where(table.c.id == id).values(values))
             decided = _read(connection, row, id)
             if (event := EVENTS.get(state)) is not None:
-                _append_event(connection, row, decided, event, author, now)
+                append_overlay_event(connection, row, decided, event, author, now)
             return decided
 
     def move_end(self, environment: str, id: str, expires: datetime, author: str, now: datetime) -> Overlay:
         """Change the end of an accepted overlay, with an event: robots get it anew. Raises NotFound, Conflict."""
         table = tables.overlay
         with self._database.write() as connection:
-            row = environment_row(connection, environment, lock=True)
+            row = environment_row(connection, environment, lock=True, mirrored=True)
             stored = _read(connection, row, id)
             if stored.state != "accepted":
                 raise Conflict(f"overlay {id} is {stored.state}: only the end of accepted overlays can be changed")
@@ -157,7 +162,7 @@ class Overlays:
                 return stored
             connection.execute(update(table).where(table.c.id == id).values(expires=expires))
             moved = _read(connection, row, id)
-            _append_event(connection, row, moved, "overlay.accepted", author, now)
+            append_overlay_event(connection, row, moved, "overlay.accepted", author, now)
             return moved
 
     def end_due(self, now: datetime) -> None:
@@ -174,14 +179,16 @@ class Overlays:
             due = connection.execute(query).all()
         for due_row in due:
             with suppress(NotFound), self._database.write(upkeep=True) as connection:
-                row = environment_row(connection, due_row.environment, lock=True)
+                row = environment_row(connection, due_row.environment, lock=True, mirrored=True)
                 stored = _read(connection, row, due_row.id)
                 if stored.state != due_row.state or stored.expires > now:
                     continue  # another process was faster, or the expiry was updated
                 state: OverlayState = "expired" if stored.state == "pending" else "ended"
                 event: EventType = "overlay.expired" if stored.state == "pending" else "overlay.ended"
                 connection.execute(update(table).where(table.c.id == due_row.id).values(state=state, decided=now))
-                _append_event(connection, row, _read(connection, row, due_row.id), event, stored.decided_by or "", now)
+                ended = _read(connection, row, due_row.id)
+                # a mirror's centre ends it by itself
+                append_overlay_event(connection, row, ended, event, stored.decided_by or "", now, to_centre=False)
 
     def note_kept(self, environment: str, id: str, version: int) -> Overlay:
         """Record the version that made an overlay permanent. It stays in force until its end."""
@@ -192,7 +199,7 @@ class Overlays:
             return _read(connection, row, id)
 
 
-_closure_cache: OrderedDict[tuple[str, int], Closures] = OrderedDict()
+_closure_cache: OrderedDict[tuple[str, int, int], Closures] = OrderedDict()
 _closure_cache_lock = threading.Lock()
 MAX_CACHED_CLOSURES: Final = 256
 
@@ -200,13 +207,14 @@ MAX_CACHED_CLOSURES: Final = 256
 def read_closures(connection: Connection, environment: Row[Any]) -> Closures:
     """Read the closures in force of an environment, in the caller's transaction.
 
-    They are cached by the sequence of the event that last changed them, which is in the environment's row.
+    They are cached by the sequence of the event that last changed them, which is in the environment's row, and in a
+    mirror by the number of its own changes.
     """
-    key = (str(environment.id), int(environment.closures_sequence))
+    key = (str(environment.id), int(environment.closures_sequence), int(environment.edge_sequence))
     with _closure_cache_lock:
         closures = _closure_cache.get(key)
     if closures is None:
-        closures = _read_closures(connection, environment)
+        closures = read_closures_anew(connection, environment)
         with _closure_cache_lock:
             _closure_cache[key] = closures
             while len(_closure_cache) > MAX_CACHED_CLOSURES:
@@ -214,14 +222,15 @@ def read_closures(connection: Connection, environment: Row[Any]) -> Closures:
     return closures
 
 
-def _read_closures(connection: Connection, environment: Row[Any]) -> Closures:
+def read_closures_anew(connection: Connection, environment: Row[Any]) -> Closures:
+    """Read the closures in force without the cache, in a transaction that changes them."""
     table = tables.overlay
     query = select(table).where(table.c.environment_id == environment.id, table.c.state == "accepted")
     rows = connection.execute(query.order_by(table.c.id))
-    return Closures(tuple(_as_overlay(environment.name, row).closure for row in rows))
+    return Closures(tuple(as_overlay(environment.name, row).closure for row in rows))
 
 
-def _require_room(connection: Connection, environment: Row[Any], overlay: Overlay) -> None:
+def require_room(connection: Connection, environment: Row[Any], overlay: Overlay) -> None:
     """Raise Conflict if another closure would make manifests too large."""
     table = tables.overlay
     in_force = select(table.c.polygon).where(table.c.environment_id == environment.id, table.c.state == "accepted")
@@ -258,20 +267,32 @@ def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overla
     return None
 
 
-def _append_event(
-    connection: Connection, environment: Row[Any], overlay: Overlay, event: EventType, author: str, now: datetime
+def append_overlay_event(
+    connection: Connection,
+    environment: Row[Any],
+    overlay: Overlay,
+    event: EventType,
+    author: str,
+    now: datetime,
+    *,
+    to_centre: bool = True,
 ) -> None:
     """Append the event of a change of state. The caller has locked the environment's row.
 
-    version and root are the head's.
+    version and root are the head's. to_centre: in a mirror, whether its centre has to be told of the change.
     """
-    sequence = environment.sequence + 1
+    sequence, edge = environment.sequence + 1, None
     owner = tables.environment
     values: dict[str, Any] = {"sequence": sequence}
     more: dict[str, Any] = {"overlay": overlay.as_dict()}
     if event in CHANGE_CLOSURES:
         values["closures_sequence"] = sequence
-        more["overlays_digest"] = _read_closures(connection, environment).digest
+        more["overlays_digest"] = read_closures_anew(connection, environment).digest
+    if environment.centre is not None:
+        sequence, edge = environment.sequence, environment.edge_sequence + 1
+        values = {"edge_sequence": edge}
+        if to_centre:
+            _queue_for_centre(connection, environment, overlay, event, author, now)
     connection.execute(update(owner).where(owner.c.id == environment.id).values(values))
     obstruction = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
     outbox.append_event(
@@ -287,8 +308,17 @@ def _append_event(
         message=f"{obstruction}, reported as {overlay.kind}" + (f": {overlay.detail}" if overlay.detail else ""),
         author=author,
         time=now,
+        edge=edge,
         **more,
     )
+
+
+def _queue_for_centre(
+    connection: Connection, environment: Row[Any], overlay: Overlay, event: EventType, author: str, now: datetime
+) -> None:
+    change = {"event": event, "overlay": overlay.as_dict(), "author": author, "time": rfc3339(now)}
+    queued = {"environment_id": environment.id, "overlay_id": overlay.id, "body": change}
+    connection.execute(insert(tables.edge_change).values(queued))
 
 
 def _read(connection: Connection, environment: Row[Any], id: str) -> Overlay:
@@ -297,10 +327,11 @@ def _read(connection: Connection, environment: Row[Any], id: str) -> Overlay:
     row = connection.execute(query).one_or_none()
     if row is None:
         raise NotFound(f"{environment.name} has no overlay {id[:80]!r}")
-    return _as_overlay(environment.name, row)
+    return as_overlay(environment.name, row)
 
 
-def _as_overlay(environment: str, row: Row[Any]) -> Overlay:
+def as_overlay(environment: str, row: Row[Any]) -> Overlay:
+    """Convert a row into a value."""
     return Overlay(
         environment=environment,
         kind=row.kind,

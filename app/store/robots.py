@@ -173,6 +173,10 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     again = row is not None and all(getattr(row, name) == value for name, value in report_columns.items())
     if row is not None and again and _is_recent(connection, received, row):
         return None
+    if row is not None and received.late and received.time < row.time:
+        if not again and not _is_in_history(connection, environment_id, received, report_columns):
+            _remember(connection, environment_id, received, report_columns)
+        return None
     if row is not None and not again and _is_duplicate_report(connection, environment_id, received, report_columns):
         connection.execute(
             update(table).where(*conditions).values(time=received.time, vouched=row.vouched or received.vouched)
@@ -249,6 +253,20 @@ def _is_duplicate_report(
         table.c.environment_id == environment_id,
         table.c.robot == received.robot,
         table.c.said == received.report.reported_at,
+        *(table.c[name].is_not_distinct_from(value) for name, value in report_columns.items()),
+    )
+    return connection.execute(query.limit(1)).scalar_one_or_none() is not None
+
+
+def _is_in_history(
+    connection: Connection, environment_id: str, received: ReceivedReport, report_columns: dict[str, Any]
+) -> bool:
+    """Return whether a late report was handed on before."""
+    table = tables.robot_history
+    query = select(table.c.id).where(
+        table.c.environment_id == environment_id,
+        table.c.robot == received.robot,
+        table.c.time == received.time,
         *(table.c[name].is_not_distinct_from(value) for name, value in report_columns.items()),
     )
     return connection.execute(query.limit(1)).scalar_one_or_none() is not None

@@ -23,11 +23,15 @@ from app.store.content import ContentReader
 from app.store.database import Database
 from app.store.documents import StoredDocument
 from app.store.drafts import Drafts
+from app.store.edge_changes import EdgeChanges
 from app.store.environments import Environments
 from app.store.garbage_collection import GarbageCollector
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.made_maps import MadeMaps
+from app.store.mirror_source import MirrorSource
+from app.store.mirror_state import Mirrors
+from app.store.mirror_target import MirrorTarget
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
@@ -78,6 +82,10 @@ class Store:
         self.overlays = Overlays(database)
         self.robots = Robots(database)
         self.robot_counts = RobotCounts(database)
+        self.mirror_source = MirrorSource(database, self.chunks)
+        self.mirror_target = MirrorTarget(database)
+        self.mirrors = Mirrors(database)
+        self.edge_changes = EdgeChanges(database)
         self.events = Outbox(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)
@@ -174,6 +182,10 @@ class Store:
     def document(self, name: str) -> StoredDocument:
         """Return a document in the database, for what several servers share."""
         return StoredDocument(self._database, self.generation, name)
+
+    def now(self) -> datetime:
+        """Return the present by the store's clock."""
+        return self._database.now()
 
     def epoch(self) -> int:
         """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""

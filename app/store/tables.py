@@ -26,7 +26,7 @@ from sqlalchemy import (
     true,
 )
 
-from app.store import fleet_tables, table_base
+from app.store import fleet_tables, mirror_tables, table_base
 from app.store.column_types import Grams, UtcDateTime, WkbGeometry, binary_text
 from app.store.table_base import POSTGRESQL, box, environment_key
 
@@ -34,6 +34,7 @@ metadata = table_base.metadata
 
 robot, robot_history = fleet_tables.robot, fleet_tables.robot_history
 robot_tally, presence = fleet_tables.robot_tally, fleet_tables.presence
+mirror, delegation, edge_change = mirror_tables.mirror, mirror_tables.delegation, mirror_tables.edge_change
 
 SEARCH_STALE = "(search_sequence = sequence AND search_updated = updated) IS NOT TRUE"
 
@@ -62,6 +63,9 @@ environment = Table(
     Column("search_sequence", BigInteger, nullable=False, server_default="-1"),
     Column("search_updated", UtcDateTime, nullable=True),
     Column("search_stale", Boolean, Computed(SEARCH_STALE), index=True),
+    Column("centre", Text, nullable=True),
+    Column("centre_epoch", BigInteger, nullable=True),
+    Column("edge_sequence", BigInteger, nullable=False, server_default="0"),
 )
 """Environments. head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event
 that changed the closures in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be
@@ -70,6 +74,9 @@ computed from the head before it is read.
 search_version: the version that ``search_item`` shows; negative while there is none. search_sequence, search_updated:
 ``sequence`` and ``updated`` at that time; every change raises one of them. index_stale, search_stale: whether ``place``
 and ``search_item`` may be behind, as the database computes it.
+
+centre, centre_epoch: URL and epoch of the server that a mirror follows, NULL for an environment of this server.
+edge_sequence: number of changes of closures that a mirror made by itself.
 """
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
@@ -452,10 +459,8 @@ overlay = Table(
     Index("ix_overlay_environment", "environment_id", "state"),
     Index("ix_overlay_expires", "state", "expires"),
 )
-"""Overlays. expires: end of the obstruction.
-
-version: the one that made it permanent; in rows of releases before closures,
-the version that it was put into.
+"""Overlays. expires: end of the obstruction. version: the one that made it permanent; in rows of releases before
+closures, the version that it was put into.
 """
 
 place = Table(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ EDIT = "edit"
 
 Information = Literal["raw", "derived", "template", "generated"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
-Role = Literal["viewer", "robot", "editor", "admin"]
+Role = Literal["viewer", "robot", "mirror", "editor", "admin"]
 
 Box = tuple[float, float, float, float]
 """A box (minimum x, minimum y, maximum x, maximum y), or in degrees (west, south, east, north).
@@ -530,6 +530,18 @@ class FeatureHit:
     key: PartKey
     id: str
     box: Box = field(default=(0.0, 0.0, 0.0, 0.0))
+
+
+class Position(NamedTuple):
+    """Position of a manifest in its channel's history.
+
+    sequence: of the event that led to it. edge: number of changes that a mirror made by itself until then. epoch: of
+    the server that a mirror follows; None: of this server.
+    """
+
+    sequence: int
+    edge: int = 0
+    epoch: int | None = None
 
 
 def rfc3339(time: datetime) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from backports import zstd
 
-from app.agent import signed_manifest
+from app.agent import signatures
 from app.agent.agent import Agent, AgentOptions
 from app.errors import Untrusted
 from app.signing import Keys, key_id
@@ -303,18 +303,18 @@ def test_endorsements_are_followed_back_to_the_trusted_key(tmp_path: Path) -> No
     name, signature = keys.sign(b"data")
     header = f"{name}:{base64.b64encode(signature).decode()}"
     listed = [k.as_dict() for k in keys.public()]
-    key = signed_manifest.verify_signature(b"data", header, first.public, None, lambda: listed)
+    key = signatures.verify_signature(b"data", header, first.public, None, lambda: listed)
     assert key_id(key) == name == keys.public()[0].id
-    assert signed_manifest.verify_signature(b"data", header, None, first.id, lambda: listed) == key
+    assert signatures.verify_signature(b"data", header, None, first.id, lambda: listed) == key
     assert (
-        signed_manifest.verify_signature(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed)
+        signatures.verify_signature(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed)
         == key
     )
     for left in (0, 1, 6):  # a link of the chain is missing
         with pytest.raises(Untrusted, match=r"does not endorse|does not list"):
-            signed_manifest.verify_signature(
+            signatures.verify_signature(
                 b"data", header, first.public, None, lambda n=left: listed[:n] + listed[n + 1 :]
             )
     circle = [{**listed[0], "endorsed_by": listed[0]["id"]}]
     with pytest.raises(Untrusted, match="does not endorse"):
-        signed_manifest.verify_signature(b"data", header, first.public, None, lambda: circle)
+        signatures.verify_signature(b"data", header, first.public, None, lambda: circle)

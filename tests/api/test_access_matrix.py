@@ -21,8 +21,9 @@ FARM, ABSENT, OTHERS = "farm", "farm-absent", "street*"
 """Environment, an unused name, and the pattern of the limited tokens, which match neither."""
 
 INCLUDES: dict[str, set[str]] = {
-    "viewer": {"viewer", "robot", "editor", "admin"},
+    "viewer": {"viewer", "robot", "mirror", "editor", "admin"},
     "robot": {"robot", "editor", "admin"},
+    "mirror": {"mirror", "admin"},
     "editor": {"editor", "admin"},
     "admin": {"admin"},
 }
@@ -58,6 +59,7 @@ V = f"{E}/versions/{{v}}"
 STATUS = {"environment": "{env}", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
 STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]}
 NAMED = "environment={env}"
+NONCE = f"nonce={'n' * 16}"
 OGC_PATHS = ("", "/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
              "/collections/{collection}/schema", "/collections/{collection}/queryables",
              "/collections/{collection}/geotiff",
@@ -111,6 +113,17 @@ ROWS = [
     Row(f"DELETE {API}/jobs/{{job}}", "admin", "job"),
     Row(f"PATCH {E}", "editor", "environment", {"datum": {"latitude": 53.2, "longitude": -0.5}}),
     Row(f"PATCH {E}", "admin", "environment", {"title": "x"}),
+    Row(f"GET {API}/mirror", "mirror", "filtered", query=NONCE),
+    Row(
+        f"POST {API}/mirror/delegations",
+        "mirror",
+        "environment",
+        {"public_key": "A" * 43 + "=", "environments": ["{env}"]},
+    ),
+    Row(f"GET {E}/mirror", "mirror", "environment", query=NONCE),
+    Row(f"POST {E}/mirror/content", "mirror", "environment", {"after": 0, "last": 0}),
+    Row(f"POST {E}/mirror/reports", "mirror", "environment", {}),
+    Row(f"GET {API}/keys", "viewer", "environment", query=NAMED),
     *rows(
         "environment",
         viewer=f"GET {E}, GET {E}/versions, GET {V}, GET {V}/sources, GET {V}/sources/{{name}}, GET {V}/layers, "
@@ -177,7 +190,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         past = datetime.now(UTC) - timedelta(seconds=1)
         bearer = {"garbage": "x" * 43, "expired": store.tokens.create("expired", "admin", expires=past)[1]}
         for pattern, suffix in ((None, ""), (OTHERS, LIMITED)):
-            for name, robot in (("viewer", None), ("robot", "r1"), ("robot", "r2"), ("editor", None), ("admin", None)):
+            for name, robot in (
+                ("viewer", None),
+                ("robot", "r1"),
+                ("robot", "r2"),
+                ("mirror", None),
+                ("editor", None),
+                ("admin", None),
+            ):
                 caller = f"{name} {robot}" if robot else name
                 bearer[caller + suffix] = store.tokens.create(caller, name, pattern, robot)[1]
         revoked, bearer["revoked"] = store.tokens.create("revoked", "admin")

@@ -72,7 +72,8 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
         "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete", "/api/v1/tokens/{id}/sign-in-code": "post",
         "/api/v1/session": "get post delete", "/api/v1/page": "get", "/api/v1/search": "get",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
-        "/api/v1/stored/{kind}/{sha256}": "get",
+        "/api/v1/stored/{kind}/{sha256}": "get", "/api/v1/mirror": "get", "/api/v1/mirror/delegations": "post",
+        f"{e}/mirror": "get", f"{e}/mirror/content": "post", f"{e}/mirror/reports": "post",
     }  # fmt: skip
     ogc = ("/", "/conformance", "/api", "/api.html", "/crs/local", "/collections", "/collections/{collection}",
            "/collections/{collection}/items", "/collections/{collection}/items/{feature}",

@@ -19,7 +19,8 @@ from typing import Any
 
 import httpx
 
-from app.agent.signed_manifest import Untrusted, key_id, verify_signature
+from app.agent.signatures import key_id, verify_signature
+from app.errors import Untrusted
 from app.events.credentials import ZenohCredentials
 from app.events.router import Router
 from tests.agent.conftest import network

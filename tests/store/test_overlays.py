@@ -13,6 +13,7 @@ from app.model.closures import NO_CLOSURES
 from app.store import overlays
 from app.store.fleet_values import Overlay
 from app.store.store import Store
+from app.store.values import Position
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 SQUARE = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1.5], [0, 0]]]}
@@ -65,15 +66,20 @@ def test_accepted_overlay_is_in_force_until_end_with_events(farm: Store):
         farm.overlays.decide("farm", one.id, "pending", "rejected", "bob", NOW)
     in_force = farm.overlays.closures("farm")
     assert [c.id for c in in_force.items] == [one.id]
-    assert farm.channels.target("farm", "latest") == (replace(farm.versions.get("farm"), closures=in_force), before + 1)
-    assert farm.channels.target("farm", 0) == (farm.versions.get("farm", 0), 1), "a version's number is history"
+    assert farm.channels.target("farm", "latest") == (
+        replace(farm.versions.get("farm"), closures=in_force),
+        Position(before + 1),
+    )
+    assert farm.channels.target("farm", 0) == (farm.versions.get("farm", 0), Position(1)), (
+        "a version's number is history"
+    )
     assert farm.channels.target("farm", 0, "apply")[0].closures == in_force
     end = NOW + timedelta(seconds=60)
     farm.overlays.end_due(NOW)
     assert farm.overlays.get("farm", one.id).state == "accepted"
     farm.overlays.end_due(end)
     assert (farm.overlays.get("farm", one.id).state, farm.overlays.closures("farm").items) == ("ended", ())
-    assert farm.channels.target("farm", "latest")[1] == before + 2
+    assert farm.channels.target("farm", "latest")[1] == Position(before + 2)
     events = [(e.body["type"], e.body.get("overlays_digest")) for e in farm.events.page("farm", before)]
     assert events == [("overlay.accepted", in_force.digest), ("overlay.ended", NO_CLOSURES.digest)]
     again, new = farm.overlays.add(blocked())

@@ -30,11 +30,12 @@ from app.errors import Denied, Unauthenticated
 from app.store.sessions import Session
 from app.store.values import Role, Token, Writer
 
-RequiredRole = Literal["viewer", "robot", "editor", "admin"]
+RequiredRole = Literal["viewer", "robot", "mirror", "editor", "admin"]
 
 _CAN: dict[RequiredRole, frozenset[Role]] = {
-    "viewer": frozenset({"viewer", "robot", "editor", "admin"}),
+    "viewer": frozenset({"viewer", "robot", "mirror", "editor", "admin"}),
     "robot": frozenset({"robot", "editor", "admin"}),
+    "mirror": frozenset({"mirror", "admin"}),
     "editor": frozenset({"editor", "admin"}),
     "admin": frozenset({"admin"}),
 }
@@ -466,6 +467,9 @@ viewer, robot, editor, admin = RequireRole("viewer"), RequireRole("robot"), Requ
 Viewer = Annotated[Principal, Depends(viewer)]
 RobotRole = Annotated[Principal, Depends(robot)]
 Editor = Annotated[Principal, Depends(editor)]
+MirrorRole = Annotated[Principal, Depends(RequireRole("mirror"))]
+"""Role of a server that follows this one."""
+
 Admin = Annotated[Principal, Depends(admin)]
 ServerViewer = Annotated[Principal, Depends(RequireRole("viewer", everywhere=True))]
 ServerAdmin = Annotated[Principal, Depends(RequireRole("admin", everywhere=True))]

@@ -55,6 +55,7 @@ class ApiOptions:
     zenoh_advertise: str = ""
     ros2: bool = False
     manifest_seconds: int = 86_400
+    delegation_seconds: int = 604_800
     public_url: str | None = None
     basemap_url: str | None = None
     basemap_attribution: str = ""

@@ -55,8 +55,9 @@ Stores the maps of environments, versioned in canonical layers, and exports them
 - **Coordinates** are `longitude, latitude` in GeoJSON, and `latitude, longitude` in query parameters (`LAT,LON`).
 - **Access** requires `Authorization: Bearer <token>`, or in a browser a session (`POST /api/v1/session`); maps can also
   be read with a signed link (`POST …/links`).
-- **Roles**: `viewer` reads; `robot` also reports the status of the token's robot, and obstructions; `editor` also
-  uploads, edits, converts, moves channels and sets datums; `admin` may do everything.
+- **Roles**: `viewer` reads; `robot` also reports the status of the token's robot, and obstructions; `mirror` is for a
+  server that follows this one; `editor` also uploads, edits, converts, moves channels and sets datums; `admin` may do
+  everything.
 """
 
 
@@ -83,6 +84,7 @@ TAGS = {
     "templates": "Values that are filled in if a format needs more than the layers contain.",
     "formats": "File formats that can be read, exported and converted.",
     "jobs": "Conversions that outlive their request.",
+    "mirrors": "For servers that follow this one.",
     "stored data": "Stored bytes, for the repair of another server.",
     "tokens": "Access tokens.",
     "session": "Sign-in of browsers.",

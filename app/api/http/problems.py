@@ -71,6 +71,7 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     errors.MissingDatum: (422, "Missing datum"),
     errors.Ambiguous: (409, "Ambiguous"),
     errors.Conflict: (409, "Conflict"),
+    errors.Mirrored: (409, "Changed elsewhere"),
     errors.StaleParent: (412, "The head has moved"),
     Throttled: (429, "Too many failures"),
     errors.Denied: (403, "Denied"),

@@ -4,7 +4,7 @@ import { ApiError, api, ask, type Role, type Schemas, unauthenticated } from "./
 
 export type Session = Schemas["SessionOut"];
 
-const ROLES: Role[] = ["viewer", "robot", "editor", "admin"];
+const ROLES: Role[] = ["viewer", "mirror", "robot", "editor", "admin"];
 
 /** undefined: not yet asked; null: nobody is signed in. */
 export const session = signal<Session | null | undefined>(undefined);

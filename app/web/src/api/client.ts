@@ -12,7 +12,7 @@ export type LayerPart = Schemas["LayerOut"];
 export type Channel = Schemas["ChannelOut"];
 export type Robot = Schemas["RobotOut"];
 export type Problem = Schemas["ProblemOut"];
-export type Role = "viewer" | "robot" | "editor" | "admin";
+export type Role = "viewer" | "mirror" | "robot" | "editor" | "admin";
 
 /** Whether the server answered the last request. */
 export const online = signal(true);

@@ -7,6 +7,7 @@ export type Token = Schemas["TokenOut"];
 export const ROLES: [Role, string][] = [
   ["viewer", "Viewer: reads"],
   ["robot", "Robot: reads, reports its status"],
+  ["mirror", "Mirror: another server that follows this one"],
   ["editor", "Editor: changes maps, promotes"],
   ["admin", "Administrator: all, also tokens"],
 ];
