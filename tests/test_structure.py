@@ -75,6 +75,7 @@ WRITERS = {
     "app/events/security.py": "files of passwords, which the router's process reads",
     "app/ingest/online.py": "a cache by address: nobody knows the hash of what a provider will send",
     "app/main.py": "creates the data folder and the folder of Prometheus's client",
+    "app/mirror/content.py": "fetched files, in a workspace",
     "app/native.py": "compiled code, outside of the data folder",
     "app/review/graph_rules.py": "no file: a method of the same name",
     "app/signing.py": "a private key in a file of its own, as operators back it up and remove it",
