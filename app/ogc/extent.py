@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from starlette.concurrency import run_in_threadpool
+
 from app.convert.extents import bounds_in_both_frames
 from app.ogc.service import Service
 from app.store.extent import join
@@ -13,8 +15,12 @@ def part_box(service: Service, entry: PartEntry) -> Box | None:
     return bounds_in_both_frames(entry, service.version.datum, service.services.tiles.header).get("wgs84")
 
 
-def site_box(service: Service) -> Box | None:
+async def site_box(service: Service) -> Box | None:
     """Return the box in degrees around a version with a datum, None without coordinates."""
+    return await run_in_threadpool(_site_box, service)
+
+
+def _site_box(service: Service) -> Box | None:
     if service.version.datum is None:
         return None
     boxes = [part_box(service, entry) for entry in service.version.parts if entry.key.layer != "resources"]

@@ -59,7 +59,7 @@ async def get_landing_page(service: Service, f: Representation = None) -> Respon
     credits_ = _attribution(service)
     if credits_:
         document["attribution"] = credits_
-    box = site_box(service)
+    box = await site_box(service)
     if service.version.datum is not None:
         document["crs"] = list(reference_systems(service, service.version.datum))
     if box is not None:

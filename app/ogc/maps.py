@@ -181,7 +181,7 @@ def _background(wanted: _Wanted) -> Colour | None:
 
 async def _extent(service: Service, collection: str | None) -> Box:
     """Return the box of the content in degrees, a little larger. Raises NotFound if nothing has a position."""
-    box = site_box(service)
+    box = await site_box(service)
     if collection is not None:
         (entry,) = [one for one in await all_collections(service) if one.id == collection]
         box = entry.bbox or box

@@ -167,7 +167,7 @@ async def _listed(service: Service, kind: Kind, collection: str | None) -> tuple
             raise _no_vector_tiles_error(collection)
         return entry.title, entry.bbox, [entry]
     shown = [one for one in entries if kind == "map" or one.id in TITLES]
-    return service.title, site_box(service), shown
+    return service.title, await site_box(service), shown
 
 
 def _no_vector_tiles_error(collection: str) -> NotFound:

@@ -99,7 +99,7 @@ async def capabilities(service: Service) -> bytes:
     _add(about, "ows:ServiceType", "OGC WMTS")
     _add(about, "ows:ServiceTypeVersion", "1.0.0")
     contents = _add(root, "Contents")
-    _layer(contents, service, SITE, service.title, "Everything on the default level.", site_box(service))
+    _layer(contents, service, SITE, service.title, "Everything on the default level.", await site_box(service))
     for entry in await all_collections(service):
         _layer(contents, service, entry.id, entry.title, entry.description, entry.bbox)
     _tile_matrix_set(contents, service)
