@@ -21,7 +21,7 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.upload_reader import UploadHints
-from tests.bench import closures, derived, events, floors, generate, http, large, networks, ogc, scale
+from tests.bench import closures, derived, events, floors, generate, http, large, networks, ogc, servers
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -239,12 +239,12 @@ def main() -> int:
             "generate",
             "derived",
             "ogc",
-            "scale",
+            "servers",
         ],
         help="one of the tables",
     )
     arguments = parser.parse_args()
-    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale"):
+    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "servers"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
@@ -254,13 +254,13 @@ def main() -> int:
     event_rows = events.rows() if arguments.only in (None, "events") else []
     closed = closures.rows() if arguments.only in (None, "closures") else []
     ogc_rows = ogc.rows(arguments.tries * 3) if arguments.only in (None, "ogc") else []
-    scale_rows = scale.rows() if arguments.only in (None, "scale") else []
+    server_rows = servers.rows() if arguments.only in (None, "servers") else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
         tables |= {"closures": closed, "ogc": ogc_rows, "generate": generation_rows, "derived": huge}
-        tables |= {"scale": scale_rows}
+        tables |= {"servers": server_rows}
         print(json.dumps(tables, indent=2))
     else:
         console = Console(width=110)
@@ -285,7 +285,7 @@ def main() -> int:
             "closures": closed,
             "OGC API": ogc_rows,
             "generated": generation_rows,
-            "several servers": scale_rows,
+            "several servers": server_rows,
         }
         for title, rows in ratios.items():
             if not rows:
@@ -325,7 +325,18 @@ def main() -> int:
         0
         if all(
             r["holds"]
-            for rows in (converted, served, paths, big, event_rows, closed, generation_rows, huge, ogc_rows, scale_rows)
+            for rows in (
+                converted,
+                served,
+                paths,
+                big,
+                event_rows,
+                closed,
+                generation_rows,
+                huge,
+                ogc_rows,
+                server_rows,
+            )
             for r in rows
         )
         else 1
