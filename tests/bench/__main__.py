@@ -241,7 +241,7 @@ def main() -> int:
             "ogc",
             "servers",
         ],
-        help="one of the tables",
+        help="one of the tables; servers, which needs PostgreSQL, only if it is named",
     )
     arguments = parser.parse_args()
     if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "servers"):
@@ -254,7 +254,7 @@ def main() -> int:
     event_rows = events.rows() if arguments.only in (None, "events") else []
     closed = closures.rows() if arguments.only in (None, "closures") else []
     ogc_rows = ogc.rows(arguments.tries * 3) if arguments.only in (None, "ogc") else []
-    server_rows = servers.rows() if arguments.only in (None, "servers") else []
+    server_rows = servers.rows() if arguments.only == "servers" else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     if arguments.json:

@@ -13,6 +13,7 @@ import stat
 from collections.abc import Iterator
 
 import httpx
+import psycopg
 import pytest
 
 from tests.docker.scale_site import (
@@ -172,6 +173,25 @@ def test_events_go_on_when_a_router_stops_and_comes_back(site: Site) -> None:
             late = Listener(other, "fleetmap/mesh/events")
             site.upload(site.https, "mesh", 0.5)
             late.wait(lambda e: sorted(e.sequences()) == [1, 2, 3])
+
+
+def test_all_recover_when_the_database_is_restarted(site: Site, postgres_cluster: Cluster) -> None:
+    create(site, "restart")
+    a, b, _ = site.servers.values()
+    postgres_cluster.kill()
+    assert eventually(lambda: (answer := a.get("/readyz")).status_code == 503 and answer).headers["retry-after"]
+    assert b.get("/api/v1/environments/restart").status_code == 503
+    postgres_cluster.restart()
+    for name in (*SERVERS, *WORKERS):
+        site.wait_ready(name)
+    site.upload(site.https, "restart", 0.0)
+    site.leader()
+    with psycopg.connect(site.compose.database_url.replace("+psycopg", ""), autocommit=True) as connection:
+        listening = (
+            "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND query ILIKE 'LISTEN%'"
+            " AND application_name = 'fleetmap worker'"
+        )
+        eventually(lambda: connection.execute(listening).fetchone() == (len(WORKERS),))
 
 
 def test_services_share_no_folder_and_log_no_secret(site: Site) -> None:
