@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -180,13 +181,17 @@ class _Connector(procrastinate.PsycopgConnector):
 
     async def listen_notify(self, on_notification: Notify, channels: Iterable[str]) -> None:
         """Listen until cancelled, also after the connection was lost."""
-        names = list(channels)
+        names, outage = list(channels), False
         while True:
+            start = time.monotonic()
             try:
                 await super().listen_notify(on_notification, names)
             except exceptions.ConnectorException as error:
-                reason = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
-                log.warning("worker: not notified of new tasks, polls meanwhile and will retry (reason=%s)", reason)
+                outage = outage and time.monotonic() - start < STALLED_SECONDS
+                if not outage:  # once for each
+                    reason = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
+                    log.warning("worker: not notified of new tasks, polls meanwhile and will retry (reason=%s)", reason)
+                outage = True
                 await asyncio.sleep(RETRY_SECONDS)
 
 

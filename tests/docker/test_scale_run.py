@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import itertools
+import json
 import signal
 import stat
 from collections.abc import Iterator
@@ -50,7 +51,10 @@ def create(site: Site, name: str) -> None:
 
 
 def test_proxy_serves_https_and_names_the_client(site: Site) -> None:
-    create(site, "links")
+    forged = {"X-Forwarded-For": "203.0.113.9", "X-Forwarded-Proto": "http"}
+    site.call(site.https, "POST", "environments", json={"name": "links"}, headers=forged)
+    entries = site.call(site.https, "GET", "audit?environment=links")
+    assert [entry["address"] for entry in entries] == ["127.0.0.1"]
     document = site.https.get("/ogc/links/").json()
     assert {httpx.URL(link["href"]).scheme for link in document["links"]} == {"https"}
     assert site.https.get("/api/v1/keys", headers={"Authorization": "Bearer wrong"}).status_code == 401
@@ -150,6 +154,9 @@ def test_event_reaches_a_robot_through_the_other_router(site: Site) -> None:
         listener = Listener(robot, "fleetmap/yard/events")
         site.upload(site.https, "yard", 0.0)
         listener.wait(lambda e: e.sequences() == [1, 2])
+        with site.https.stream("GET", "/api/v1/events", params={"environment": "yard", "since": 0}) as stream:
+            lines = stream.iter_lines()  # the proxy passes each on at once: the stream does not end
+            assert next(json.loads(line[5:])["sequence"] for line in lines if line.startswith("data:")) == 1
         robot.put("fleetmap/yard/events", b'{"sequence": 3}')  # of another robot's: the routers drop it
         with site.robot_session("router-1") as other:
             late = Listener(other, "fleetmap/yard/events")
