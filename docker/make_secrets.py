@@ -81,6 +81,8 @@ def make_scale(folder: Path, hosts: list[str]) -> list[str]:
 
     hosts: names and addresses by which robots and browsers reach this machine.
     """
+    if sys.version_info < (3, 10):  # noqa: UP036  runs where the containers run
+        raise SystemExit("--scale requires Python 3.10 or newer")
     written = _write_missing(
         folder,
         {

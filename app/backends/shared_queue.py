@@ -13,13 +13,15 @@ import asyncio
 import contextlib
 import json
 import logging
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any, Final
 
 import procrastinate
 from procrastinate import exceptions, jobs
+from procrastinate.connector import Notify
 from procrastinate.worker import Worker
 from psycopg.conninfo import make_conninfo
 from sqlalchemy import Connection, text
@@ -174,6 +176,25 @@ class _GiveBack(procrastinate.BaseRetryStrategy):
         return None
 
 
+class _Connector(procrastinate.PsycopgConnector):
+    """Connections of a worker. Procrastinate listens for new tasks on one, and would never again once it is lost."""
+
+    async def listen_notify(self, on_notification: Notify, channels: Iterable[str]) -> None:
+        """Listen until cancelled, also after the connection was lost."""
+        names, outage = list(channels), False
+        while True:
+            start = time.monotonic()
+            try:
+                await super().listen_notify(on_notification, names)
+            except exceptions.ConnectorException as error:
+                outage = outage and time.monotonic() - start < STALLED_SECONDS
+                if not outage:  # once for each
+                    reason = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[0]
+                    log.warning("worker: not notified of new tasks, polls meanwhile and will retry (reason=%s)", reason)
+                outage = True
+                await asyncio.sleep(RETRY_SECONDS)
+
+
 class QueueWorker:
     """Takes tasks from the queue, ``slots`` at once.
 
@@ -220,9 +241,7 @@ class QueueWorker:
         parsed = make_url(self._url).set(drivername="postgresql+psycopg")
         options: dict[str, Any] = dict(parsed.get_dialect()().create_connect_args(parsed)[1])
         options |= {"application_name": "fleetmap worker", "connect_timeout": 5, "keepalives_idle": 2}
-        connector = procrastinate.PsycopgConnector(
-            conninfo=make_conninfo(**options), min_size=1, max_size=self._slots + 4, timeout=10.0
-        )
+        connector = _Connector(conninfo=make_conninfo(**options), min_size=1, max_size=self._slots + 4, timeout=10.0)
         queue_app = procrastinate.App(connector=connector)
         queue_app.task(name=TASK, retry=_GiveBack())(self._perform)
         async with queue_app.open_async():

@@ -242,7 +242,7 @@ def main() -> int:
             "scale",
             "servers",
         ],
-        help="one of the tables; scale, which takes half an hour, only if it is named",
+        help="one of the tables; scale, which takes half an hour, and servers, which needs PostgreSQL, only if they are named",
     )
     arguments = parser.parse_args()
     if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale", "servers"):
@@ -255,7 +255,7 @@ def main() -> int:
     event_rows = events.rows() if arguments.only in (None, "events") else []
     closed = closures.rows() if arguments.only in (None, "closures") else []
     ogc_rows = ogc.rows(arguments.tries * 3) if arguments.only in (None, "ogc") else []
-    server_rows = servers.rows() if arguments.only in (None, "servers") else []
+    server_rows = servers.rows() if arguments.only == "servers" else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     scale_rows = scale.rows() if arguments.only == "scale" else []

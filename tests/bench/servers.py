@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import signal
 import tempfile
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import httpx
 
+from app import native
 from tests.docker.scale_site import SERVERS, Load, ReadinessWatch, Site, fetch_round_robin, read_delays, running_site
 from tests.docker.schema_upgrade import upgrade_to_later_revision
 from tests.postgres import running_cluster
@@ -25,6 +27,9 @@ REQUESTS = 200
 
 def rows() -> list[dict[str, Any]]:
     """Measure refusals and conversions of a robot, then failed requests during an upgrade and kills."""
+    compiled = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
+    native.fill(compiled)  # compile before the measurement
+    os.environ[native.FOLDER] = str(compiled)
     with running_cluster() as cluster, tempfile.TemporaryDirectory() as folder:
         url = cluster.url(cluster.create_database())
         with running_site(Path(folder), url) as site:

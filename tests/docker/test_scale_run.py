@@ -8,11 +8,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import itertools
+import json
 import signal
 import stat
 from collections.abc import Iterator
 
 import httpx
+import psycopg
 import pytest
 
 from tests.docker.scale_site import (
@@ -49,7 +51,10 @@ def create(site: Site, name: str) -> None:
 
 
 def test_proxy_serves_https_and_names_the_client(site: Site) -> None:
-    create(site, "links")
+    forged = {"X-Forwarded-For": "203.0.113.9", "X-Forwarded-Proto": "http"}
+    site.call(site.https, "POST", "environments", json={"name": "links"}, headers=forged)
+    entries = site.call(site.https, "GET", "audit?environment=links")
+    assert [entry["address"] for entry in entries] == ["127.0.0.1"]
     document = site.https.get("/ogc/links/").json()
     assert {httpx.URL(link["href"]).scheme for link in document["links"]} == {"https"}
     assert site.https.get("/api/v1/keys", headers={"Authorization": "Bearer wrong"}).status_code == 401
@@ -149,6 +154,9 @@ def test_event_reaches_a_robot_through_the_other_router(site: Site) -> None:
         listener = Listener(robot, "fleetmap/yard/events")
         site.upload(site.https, "yard", 0.0)
         listener.wait(lambda e: e.sequences() == [1, 2])
+        with site.https.stream("GET", "/api/v1/events", params={"environment": "yard", "since": 0}) as stream:
+            lines = stream.iter_lines()  # the proxy passes each on at once: the stream does not end
+            assert next(json.loads(line[5:])["sequence"] for line in lines if line.startswith("data:")) == 1
         robot.put("fleetmap/yard/events", b'{"sequence": 3}')  # of another robot's: the routers drop it
         with site.robot_session("router-1") as other:
             late = Listener(other, "fleetmap/yard/events")
@@ -172,6 +180,25 @@ def test_events_go_on_when_a_router_stops_and_comes_back(site: Site) -> None:
             late = Listener(other, "fleetmap/mesh/events")
             site.upload(site.https, "mesh", 0.5)
             late.wait(lambda e: sorted(e.sequences()) == [1, 2, 3])
+
+
+def test_all_recover_when_the_database_is_restarted(site: Site, postgres_cluster: Cluster) -> None:
+    create(site, "restart")
+    a, b, _ = site.servers.values()
+    postgres_cluster.kill()
+    assert eventually(lambda: (answer := a.get("/readyz")).status_code == 503 and answer).headers["retry-after"]
+    assert b.get("/api/v1/environments/restart").status_code == 503
+    postgres_cluster.restart()
+    for name in (*SERVERS, *WORKERS):
+        site.wait_ready(name)
+    site.upload(site.https, "restart", 0.0)
+    site.leader()
+    with psycopg.connect(site.compose.database_url.replace("+psycopg", ""), autocommit=True) as connection:
+        listening = (
+            "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND query ILIKE 'LISTEN%'"
+            " AND application_name = 'fleetmap worker'"
+        )
+        eventually(lambda: connection.execute(listening).fetchone() == (len(WORKERS),))
 
 
 def test_services_share_no_folder_and_log_no_secret(site: Site) -> None:
