@@ -24,14 +24,14 @@ from app.api.http.responses import api_router, json_bytes, json_response
 from app.api.http.schemas import NAME, ApiTime, EnvironmentPath, RequestModel, problem_responses
 from app.api.overlays import check_place, parse_polygon, shown_versions
 from app.errors import Conflict, FleetMapError, Invalid, NotFound, Problem, Unavailable
-from app.events.messages import ROBOT_NAME, SIGNATURE, RobotStatus
+from app.events.messages import ROBOT_NAME, RobotStatus
 from app.fleet import report_from_status
 from app.signing import delegation_statement
 from app.store import blob_coding
 from app.store.blob_rows import BlobRow
 from app.store.edge_changes import OverlayChange
 from app.store.fleet_values import Overlay, ReceivedReport
-from app.store.mirror_source import PREFIX_BYTES
+from app.store.mirror_source import PREFIX_BYTES, SIGNATURE
 from app.store.values import rfc3339
 
 TYPE = "application/octet-stream"

@@ -14,7 +14,7 @@ import httpx
 
 from app.agent import signatures
 from app.errors import Conflict, Denied, FleetMapError, NotFound, Unauthenticated, Unavailable, Untrusted
-from app.events.messages import SIGNATURE
+from app.store.mirror_source import SIGNATURE
 
 API: Final = "/api/v1"
 MAX_PAGE_BYTES: Final = 512 * 2**20

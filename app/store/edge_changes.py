@@ -106,18 +106,18 @@ class EdgeChanges:
     # --- at the mirror ---
 
     def waiting(self, limit: int) -> list[QueuedChange]:
-        """List the oldest changes that wait for the centre."""
+        """List the oldest changes of each environment that wait for the centre, by environment."""
         table, owner = tables.edge_change, tables.environment
+        rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.id)
+        ranked = select(table, rank.label("rank")).subquery()
         query = (
-            select(table, owner.c.name)
-            .join(owner, owner.c.id == table.c.environment_id)
-            .where(owner.c.deleted.is_(None))
-            .order_by(table.c.id)
+            select(ranked, owner.c.name)
+            .join(owner, owner.c.id == ranked.c.environment_id)
+            .where(owner.c.deleted.is_(None), ranked.c.rank <= limit)
+            .order_by(owner.c.name, ranked.c.id)
         )
         with self._database.read() as connection:
-            return [
-                QueuedChange(r.id, r.name, r.overlay_id, r.body) for r in connection.execute(query.limit(limit)).all()
-            ]
+            return [QueuedChange(r.id, r.name, r.overlay_id, r.body) for r in connection.execute(query)]
 
     def count_waiting(self) -> int:
         """Count the changes that wait for the centre."""

@@ -28,6 +28,9 @@ from app.store.values import rfc3339
 FORM: Final = 1
 """Number of the form of pages. A mirror refuses one that it does not know."""
 
+SIGNATURE: Final = "fleetmap-mirror-signature"
+"""Header of a page: as that of a manifest. Another name, since a page may be compressed on its way."""
+
 MAX_EVENTS: Final = 2000
 MAX_VERSIONS: Final = 100
 """Maximum number of events and versions in one page."""
