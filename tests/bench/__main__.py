@@ -21,7 +21,7 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.upload_reader import UploadHints
-from tests.bench import closures, derived, events, floors, generate, http, large, networks, ogc
+from tests.bench import closures, derived, events, floors, generate, http, large, networks, ogc, sizing
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -229,10 +229,23 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument(
         "--only",
-        choices=["conversions", "serving", "networks", "large", "events", "closures", "generate", "derived", "ogc"],
+        choices=[
+            "conversions",
+            "serving",
+            "networks",
+            "large",
+            "events",
+            "closures",
+            "generate",
+            "derived",
+            "ogc",
+            "sizing",
+        ],
         help="one of the tables",
     )
     arguments = parser.parse_args()
+    if arguments.only == "sizing":  # not with all others: it needs PostgreSQL
+        return sizing.report(arguments.json)
     if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
