@@ -21,7 +21,20 @@ from app.limits import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.upload_reader import UploadHints
-from tests.bench import closures, derived, events, floors, generate, http, large, networks, ogc, scale, servers
+from tests.bench import (
+    closures,
+    derived,
+    events,
+    floors,
+    generate,
+    http,
+    large,
+    networks,
+    ogc,
+    scale,
+    servers,
+    sizing,
+)
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -241,10 +254,13 @@ def main() -> int:
             "ogc",
             "scale",
             "servers",
+            "sizing",
         ],
-        help="one of the tables; scale, which takes half an hour, and servers, which needs PostgreSQL, only if they are named",
+        help="one of the tables; scale (half an hour), servers and sizing (with PostgreSQL) only if they are named",
     )
     arguments = parser.parse_args()
+    if arguments.only == "sizing":
+        return sizing.report(arguments.json)
     if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale", "servers"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2

@@ -37,7 +37,7 @@ def free_port() -> int:
 
 
 @contextmanager
-def serving(command: list[str], port: int, env: dict[str, str] | None = None) -> Iterator[None]:
+def serving(command: list[str], port: int, env: dict[str, str] | None = None) -> Iterator[subprocess.Popen[bytes]]:
     """Run a server process on a loopback port."""
     process = subprocess.Popen(command, env={**os.environ, **(env or {})}, stdout=subprocess.DEVNULL)
     try:
@@ -50,7 +50,7 @@ def serving(command: list[str], port: int, env: dict[str, str] | None = None) ->
             time.sleep(0.05)
         else:
             raise RuntimeError("the server did not start within 120 s")
-        yield
+        yield process
     finally:
         process.terminate()
         process.wait(20)
