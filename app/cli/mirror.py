@@ -122,7 +122,6 @@ def _follow(settings: Settings, url: str, token: str, environments: list[str], k
     address = url if "://" in url else f"http://{url}"
     ca = os.environ.get("FLEETMAP_CA")
     given = None if key is None else check_key(key)
-    logging.config.dictConfig(logs.config(settings.log_level, settings.log_format))
     with (
         closing(_open(settings)) as store,
         closing(open_leads(settings.direct_database, settings.data_dir)) as leads,
@@ -135,6 +134,7 @@ def _follow(settings: Settings, url: str, token: str, environments: list[str], k
         if once:
             _end_once(mirror.run_once().failures)
             return
+        logging.config.dictConfig(logs.config(settings.log_level, settings.log_format))
         stop = threading.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: stop.set())
