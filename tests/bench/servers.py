@@ -66,7 +66,7 @@ def _fetches(site: Site) -> list[dict[str, Any]]:
         _row(f"{label}: refusals", len(fetches.refusals) + FETCHES - fetches.count, 0, "refusals"),
         _row(
             f"{len(COMMITS) + 1} versions, 2 formats: conversions (peer: recipes)",
-            made,
+            conversions,
             1,
             "maps",
             len(fetches.recipes),
