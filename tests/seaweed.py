@@ -50,6 +50,7 @@ class Seaweed:
         command += [f"-{name.replace('_', '.port.')}={port}" for name, port in self.ports.items() if "grpc" in name]
         command += ["-filer", "-s3", f"-s3.config={self.folder / 's3.json'}", "-s3.iam=false"]
         command += ["-s3.port.iceberg=0", "-s3.port.lance=0", "-master.volumeSizeLimitMB=64", "-volume.max=40"]
+        command += ["-master.telemetry=false"]
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder)
         self._wait()

@@ -60,13 +60,13 @@ def _fetches(site: Site) -> list[dict[str, Any]]:
     _create(site, "pinned")
     before = sum(site.conversions().values())
     fetches = fetch_round_robin(site, "pinned", FETCHES, ROTATIONS, COMMITS)
-    made = sum(site.conversions().values()) - before
+    conversions = sum(site.conversions().values()) - before
     label = f"{FETCHES} fetches of a pinned robot, 3 servers in turn, {len(ROTATIONS)} key rotations"
     return [
         _row(f"{label}: refusals", len(fetches.refusals) + FETCHES - fetches.count, 0, "refusals"),
         _row(
             f"{len(COMMITS) + 1} versions, 2 formats: conversions (peer: recipes)",
-            made,
+            conversions,
             1,
             "maps",
             len(fetches.recipes),

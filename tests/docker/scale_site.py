@@ -129,7 +129,7 @@ class Site:
 
     def leader(self, names: Sequence[str] = SERVERS) -> str:
         """Wait until one server relays events; return its name."""
-        (name,) = eventually(lambda: len(found := self.leaders(names)) == 1 and found)
+        (name,) = eventually(lambda: len(leaders := self.leaders(names)) == 1 and leaders)
         return str(name)
 
     def robot_session(self, router: str) -> Any:
@@ -172,8 +172,8 @@ class Site:
         """Number of maps that each server and worker has made."""
         clients = {**self.servers, **self.workers}
         texts = {name: client.get("/metrics").text for name, client in clients.items()}
-        made = re.compile(r'^fleetmap_conversions_total\{.*result="made"\} (\S+)', re.MULTILINE)
-        return {name: sum(int(float(value)) for value in made.findall(text)) for name, text in texts.items()}
+        pattern = re.compile(r'^fleetmap_conversions_total\{.*result="made"\} (\S+)', re.MULTILINE)
+        return {name: sum(int(float(value)) for value in pattern.findall(text)) for name, text in texts.items()}
 
 
 @contextlib.contextmanager

@@ -85,9 +85,9 @@ def test_job_of_one_server_is_done_by_a_worker_and_fetched_from_all(site: Site) 
     before = site.conversions()
     octomaps = [client.get("/api/v1/environments/cave/versions/1/maps/octomap") for client in (b, a, c, site.https)]
     assert len({(answer.content, answer.headers["etag"]) for answer in octomaps}) == 1
-    made = {name: count - before[name] for name, count in site.conversions().items()}
-    assert {made[name] for name in SERVERS} == {0}
-    assert sum(made[name] for name in WORKERS) == 1, "a worker made it, once"
+    new = {name: count - before[name] for name, count in site.conversions().items()}
+    assert {new[name] for name in SERVERS} == {0}
+    assert sum(new[name] for name in WORKERS) == 1, "a worker made it, once"
 
 
 def test_pinned_robot_accepts_all_servers_across_a_key_rotation(site: Site) -> None:
