@@ -110,6 +110,9 @@ class Mirror:
             changes |= {} if failures else {"position": self.position}
             self._complete = None if failures else (self._clock(), self.position)
         self._renew_permissions(failures)
+        for name, problem in sorted(failures.items()):
+            if (state.failures or {}).get(name) != problem:  # once, not for each pass
+                log.warning("mirror: skipped, will retry (environment=%s): %s", name, problem)
         changes |= {"contact": self._clock(), "problem": None, "failures": failures}
         self._store.mirrors.save(**changes)
         return self._store.mirrors.state() or state
@@ -322,7 +325,6 @@ class _NotedFailure:
         if not is_own or not isinstance(error, FleetMapError):
             return False
         self._failures[self._environment] = error.detail
-        log.warning("mirror: skipped, will retry (environment=%s): %s", self._environment, error.detail)
         return True
 
 
