@@ -23,6 +23,10 @@ STREAM_SECONDS: Final = 60.0
 """Maximum time without data on the stream of events; a server sends a comment every 15 seconds."""
 
 
+class CentreUnreachable(Unavailable):
+    """No connection to the centre: nothing else can succeed now."""
+
+
 class Centre:
     """A centre, with the token of this mirror. Not thread-safe, but for ``wait_for_event``.
 
@@ -162,7 +166,9 @@ class Centre:
     def _errors(self) -> Iterator[None]:
         try:
             yield
-        except (httpx.HTTPError, httpx.InvalidURL) as error:
+        except (httpx.ConnectError, httpx.ConnectTimeout, httpx.InvalidURL, httpx.UnsupportedProtocol) as error:
+            raise CentreUnreachable(f"no connection to {self.url}: {type(error).__name__}: {error}") from error
+        except httpx.HTTPError as error:
             raise Unavailable(f"no connection to {self.url}: {type(error).__name__}: {error}") from error
 
     def _problem(self, answer: httpx.Response, data: bytes | None = None) -> FleetMapError:

@@ -16,8 +16,19 @@ from fnmatch import fnmatchcase
 from itertools import groupby
 from typing import Any, Final
 
-from app.errors import Conflict, Denied, FleetMapError, NotFound, Unauthenticated, Unavailable, Untrusted
-from app.mirror.centre import Centre
+from app.backends.lead import LeadLostError
+from app.errors import (
+    Conflict,
+    DatabaseDamaged,
+    Denied,
+    FleetMapError,
+    NoRoom,
+    NotFound,
+    Unauthenticated,
+    Unavailable,
+    Untrusted,
+)
+from app.mirror.centre import Centre, CentreUnreachable
 from app.mirror.content import Fetcher
 from app.signing import SigningKeys
 from app.store.base import utcnow
@@ -99,6 +110,9 @@ class Mirror:
             changes |= {} if failures else {"position": self.position}
             self._complete = None if failures else (self._clock(), self.position)
         self._renew_permissions(failures)
+        for name, problem in sorted(failures.items()):
+            if (state.failures or {}).get(name) != problem:  # once, not for each pass
+                log.warning("mirror: skipped, will retry (environment=%s): %s", name, problem)
         changes |= {"contact": self._clock(), "problem": None, "failures": failures}
         self._store.mirrors.save(**changes)
         return self._store.mirrors.state() or state
@@ -114,11 +128,8 @@ class Mirror:
         local = self._store.mirror_target.environments()
         for item in listing["environments"]:
             if self._is_chosen(str(item["name"])):
-                with self._noting(failures, str(item["name"])):
+                with _NotedFailure(failures, str(item["name"]), goes_on=True):
                     self._sync(item, local.get(str(item["id"])), int(listing["epoch"]))
-
-    def _noting(self, failures: dict[str, str], environment: str) -> _NotedFailure:
-        return _NotedFailure(failures, environment)
 
     def _note_problem(self, error: FleetMapError) -> None:
         if self._store.mirrors.state() is not None:
@@ -228,7 +239,7 @@ class Mirror:
         """Hand on changes of overlays, then reports of robots, in their order; returns whether there were changes."""
         waiting = self._store.edge_changes.waiting(REPORTS)
         for environment, group in groupby(waiting, key=lambda change: change.environment):
-            with self._noting(failures, environment):
+            with _NotedFailure(failures, environment):
                 self._hand_on_changes(environment, list(group))
         while reports := self._store.edge_changes.reports_after(state.reported, REPORTS):
             self._hand_on_reports([report for _, report in reports], failures)
@@ -250,7 +261,7 @@ class Mirror:
     def _hand_on_reports(self, reports: Sequence[ReceivedReport], failures: dict[str, str]) -> None:
         ordered = sorted(reports, key=lambda report: report.environment)  # stable: each robot's order stays
         for environment, group in groupby(ordered, key=lambda report: report.environment):
-            with self._noting(failures, environment):
+            with _NotedFailure(failures, environment):
                 self._centre.report(environment, statuses=[_report_as_json(report) for report in group])
 
     # --- permissions ---
@@ -271,7 +282,7 @@ class Mirror:
                 self._request_permissions(some, public)
             except (NotFound, Denied):  # one of them: find out which
                 for one in some:
-                    with self._noting(failures, one.name):
+                    with _NotedFailure(failures, one.name):
                         self._request_permissions([one], public)
 
     def _request_permissions(self, environments: Sequence[MirroredEnvironment], public: bytes) -> None:
@@ -296,21 +307,30 @@ class Mirror:
 
 
 class _NotedFailure:
-    """Context that notes an environment's failure and goes on; failures of the whole centre pass."""
+    """Context that notes an environment's failure and goes on; failures of the whole centre pass.
 
-    def __init__(self, failures: dict[str, str], environment: str) -> None:
-        self._failures, self._environment = failures, environment
+    goes_on: note also that something is unavailable, such as damaged content at the centre, as long as the centre can
+    be reached: so no environment keeps the others from being mirrored.
+    """
+
+    def __init__(self, failures: dict[str, str], environment: str, *, goes_on: bool = False) -> None:
+        self._failures, self._environment, self._goes_on = failures, environment, goes_on
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
         is_own = isinstance(error, NotFound | Conflict | Untrusted | Denied) and not isinstance(error, Unauthenticated)
+        is_own = is_own or (self._goes_on and isinstance(error, Unavailable) and not _is_general(error))
         if not is_own or not isinstance(error, FleetMapError):
             return False
         self._failures[self._environment] = error.detail
-        log.warning("mirror: skipped, will retry (environment=%s): %s", self._environment, error.detail)
         return True
+
+
+def _is_general(error: Unavailable) -> bool:
+    """Return whether no environment can be mirrored now: no connection, no lead, no disk space."""
+    return isinstance(error, CentreUnreachable | LeadLostError | NoRoom | DatabaseDamaged)
 
 
 def _has_diverged(page: MirrorPage, local: MirroredEnvironment) -> bool:

@@ -83,6 +83,9 @@ def _wait(store: Store, generation: int, news: threading.Event, stop: threading.
 def _watch(centre: Centre, mirror: Mirror, news: threading.Event, stop: threading.Event) -> None:
     """Set ``news`` at each event of the centre. A hint only: passes do not depend on it."""
     while not stop.is_set():
-        if mirror.position and not news.is_set() and centre.wait_for_event(mirror.position):
+        if not mirror.position or news.is_set():
+            stop.wait(POLL_SECONDS)
+        elif centre.wait_for_event(mirror.position):
             news.set()
-        stop.wait(1.0 if not news.is_set() else POLL_SECONDS)
+        else:
+            stop.wait(STAND_BY_SECONDS)

@@ -12,6 +12,7 @@ from sqlalchemy import update
 
 from app.errors import Denied, FleetMapError, Unauthenticated, Unavailable, Untrusted
 from app.store import tables
+from tests.api import samples
 from tests.api.conftest import Api, create_farm, running, settings_for
 from tests.mirror.conftest import Edge, mirror_token
 
@@ -67,14 +68,31 @@ def test_cut_off_transfer_goes_on(farm: str, alone: Make) -> None:
     edge = alone(farm)
     for limit in itertools.count(200, 400):
         edge.wire.limit = limit
-        try:
-            edge.follow()
-        except Unavailable as error:
-            assert "ended early" in error.detail
-            assert edge.store.mirror_target.environments() == {}
-            continue
-        break
+        failures = edge.mirror.run_once().failures
+        if not failures:
+            break
+        assert "ended early" in failures[farm]
+        assert edge.store.mirror_target.environments() == {}
     assert edge.store.verifier().run().findings == []
+
+
+def test_lost_content_of_one_environment_holds_up_no_other(centre: Api, farm: str, alone: Make) -> None:
+    later = create_farm(centre, f"{farm}-later")
+    centre.upload(farm, {"network.tmap2.yaml": samples.tmap2({"only": (1.0, 2.0)}, ())})
+    store = centre.app.state.services.store
+    before = {entry.hash for entry in store.versions.get(farm, 3).parts}
+    lost = next(bytes.fromhex(e.hash) for e in store.versions.get(farm).parts if e.hash not in before)
+    edge = alone(farm, later)
+    with store._database.write() as connection:
+        row = connection.execute(tables.chunk.select().where(tables.chunk.c.hash == lost)).one()
+        connection.execute(update(tables.chunk).where(tables.chunk.c.hash == lost).values(data=b"damaged"))
+    failures = edge.mirror.run_once().failures
+    assert list(failures or ()) == [farm]
+    assert edge.store.environments.get(later).head == 3
+    with store._database.write() as connection:
+        connection.execute(update(tables.chunk).where(tables.chunk.c.hash == lost).values(data=row.data))
+    edge.follow()
+    assert edge.store.environments.get(farm).head == 4
 
 
 def test_repeated_answer_is_refused(farm: str, alone: Make) -> None:
