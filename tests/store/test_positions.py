@@ -457,7 +457,8 @@ def crowd(store: Store, corners: Sequence[tuple[float, float]], size: float) -> 
     """Insert environments with a square fence each, in their stored form."""
     store.environments.create("model", datum=DATUM)
     with store._database.write() as connection:
-        row = dict(connection.execute(select(tables.environment)).mappings().one())
+        stored = [column for column in tables.environment.c if column.computed is None]
+        row = dict(connection.execute(select(*stored)).mappings().one())
         boxes = shapely.box(*np.array([(x, y, x + size, y + size) for x, y in corners]).T)
         wkb = to_wkb(np.asarray(boxes, object))
         connection.execute(
