@@ -26,6 +26,7 @@ from app.store.base import (
     environment_row,
     upsert,
 )
+from app.store.box_index import few_environments
 from app.store.changes import KEEP
 from app.store.chunks import Chunks
 from app.store.database import Database
@@ -135,6 +136,8 @@ class Environments:
         out: list[Environment] = []
         after = cursor
         with self._database.read() as connection:
+            if self._database.sqlite and not deleted:
+                query = query.where(*few_environments(connection, q, bbox))
             while len(out) <= limit:
                 page = query if after is None else query.where(table.c.name > after)
                 rows = connection.execute(page.limit(PAGE if allowed else limit + 1)).all()

@@ -500,7 +500,7 @@ search_item = Table(
 
 kind: see ``app.store.search_index``. name: of the item, else its id. folded: the name in lower case; folded_id: the id,
 of an environment the title, if it differs. x, y: metres in the local frame. grams: of both texts, on PostgreSQL; on
-SQLite the virtual tables ``search_text`` and ``search_term`` have them.
+SQLite the virtual tables ``search_node`` and so on have them.
 """
 
 Index("ix_search_item_grams", search_item.c.grams, postgresql_using="gin", info=POSTGRESQL).ddl_if(dialect="postgresql")

@@ -70,6 +70,7 @@ def requests(environments: int, versions: int, url: Callable[[str], str] | None 
 def _server(database: str, folder: Path) -> Iterator[httpx.Client]:
     port = http.free_port()
     env = {"FLEETMAP_DATA_DIR": str(folder), "FLEETMAP_DATABASE_URL": database, "FLEETMAP_ADMIN_TOKEN": TOKEN}
+    env["FLEETMAP_ZENOH_MODE"] = "off"
     command = [sys.executable, "-m", "app.cli", "serve", "--host", "127.0.0.1", "--port", str(port)]
     auth = {"Authorization": f"Bearer {TOKEN}"}
     with (
