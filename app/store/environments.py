@@ -225,7 +225,8 @@ class Environments:
     def purge(self, name: str) -> None:
         """Remove a deleted environment permanently. Raises Conflict if it is not deleted.
 
-        Garbage collection removes its chunks and files; its events stay in the log for 30 days, for late readers.
+        Garbage collection removes its chunks and files; its events stay in the log for 30 days or more, for late
+        readers.
         """
         table = tables.environment
         with self._database.write() as connection:

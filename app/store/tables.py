@@ -12,6 +12,7 @@ from sqlalchemy import (
     BigInteger,
     Boolean,
     Column,
+    ColumnElement,
     Computed,
     Float,
     ForeignKey,
@@ -23,6 +24,7 @@ from sqlalchemy import (
     Table,
     Text,
     false,
+    literal_column,
     true,
 )
 
@@ -188,6 +190,11 @@ chunk = Table(
 used: time of the last write or repeated write (seconds since 1970): garbage collection skips recent ones, which an
 upload in progress may rely on. kept: known to be part of a version.
 """
+
+
+def is_young(table: Table) -> ColumnElement[bool]:
+    """Return the condition of ``_young``, as written there: SQLite does not use its index for ``kept IS 0``."""
+    return literal_column(f"{table.name}.kept IS false")  # with a type, SQLite would get "= 1" after it
 
 
 def _young(table: Table) -> None:
