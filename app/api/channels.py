@@ -77,7 +77,7 @@ class ChannelRobotsOut(BaseModel):
     """Robots of a channel. `since`: time from which all of them run its root and closures, or null."""
 
     total: int
-    online: int
+    online: int = Field(description="With more than 1000 robots in the environment up to 5 seconds old.")
     holding: int
     lagging: int
     failed: int

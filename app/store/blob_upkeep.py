@@ -14,7 +14,7 @@ from app.store import blob_rows
 from app.store.blob_rows import BATCH
 from app.store.blobs import Blobs
 from app.store.database import Database
-from app.store.tables import blob, made_map, source
+from app.store.tables import blob, is_young, made_map, source
 
 _SINGLE: Final = re.compile(r"[0-9a-f]{2}/(?P<name>[0-9a-f]{64})(\..+)?")
 _PACK: Final = re.compile(r"packs/(?P<name>[0-9a-f]{64})")
@@ -33,13 +33,13 @@ class BlobUpkeep:
         for start in range(0, len(listed), BATCH):
             some = listed[start : start + BATCH]
             with self._database.write(upkeep=True) as connection:
-                young = blob.c.sha256.in_(some), blob.c.kept.is_(False)
+                young = blob.c.sha256.in_(some), is_young(blob)
                 if connection.execute(select(blob.c.sha256).where(*young).limit(1)).first() is not None:
                     connection.execute(update(blob).where(*young).values(kept=True))
 
     def collect_young(self, referenced: set[str], before: int) -> tuple[int, int]:
         """Remove those that no version is known to refer to, unless ``referenced`` or used since; (count, bytes)."""
-        query = select(blob.c.sha256).where(blob.c.kept.is_(False), blob.c.used < before)
+        query = select(blob.c.sha256).where(is_young(blob), blob.c.used < before)
         with self._database.read() as connection:
             idle = sorted(set(connection.execute(query).scalars()) - referenced)
             sources: set[str] = set()
@@ -83,7 +83,7 @@ class BlobUpkeep:
         needed = exists(select(other.c.sha256).where(other.c.base == blob.c.sha256))
         conditions = [blob.c.sha256.in_(names), blob.c.used < before, ~needed]
         if young:
-            conditions.append(blob.c.kept.is_(False))
+            conditions.append(is_young(blob))
         with self._database.write(upkeep=True) as connection:
             rows = blob_rows.select_rows(connection, names)
             gone = set(connection.execute(delete(blob).where(*conditions).returning(blob.c.sha256)).scalars())

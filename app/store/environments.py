@@ -27,6 +27,7 @@ from app.store.base import (
     environment_row,
     upsert,
 )
+from app.store.box_index import few_environments
 from app.store.changes import KEEP
 from app.store.chunks import Chunks
 from app.store.database import Database
@@ -141,6 +142,8 @@ class Environments:
         out: list[Environment] = []
         after = cursor
         with self._database.read() as connection:
+            if self._database.sqlite and not deleted:
+                query = query.where(*few_environments(connection, q, bbox))
             while len(out) <= limit:
                 page = query if after is None else query.where(table.c.name > after)
                 rows = connection.execute(page.limit(PAGE if allowed else limit + 1)).all()
@@ -228,7 +231,8 @@ class Environments:
     def purge(self, name: str) -> None:
         """Remove a deleted environment permanently. Raises Conflict if it is not deleted.
 
-        Garbage collection removes its chunks and files; its events stay in the log for 30 days, for late readers.
+        Garbage collection removes its chunks and files; its events stay in the log for 30 days or more, for late
+        readers.
         """
         table = tables.environment
         with self._database.write() as connection:

@@ -2,7 +2,7 @@
 
 Most runs cost what was written since the last one: they walk the versions since then, mark what these contain as kept,
 and look only at what is not kept. Content of versions goes only when an environment is purged; the run after that, and
-one a month, looks at everything, also for files without a row.
+one a month, looks at everything, also for files without a row and for events of purged environments.
 
 It never races an upload. The chunks that a version in progress relies on are part of its base version, which exists
 while it is marked (else the commit fails), or were written or used again within the grace period. Rows are removed with
@@ -94,7 +94,7 @@ class GarbageCollector:
             counts = self._collect_young(before, since=state.time - OVERLAP_SECONDS)
         temporary = self._blobs.files.recover()
         self._made_maps.collect()
-        self._tidy()
+        self._tidy(complete=complete)
         done = {"time": started, **({"complete": started, "collected": state.purges} if complete else {})}
         with self._database.write(notify=False, upkeep=True) as connection:
             connection.execute(update(tables.collection).values(done))
@@ -124,7 +124,7 @@ class GarbageCollector:
         table, version = tables.chunk, tables.version
         recent = version.c.time >= datetime.fromtimestamp(max(since, 0), UTC)
         with self._database.snapshot() as connection:
-            query = select(table.c.hash, table.c.used).where(table.c.kept.is_(False))
+            query = select(table.c.hash, table.c.used).where(tables.is_young(table))
             young = {bytes(name): used for name, used in connection.execute(query)}
             kept_roots = _roots(connection, [version], recent)
             pending_roots, pending_sources = _roots(connection, _PENDING), _pending_sources(connection)
@@ -155,7 +155,7 @@ class GarbageCollector:
         table = tables.chunk
         listed = sorted(names)
         for start in range(0, len(listed), PAGE):
-            young = table.c.hash.in_(listed[start : start + PAGE]), table.c.kept.is_(False)
+            young = table.c.hash.in_(listed[start : start + PAGE]), tables.is_young(table)
             with self._database.read() as connection:
                 some = list(connection.execute(select(table.c.hash).where(*young)).scalars())
             if some:
@@ -183,7 +183,7 @@ class GarbageCollector:
                 count += len(chunks.delete(connection, names[start : start + PAGE * 10], before, young=young))
         return count
 
-    def _tidy(self) -> None:
+    def _tidy(self, *, complete: bool) -> None:
         now = self._database.now()
         events, keys, jobs = tables.event, tables.idempotency, tables.job
         with self._database.write(upkeep=True) as connection:
@@ -197,12 +197,10 @@ class GarbageCollector:
             connection.execute(delete(tables.overlay).where(decided, old))
             finished = jobs.c.state.in_(("done", "failed", "cancelled"))
             connection.execute(delete(jobs).where(finished, jobs.c.updated < now - timedelta(days=JOB_DAYS)))
-            connection.execute(
-                delete(events).where(
-                    events.c.time < now - timedelta(days=EVENT_DAYS),
-                    events.c.environment_id.not_in(select(tables.environment.c.id)),
-                )
-            )
+            if complete:  # they are looked for in all old events
+                old_events = events.c.time < now - timedelta(days=EVENT_DAYS)
+                gone = events.c.environment_id.not_in(select(tables.environment.c.id))
+                connection.execute(delete(events).where(old_events, gone))
 
 
 _PENDING: Final = (tables.dry_run, tables.draft)

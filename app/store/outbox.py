@@ -215,8 +215,8 @@ class Outbox:
             rows = connection.execute(query).all()
             names = connection.execute(select(owner.c.id).order_by(owner.c.updated.desc())).scalars().all()
         ranges = [HistoryRange(row.environment_id, row.first, each) for row in rows]
-        left, reached = limit - sum(row.number for row in rows), {row.environment_id for row in rows}
-        quiet = [name for name in names if name not in reached][: max(0, left)]
+        left, recent_ids = limit - sum(row.number for row in rows), {row.environment_id for row in rows}
+        quiet = [name for name in names if name not in recent_ids][: max(0, left)]
         return ranges + [HistoryRange(name, 0, min(each, left // len(quiet))) for name in quiet]
 
     def last(self, chosen: HistoryRange, each: int, position: int) -> list[Event]:

@@ -16,6 +16,7 @@ from app.model.geodesy import distance
 from app.store import column_types, tables
 from app.store.area import compute_area, write_area
 from app.store.base import as_environment, datum_from_row
+from app.store.box_index import pieces_around
 from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.encode import from_wkb, to_wkb
@@ -124,7 +125,8 @@ class Areas:
         area = tables.area
         if self._database.sqlite:
             x, y = place
-            return and_(area.c.south <= y, area.c.north >= y, area.c.west <= x, area.c.east >= x)
+            inside = and_(area.c.south <= y, area.c.north >= y, area.c.west <= x, area.c.east >= x)
+            return and_(pieces_around(x, y), inside)
         wkb = bytes(to_wkb(np.array([shapely.Point(place)], object))[0])
         return func.ST_Covers(area.c.geometry, column_types.from_wkb(literal(wkb, LargeBinary)), type_=Boolean)
 

@@ -145,7 +145,8 @@ def _online_query() -> Select[Any]:
 def _last_held_query() -> Select[Any]:
     table = tables.robot
     of_channel = table.c.environment_id == bindparam("environment"), table.c.channel == bindparam("channel")
-    return select(func.max(table.c.held_since)).where(*of_channel)
+    query = select(table.c.held_since).where(*of_channel, table.c.held_since.is_not(None))
+    return query.order_by(table.c.held_since.desc()).limit(1)
 
 
 _GROUPS: Final = _groups_query()

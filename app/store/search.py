@@ -39,7 +39,8 @@ from sqlalchemy.dialects.postgresql import TSQUERY
 from app.store import tables
 from app.store.database import Database
 from app.store.environments import reaches
-from app.store.search_index import GRAM, ORDER, SEPARATOR, SearchIndex, SearchKind, fold
+from app.store.grams import GRAM, SEPARATOR, fold, wanted_grams
+from app.store.search_index import ORDER, SearchIndex, SearchKind
 
 MAX_CANDIDATES: Final = 1000
 """Maximum number of matches in the middle of a text, of each kind, that are put in order."""
@@ -56,12 +57,8 @@ LAST: Final = "\U0010ffff"
 """Sorts after all texts that begin alike."""
 
 WILDCARDS: Final = "*?["
-SINGLE, DOUBLE = "'", '"'
 
 _COLUMNS: Final = ("id", "kind", "level", "feature", "name", "folded", "folded_id", "x", "y")
-
-_SEARCH_TEXT: Final = table("search_text", column("rowid"), column("search_text"))
-_SEARCH_TERM: Final = table("search_term", column("term"), column("doc"), column("col"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +138,10 @@ class Search:
             for match in sorted(_match(row, rank, by_id=bool(row.by_id)) for row in rows):
                 seen.add(match.id)
                 yield match
-        query = _part_query(scope.form, is_short=len(needle) < GRAM, sqlite=sqlite)
+        values |= {"wanted": wanted_grams(needle, sqlite=sqlite), "limit": MAX_CANDIDATES + limit}
         for kind in range(len(ORDER)):
-            wanted = _wanted(needle, kind, sqlite=sqlite)
-            more = {"wanted": wanted, "kind": kind, "column": ORDER[kind], "limit": MAX_CANDIDATES + limit}
-            rows = connection.execute(query, {**values, **more})
+            query = _part_query(scope.form, kind, is_short=len(needle) < GRAM, sqlite=sqlite)
+            rows = connection.execute(query, {**values, "kind": kind})
             matches = (_best_match(row, needle) for row in rows)
             yield from sorted(match for match in matches if match.rank == PART)
 
@@ -228,20 +224,21 @@ def _ordered_query(rank: int, form: Form, *, sqlite: bool) -> CompoundSelect[Any
 
 
 @lru_cache
-def _part_query(form: Form, *, is_short: bool, sqlite: bool) -> Select[Any]:
+def _part_query(form: Form, kind: int, *, is_short: bool, sqlite: bool) -> Select[Any]:
     """Select items of a kind that contain the text, by the index of three characters in a row."""
     item = tables.search_item
     query = _items(form, sqlite=sqlite).where(_has_text(sqlite=sqlite)).limit(bindparam("limit", type_=Integer))
     if not sqlite:
         wanted = cast(bindparam("wanted", type_=Text), TSQUERY)
         return query.where(item.c.kind == bindparam("kind"), item.c.grams.op("@@")(wanted))
+    name = f"search_{ORDER[kind]}"
     if is_short:
-        term = _SEARCH_TERM.c
-        begins = term.term >= bindparam("needle"), term.term < bindparam("last"), term.col == bindparam("column")
+        term = table(f"{name}_term", column("term"), column("doc")).c
+        begins = term.term >= bindparam("needle"), term.term < bindparam("last")
         rows = select(term.doc).where(*begins).distinct().subquery()
         return query.join(rows, rows.c.doc == item.c.id)
-    text = _SEARCH_TEXT.c
-    return query.join(_SEARCH_TEXT, text.rowid == item.c.id).where(text.search_text.op("MATCH")(bindparam("wanted")))
+    text = table(name, column("rowid"), column(name))
+    return query.join(text, text.c.rowid == item.c.id).where(text.c[name].op("MATCH")(bindparam("wanted")))
 
 
 def _has_text(*, sqlite: bool) -> ColumnElement[bool]:
@@ -249,20 +246,6 @@ def _has_text(*, sqlite: bool) -> ColumnElement[bool]:
     item, needle = tables.search_item, bindparam("needle", type_=Text)
     position = func.instr if sqlite else func.strpos
     return or_(position(item.c.folded, needle) > 0, position(item.c.folded_id, needle) > 0)
-
-
-def _wanted(needle: str, kind: int, *, sqlite: bool) -> str:
-    """Return the query of the index of three characters in a row; on PostgreSQL shorter texts are prefixes of three."""
-    windows = sorted({needle[k : k + GRAM] for k in range(max(1, len(needle) - GRAM + 1))})
-    if sqlite:
-        return f"{ORDER[kind]} : ({' AND '.join(_quoted(window, DOUBLE) for window in windows)})"
-    return " & ".join(_quoted(window, SINGLE) + (":*" if len(window) < GRAM else "") for window in windows)
-
-
-def _quoted(text: str, quote: str) -> str:
-    """Quote a text for a query of the index: quotes, and on PostgreSQL backslashes, are doubled."""
-    escaped = text.replace("\\", "\\\\") if quote == SINGLE else text
-    return quote + escaped.replace(quote, 2 * quote) + quote
 
 
 def _best_match(row: Row[Any], needle: str) -> _Match:

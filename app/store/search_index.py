@@ -29,6 +29,7 @@ from app.store.base import storable_text
 from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.encode import from_wkb
+from app.store.grams import SEPARATOR, fold, grams
 from app.store.manifest import read_version
 from app.store.parts.features import Item
 from app.store.prepare import differing_keys, read_roots
@@ -47,10 +48,6 @@ PRODUCTION: Final = "production"
 
 MAX_FIELD: Final = 256
 """Maximum number of characters of a name or id that are searched."""
-
-SEPARATOR: Final = "\n"
-GRAM: Final = 3
-"""Number of characters in a row that are indexed together."""
 
 BATCH: Final = 500
 SLICE: Final = 2000
@@ -302,20 +299,6 @@ def _folded(further: str, name: str) -> dict[str, Any]:
     texts = [fold(text[:MAX_FIELD].replace(SEPARATOR, " ")) for text in (name, further)]
     texts = texts[:1] if texts[1] in (texts[0], "") else texts
     return {"folded": texts[0], "folded_id": texts[1] if len(texts) == 2 else None, "grams": grams(*texts)}
-
-
-def grams(*texts: str) -> list[str]:
-    """Return all groups of three characters in a row; line ends let the last characters begin such a group, too."""
-    padded = (text + SEPARATOR * (GRAM - 1) for text in texts)
-    return sorted({text[k : k + GRAM] for text in padded for k in range(len(text) - GRAM + 1)})
-
-
-def fold(text: str) -> str:
-    """Convert to lower case without changing the number of characters."""
-    lower = text.lower()
-    if len(lower) != len(text):
-        lower = "".join([c.lower() if len(c.lower()) == 1 else c for c in text])
-    return lower.replace("ς", "σ")  # the only letter whose lower case depends on its neighbours
 
 
 def _positions(items: Sequence[Item], datum: Datum | None) -> list[tuple[float | None, float | None]]:

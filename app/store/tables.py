@@ -12,6 +12,7 @@ from sqlalchemy import (
     BigInteger,
     Boolean,
     Column,
+    ColumnElement,
     Computed,
     Float,
     ForeignKey,
@@ -23,6 +24,7 @@ from sqlalchemy import (
     Table,
     Text,
     false,
+    literal_column,
     true,
 )
 
@@ -195,6 +197,11 @@ chunk = Table(
 used: time of the last write or repeated write (seconds since 1970): garbage collection skips recent ones, which an
 upload in progress may rely on. kept: known to be part of a version.
 """
+
+
+def is_young(table: Table) -> ColumnElement[bool]:
+    """Return the condition of ``_young``, as written there: SQLite does not use its index for ``kept IS 0``."""
+    return literal_column(f"{table.name}.kept IS false")  # with a type, SQLite would get "= 1" after it
 
 
 def _young(table: Table) -> None:
@@ -505,7 +512,7 @@ search_item = Table(
 
 kind: see ``app.store.search_index``. name: of the item, else its id. folded: the name in lower case; folded_id: the id,
 of an environment the title, if it differs. x, y: metres in the local frame. grams: of both texts, on PostgreSQL; on
-SQLite the virtual tables ``search_text`` and ``search_term`` have them.
+SQLite the virtual tables ``search_node`` and so on have them.
 """
 
 Index("ix_search_item_grams", search_item.c.grams, postgresql_using="gin", info=POSTGRESQL).ddl_if(dialect="postgresql")

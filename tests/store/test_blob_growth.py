@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sqlalchemy import select
 
 from app.errors import Damaged, NotFound
 from app.model.layers import PartKey
+from app.store import tables
 from app.store.blob_rows import BlobRow, select_rows
 from app.store.changes import Changes, Drop, Replace
 from app.store.store import Store
@@ -157,6 +159,13 @@ def test_collection_looks_only_at_what_is_new(store: Store, monkeypatch: pytest.
         store.blobs.get(waste)
     monkeypatch.setattr(store.blobs.files, "list", None)  # nor are the files listed
     store.garbage.collect(timedelta(0))
+
+
+def test_collection_finds_what_is_new_by_an_index(sqlite_store: Store) -> None:
+    query = select(tables.chunk.c.hash, tables.chunk.c.used).where(tables.is_young(tables.chunk))
+    with sqlite_store._database.read() as connection:
+        plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query.compile(connection)}").all()
+    assert "ix_chunk_young" in str(plan)
 
 
 def test_versions_of_an_older_release_are_not_collected(store: Store) -> None:

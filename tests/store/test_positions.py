@@ -457,8 +457,8 @@ def crowd(store: Store, corners: Sequence[tuple[float, float]], size: float) -> 
     """Insert environments with a square fence each, in their stored form."""
     store.environments.create("model", datum=DATUM)
     with store._database.write() as connection:
-        stored = [column for column in tables.environment.c if column.computed is None]
-        row = dict(connection.execute(select(*stored)).mappings().one())
+        columns = [column for column in tables.environment.c if column.computed is None]
+        row = dict(connection.execute(select(*columns)).mappings().one())
         boxes = shapely.box(*np.array([(x, y, x + size, y + size) for x, y in corners]).T)
         wkb = to_wkb(np.asarray(boxes, object))
         connection.execute(
@@ -498,9 +498,10 @@ def test_position_query_of_ten_thousand_environments_uses_index(store: Store):
         if store._database.sqlite:
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()
             query_plan = " | ".join(str(line[-1]) for line in plan)
-            assert "SEARCH area USING INDEX ix_area_box" in query_plan, query_plan
             assert "SEARCH environment USING INDEX sqlite_autoindex_environment_1" in query_plan, query_plan
-            assert "SCAN" not in query_plan, query_plan
+            scans = [str(line[-1]) for line in plan if "SCAN" in str(line[-1])]
+            assert scans
+            assert all(line.startswith("SCAN box_tree VIRTUAL TABLE INDEX") for line in scans), query_plan
             steps = [0]
             driver: Any = connection.connection.driver_connection
 
@@ -512,7 +513,7 @@ def test_position_query_of_ten_thousand_environments_uses_index(store: Store):
             row_count = len(connection.exec_driver_sql(statement, parameters).all())
             driver.set_progress_handler(None, 0)
             assert row_count < 5, "number of polygons that shapely tests"
-            assert steps[0] < 10 * MANY, "instructions of SQLite's machine: a few for each entry of the index"
+            assert steps[0] < MANY / 10, "instructions of SQLite's machine: not one for each environment"
         else:
             plan_ = connection.exec_driver_sql(f"EXPLAIN (ANALYZE, FORMAT JSON) {statement}", parameters).scalar_one()
             nodes = list(flat(plan_[0]["Plan"]))

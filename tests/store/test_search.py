@@ -21,8 +21,9 @@ from app.store import search as search_module
 from app.store import search_index as index_module
 from app.store import tables
 from app.store.changes import Put, Replace
+from app.store.grams import fold
 from app.store.search import Search, SearchHit
-from app.store.search_index import SearchIndex, fold
+from app.store.search_index import SearchIndex
 from app.store.store import Store
 from tests.store import samples
 
