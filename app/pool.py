@@ -211,6 +211,7 @@ class Pool:
             _start(process)
         except (OSError, EOFError) as error:
             ours.close()
+            log.warning("pool: cannot start a worker (reason=%s)", error)
             raise Unavailable("the system cannot start another process: try again in a few seconds") from error
         finally:
             theirs.close()

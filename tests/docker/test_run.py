@@ -17,9 +17,9 @@ from tests.docker.containers import Compose, Container, image, instructions
 
 
 @pytest.fixture
-def containers(tmp_path: Path, postgres_url: str) -> tuple[Container, Container]:
-    """Migrate service and server, with a new database."""
-    compose = Compose("compose.yaml", tmp_path, postgres_url)
+def containers(tmp_path_factory: pytest.TempPathFactory, postgres_url: str) -> tuple[Container, Container]:
+    """Migrate service and server, with a new database, in a folder with a short path: a socket lies in its /tmp."""
+    compose = Compose("compose.yaml", tmp_path_factory.mktemp("site"), postgres_url)
     return Container(compose, "migrate"), Container(compose, "server")
 
 
