@@ -84,8 +84,8 @@ def server(running_server: WebServer) -> Iterator[WebServer]:
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     """Start the browser of all modules. While it runs, no test outside of this folder could start an event loop."""
-    program = shutil.which("chromium")
-    assert program, "chromium is not installed (Debian: apt install chromium)"
+    program = shutil.which("chromium-headless-shell")
+    assert program, "chromium-headless-shell is not installed (Debian: apt install chromium-headless-shell)"
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser
