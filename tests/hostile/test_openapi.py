@@ -35,6 +35,7 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield api
 
 
+@pytest.mark.filterwarnings("ignore:Do not use the `random` module inside strategies")  # the server's threads do
 def test_every_response_is_declared_and_no_call_fails_the_server(api: Api) -> None:
     schema = schemathesis.openapi.from_dict(api.get("/openapi.json").json())
     failures: list[str] = []
