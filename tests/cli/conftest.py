@@ -7,8 +7,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -22,6 +20,7 @@ import pytest
 from app.cli import run
 from app.cli.server import wait_ready
 from app.errors import Unavailable
+from tests.preloaded import PreloadedProcess
 
 TOKEN = "administrator-of-the-tests"
 START_SECONDS = 60.0
@@ -48,22 +47,8 @@ class ServerProcess:
 
     def __init__(self, *arguments: str, environment: Mapping[str, str], folder: Path, command: str = "serve") -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "app.cli", command, "--port", "0", *arguments],
-            env={
-                **clean,
-                "FLEETMAP_ZENOH_MODE": "off",
-                **environment,
-                "PYTHONUNBUFFERED": "1",
-                "PYTHONPATH": str(Path(__file__).parents[2]),
-            },
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
+        values = {**clean, "FLEETMAP_ZENOH_MODE": "off", **environment, "PYTHONPATH": str(Path(__file__).parents[2])}
+        self.process = PreloadedProcess([command, "--port", "0", *arguments], env=values, cwd=folder)
         self.lines: list[str] = []
         self._news = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)

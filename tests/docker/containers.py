@@ -21,6 +21,8 @@ from typing import Any
 
 import yaml
 
+from tests.preloaded import PreloadedProcess
+
 TOP = Path(__file__).resolve().parents[2]
 DOCKER = TOP / "docker"
 OWN_IMAGE = "fleet-map-server"
@@ -146,7 +148,7 @@ class Container:
         self.healthcheck = configuration.get("healthcheck", [])
         self.workdir = self.translate(configuration["workdir"])
         self._mount(service, volumes)
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | PreloadedProcess | None = None
 
     def _of_machine(self) -> dict[str, str]:
         """Variables of this machine: its programs, this checkout, and compiled code.
@@ -207,11 +209,15 @@ class Container:
             check=False,
         )
 
-    def start(self) -> subprocess.Popen[bytes]:
+    def start(self) -> subprocess.Popen[bytes] | PreloadedProcess:
         """Start the service; its output is appended to ``log``."""
+        program, *arguments = self._program(self.command), *self.command[1:]
         with (self.folder / "log").open("ab") as log:
+            if Path(program).name == "fleetmap":
+                self.process = PreloadedProcess(arguments, env=self.environment, cwd=Path(self.workdir), output=log)
+                return self.process
             self.process = subprocess.Popen(
-                [self._program(self.command), *self.command[1:]],
+                [program, *arguments],
                 env=self.environment,
                 cwd=self.workdir,
                 stdin=subprocess.DEVNULL,

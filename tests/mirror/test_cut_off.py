@@ -7,8 +7,6 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -26,6 +24,7 @@ from tests.agent.conftest import whole
 from tests.api.conftest import ADMIN, Api, create_farm
 from tests.events.conftest import eventually
 from tests.mirror.conftest import Edge, mirror_token
+from tests.preloaded import PreloadedProcess
 
 Make = Callable[..., Edge]
 ROOT = Path(__file__).parents[2]
@@ -200,19 +199,11 @@ def test_killed_mirror_leaves_the_old_or_the_new_state(centre: Api, farm: str, t
     token = tmp_path / "token"
     token.write_text(mirror_token(centre))
     clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
-    command = [sys.executable, "-m", "app.cli", "mirror"]
     environment = {**clean, "PYTHONPATH": str(ROOT), "FLEETMAP_DATA_DIR": str(data)}
 
-    def start() -> subprocess.Popen[str]:
-        arguments = [centre.url, "--token-file", str(token), "-e", farm]
-        return subprocess.Popen(
-            [*command, *arguments],
-            env=environment,
-            cwd=tmp_path,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+    def start() -> PreloadedProcess:
+        arguments = ["mirror", centre.url, "--token-file", str(token), "-e", farm]
+        return PreloadedProcess(arguments, env=environment, cwd=tmp_path)
 
     def heads() -> int:
         if not (data / "fleetmap.sqlite3").exists():
@@ -229,7 +220,8 @@ def test_killed_mirror_leaves_the_old_or_the_new_state(centre: Api, farm: str, t
     assert "following" in line, line
     eventually(lambda: heads() == 3 or (data / "blobs").is_dir())
     process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)
+    process.wait(60)
+    process.stdout.close()
     assert heads() in (-1, 3)
     centre("PATCH", f"environments/{farm}", 200, json={"datum": {"latitude": 53.2, "longitude": 0.5}})
     process = start()
@@ -237,8 +229,10 @@ def test_killed_mirror_leaves_the_old_or_the_new_state(centre: Api, farm: str, t
         eventually(lambda: heads() == 4 or process.poll() is not None)
     finally:
         process.terminate()
-        out, _ = process.communicate(timeout=60)
-    assert process.returncode == 0, out
+        process.wait(60)
+    assert process.stdout is not None
+    with process.stdout:
+        assert process.returncode == 0, process.stdout.read()
     store = Store(f"sqlite:///{data}/fleetmap.sqlite3", data / "blobs")
     try:
         assert store.verifier().run().findings == []
