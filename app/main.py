@@ -67,6 +67,7 @@ from app.sandbox import SandboxPolicy
 from app.signing import Keys, MountedKeys, SharedKeys, SigningKeys
 from app.store.scrub import Scrub
 from app.store.store import Store
+from app.watch import operation_metrics
 
 log = logging.getLogger(__name__)
 
@@ -292,6 +293,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     leads = open_leads(settings.direct_database, settings.data_dir)
 
     jobs, work = _conversion_jobs(settings, store, service, pool, metrics)
+    writability = Writability(store.check_writable, intake.check)
+    metrics.operation = operation_metrics(settings, store, service.cache, writability)
     tiles = Tiles(store, service.cache)
     return Services(
         options=_api_options(settings),
@@ -314,7 +317,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         views=Views(store, tiles),
         leads=leads,
         fleet=FleetIntake(store, leads.lead(relay.NAME), bus_vouches=_bus_vouches(settings)),
-        writability=Writability(store.check_writable, intake.check),
+        writability=writability,
     )
 
 

@@ -22,6 +22,7 @@ from app.api.http.task_performer import TaskPerformer
 from app.backends.shared_queue import QueueWorker, SharedQueue
 from app.config import Settings
 from app.errors import FleetMapError, Invalid, Unavailable
+from app.watch import disk_metrics
 
 
 def check(settings: Settings) -> None:
@@ -54,6 +55,7 @@ async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
     )
     await run_in_threadpool(services.pool.start)
     app.state.services, app.state.worker, app.state.queue = services, worker, queue
+    app.state.disks = disk_metrics(settings)
     running = asyncio.create_task(worker.run())
     try:
         yield
@@ -81,8 +83,9 @@ async def _readyz(request: Request) -> Response:
 
 
 async def _metrics(request: Request) -> Response:
-    """Return the conversions of this worker and the state of the queue."""
+    """Return the conversions of this worker, its disks and the state of the queue."""
     registry = CollectorRegistry()
     registry.register(QueueCollector(request.app.state.queue.figures))
+    registry.register(request.app.state.disks)
     conversions = generate_latest(request.app.state.services.metrics.registry)
     return Response(conversions + await run_in_threadpool(generate_latest, registry), media_type=CONTENT_TYPE)

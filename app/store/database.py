@@ -238,6 +238,18 @@ class Database:
             kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
+    def clock_offset(self) -> float | None:
+        """Return by how many seconds the database's clock is ahead of this machine's; None if it is the same clock.
+
+        The error is at most half of the time that the query takes.
+        """
+        if self.sqlite:
+            return None
+        with self.connection() as connection:
+            sent = time.time()
+            remote = float(connection.exec_driver_sql("SELECT extract(epoch FROM clock_timestamp())").scalar_one())
+            return remote - (sent + time.time()) / 2
+
     def tables(self) -> tuple[list[str], int]:
         """Return the names of SQLite's tables, and the bytes of its pages; none on PostgreSQL."""
         if not self.sqlite:
