@@ -274,15 +274,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         return run(function, *args, by=spare if pool.is_busy else pool)
 
     metrics = Metrics()
-    service = Maps(
-        store,
-        run,
-        settings.cache_dir,
-        settings.limits,
-        cache_bytes=settings.cache_bytes,
-        run_trial=run_trial,
-        shared=SharedMaps(store.made_maps) if settings.shares_maps else None,
-    )
+    service = _maps(settings, store, run, run_trial)
     service.cache.on_damage = metrics.cache_damaged.inc
     access = _authenticator(settings, store)
 
@@ -318,6 +310,18 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         leads=leads,
         fleet=FleetIntake(store, leads.lead(relay.NAME), bus_vouches=_bus_vouches(settings)),
         writability=writability,
+    )
+
+
+def _maps(settings: Settings, store: Store, run: Callable[..., Any], run_trial: Callable[..., Any]) -> Maps:
+    return Maps(
+        store,
+        run,
+        settings.cache_dir,
+        settings.limits,
+        cache_bytes=settings.cache_bytes,
+        run_trial=run_trial,
+        shared=SharedMaps(store.made_maps) if settings.shares_maps else None,
     )
 
 
