@@ -444,7 +444,7 @@ def start_relay(settings: Settings, services: Services) -> Relay | None:
             "Zenoh router: FLEETMAP_ZENOH_USERS is set but the router listens without TLS; passwords and messages are "
             "sent in clear text"
         )
-    options = _bus_options(settings)
+    options = bus_options(settings)
     zenoh_bus = Bus(
         options,
         query_handler=partial(events.answer_zenoh_query, services, options.max_reply_bytes),
@@ -464,7 +464,7 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
         return None
     publishing = Ros2Publisher(
         Ros2Options(chosen, parse_keys(settings.ros2_keys), settings.ros2_domain_id),
-        _bus_options(settings),
+        bus_options(settings),
         settings.data_dir,
         services.leads,
         generation=services.store.generation,
@@ -478,10 +478,11 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
 def check_bus(settings: Settings) -> None:
     """Check the Zenoh settings, including their files and users. Raises FleetMapError."""
     if settings.zenoh_mode != "off":
-        bus.check(_bus_options(settings))
+        bus.check(bus_options(settings))
 
 
-def _bus_options(settings: Settings) -> BusOptions:
+def bus_options(settings: Settings) -> BusOptions:
+    """Return the options of the Zenoh session and router."""
     return BusOptions(
         mode=settings.zenoh_mode,
         listen=settings.zenoh_listen,

@@ -238,6 +238,16 @@ class Database:
             kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
+    def versions(self) -> dict[str, str]:
+        """Return the versions of SQLite, or of PostgreSQL and PostGIS (``missing`` without it)."""
+        with self.connection() as connection:
+            if self.sqlite:
+                return {"SQLite": str(connection.exec_driver_sql("SELECT sqlite_version()").scalar_one())}
+            version = str(connection.exec_driver_sql("SHOW server_version").scalar_one()).partition(" ")[0]
+            extension = "SELECT extversion FROM pg_extension WHERE extname = 'postgis'"
+            postgis = connection.exec_driver_sql(extension).scalar()
+        return {"PostgreSQL": version, "PostGIS": str(postgis or "missing")}
+
     def clock_offset(self) -> float | None:
         """Return by how many seconds the database's clock is ahead of this machine's; None if it is the same clock.
 

@@ -189,6 +189,14 @@ class Store:
         """Return the present by the store's clock."""
         return self._database.now()
 
+    def integrity(self) -> str | None:
+        """Check all pages of SQLite's file, without noting a problem; return it, None if intact or on PostgreSQL."""
+        return self._database.integrity(10)
+
+    def database_versions(self) -> dict[str, str]:
+        """Return the versions of the database's programs and of the schema. Raises Unavailable."""
+        return {**self._database.versions(), "schema": schema.present(self._database) or "none"}
+
     def clock_offset(self) -> float | None:
         """Return by how many seconds the database's clock is ahead of this machine's; None with SQLite."""
         return self._database.clock_offset()
