@@ -33,6 +33,9 @@ def database(site: Site) -> Iterator[Finding]:
         yield error(failure.detail, place, advice)
         return
     yield ok("answers: " + ", ".join(f"{name} {version}" for name, version in versions.items()), place)
+    if versions.get("PostGIS") == "missing":
+        advice = "install PostGIS 3, and run as a superuser in this database: CREATE EXTENSION postgis"
+        yield warning("the database has no PostGIS", place, advice)
     try:
         site.store.check()
     except FleetMapError as failure:

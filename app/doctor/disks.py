@@ -42,9 +42,19 @@ def _existing(folder: Path) -> Path:
     return path
 
 
+def _users(folder: Path) -> tuple[int, int]:
+    """Return the numbers of this user and of the owner of a folder."""
+    return os.getuid(), folder.stat().st_uid
+
+
 @check
 def folders(site: Site) -> Iterator[Finding]:
-    """Look whether the folders exist and can be written."""
+    """Look whether the folders exist and can be written by their owner."""
+    data = site.settings.data_dir
+    user, owner = _users(_existing(data))
+    if user == 0 and owner != 0 and data.exists():
+        advice = f"run it as the user of the server, whose rights it then examines: sudo -u '#{owner}' fleetmap doctor"
+        yield warning(f"this examination runs as root, and the folder belongs to user {owner}", str(data), advice)
     for name, folder in _folders(site).items():
         place = f"{folder} ({name})"
         if folder.exists() and not folder.is_dir():

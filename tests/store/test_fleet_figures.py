@@ -175,6 +175,12 @@ def test_unsent_events_are_counted_with_the_age_of_the_oldest(site: Site, clock:
     assert events.unsent(clock.now) == (1, 60.0)
 
 
+def test_versions_of_the_database_are_known(store: Store) -> None:
+    versions = store.database_versions()
+    assert set(versions) == ({"PostgreSQL", "PostGIS", "schema"} if store.is_shared else {"SQLite", "schema"})
+    assert all(version[0].isdigit() for version in versions.values()), versions
+
+
 def test_clock_of_the_database_is_compared(store: Store) -> None:
     offset = store.clock_offset()
     if not store.is_shared:
