@@ -20,7 +20,7 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__, derive, housekeeping, logs, ogc
+from app import __version__, derive, housekeeping, logs, ogc, traces
 from app import formats as every_format
 from app.api import events, health, maps, page, ros2, routers
 from app.api.http import openapi, problems
@@ -100,6 +100,7 @@ def create_app(settings: Settings) -> FleetMapApp:
 
 @contextlib.asynccontextmanager
 async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]:
+    traces.start(os.environ, __version__)
     services = await run_in_threadpool(open_services, settings)
     app.state.services = services
     app.state.feed = events.EventFeed(services)
@@ -120,6 +121,7 @@ async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]
         for one in (*publishing, *([listener] if listener else [])):
             await run_in_threadpool(one.close)
         await run_in_threadpool(close_services, services)
+        await run_in_threadpool(traces.stop)
 
 
 def from_environment() -> FleetMapApp:
@@ -261,7 +263,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         fetched: set[str] = set()
         while True:
             try:
-                return by.run(function, *args, **more)
+                with traces.span(f"worker {function.__name__}"):
+                    return by.run(function, *args, **more)
             except DatabaseDamaged as error:  # found by a worker
                 store.note_damage(error)
                 raise

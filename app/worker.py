@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import AsyncIterator
 from functools import partial
 
@@ -14,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from app import main
+from app import __version__, main, traces
 from app.api.http import problems
 from app.api.http.metrics import CONTENT_TYPE, QueueCollector
 from app.api.http.responses import json_response
@@ -43,6 +44,7 @@ def create_worker(settings: Settings) -> Starlette:
 
 @contextlib.asynccontextmanager
 async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
+    traces.start(os.environ, __version__)
     services = await run_in_threadpool(main.open_services, settings)
     queue = SharedQueue(services.store.transaction, waiting=settings.conversion_queue)
 
@@ -63,6 +65,7 @@ async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
         worker.stop()
         await running
         await run_in_threadpool(main.close_services, services)
+        await run_in_threadpool(traces.stop)
 
 
 async def _healthz(request: Request) -> Response:
