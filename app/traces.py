@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import Any, Final
@@ -16,6 +17,7 @@ log = logging.getLogger(__name__)
 
 ENDPOINTS: Final = ("OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT")
 SERVICE: Final = "fleetmap"
+STOP_SECONDS: Final = 3.0
 
 _NO_SPAN: Final[AbstractContextManager[Any]] = contextlib.nullcontext(None)
 
@@ -36,8 +38,8 @@ def is_wanted(environment: Mapping[str, str]) -> bool:
 
 def start(environment: Mapping[str, str], version: str) -> bool:
     """Start to trace in this process if the variables ask for it; return whether it traces."""
-    if not is_wanted(environment):
-        return False
+    if is_on() or not is_wanted(environment):
+        return is_on()
     try:
         from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
         from opentelemetry.sdk.resources import OTELResourceDetector, Resource
@@ -57,11 +59,13 @@ def start(environment: Mapping[str, str], version: str) -> bool:
     return True
 
 
-def stop() -> None:
-    """Send what is left and stop. Blocks for seconds if the endpoint does not answer."""
+def stop(seconds: float = STOP_SECONDS) -> None:
+    """Send what is left and stop, within so many seconds: an endpoint that is away must not hold up a shutdown."""
     provider, _Tracing.provider, _Tracing.tracer = _Tracing.provider, None, None
     if provider is not None:
-        provider.shutdown()
+        sending = threading.Thread(target=provider.shutdown, name="fleetmap-traces", daemon=True)
+        sending.start()
+        sending.join(seconds)
 
 
 def is_on() -> bool:
