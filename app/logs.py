@@ -1,4 +1,4 @@
-"""Server log as text lines or JSON: time, level, request, message.
+"""Server log as text lines or JSON: time, level, request, trace if there is one, message.
 
 Callers must not log tokens, bodies, or paths of this machine.
 """
@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any, Literal
+
+from app import traces
 
 LogFormat = Literal["text", "json"]
 
@@ -25,6 +27,7 @@ def config(level: str, form: LogFormat) -> dict[str, Any]:
     """
     formatter = {"text": TextFormatter, "json": JsonFormatter}[form]
     levels = {"app": level.upper(), "uvicorn": level.upper(), "asyncio": "WARNING", "sqlalchemy": "WARNING"}
+    levels["opentelemetry"] = "WARNING"
     return {
         "version": 1,
         "disable_existing_loggers": False,
@@ -49,7 +52,8 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Format a record as one line, with control characters escaped, and a traceback below it."""
-        head = f"{_time(record)} {record.levelname:<7} {REQUEST_ID.get() or '-'} {record.name}: "
+        trace = f" trace={traces.trace_id()}" if traces.trace_id() else ""
+        head = f"{_time(record)} {record.levelname:<7} {REQUEST_ID.get() or '-'}{trace} {record.name}: "
         text = record.getMessage()
         if not text.isprintable():
             text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
@@ -69,6 +73,8 @@ class JsonFormatter(logging.Formatter):
         }
         if REQUEST_ID.get():
             entry["request"] = REQUEST_ID.get()
+        if traces.trace_id():
+            entry["trace_id"] = traces.trace_id()
         entry |= getattr(record, "fields", {})
         if record.exc_info:
             entry["trace"] = self.formatException(record.exc_info)

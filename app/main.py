@@ -20,7 +20,7 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__, derive, housekeeping, logs, ogc
+from app import __version__, derive, housekeeping, logs, ogc, traces
 from app import formats as every_format
 from app.api import events, health, maps, page, ros2, routers
 from app.api.http import openapi, problems
@@ -67,6 +67,7 @@ from app.sandbox import SandboxPolicy
 from app.signing import Keys, MountedKeys, SharedKeys, SigningKeys
 from app.store.scrub import Scrub
 from app.store.store import Store
+from app.watch import operation_metrics
 
 log = logging.getLogger(__name__)
 
@@ -99,6 +100,7 @@ def create_app(settings: Settings) -> FleetMapApp:
 
 @contextlib.asynccontextmanager
 async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]:
+    traces.start(os.environ, __version__)
     services = await run_in_threadpool(open_services, settings)
     app.state.services = services
     app.state.feed = events.EventFeed(services)
@@ -119,6 +121,7 @@ async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]
         for one in (*publishing, *([listener] if listener else [])):
             await run_in_threadpool(one.close)
         await run_in_threadpool(close_services, services)
+        await run_in_threadpool(traces.stop)
 
 
 def from_environment() -> FleetMapApp:
@@ -260,7 +263,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         fetched: set[str] = set()
         while True:
             try:
-                return by.run(function, *args, **more)
+                with traces.span(f"worker {function.__name__}"):
+                    return by.run(function, *args, **more)
             except DatabaseDamaged as error:  # found by a worker
                 store.note_damage(error)
                 raise
@@ -273,15 +277,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         return run(function, *args, by=spare if pool.is_busy else pool)
 
     metrics = Metrics()
-    service = Maps(
-        store,
-        run,
-        settings.cache_dir,
-        settings.limits,
-        cache_bytes=settings.cache_bytes,
-        run_trial=run_trial,
-        shared=SharedMaps(store.made_maps) if settings.shares_maps else None,
-    )
+    service = _maps(settings, store, run, run_trial)
     service.cache.on_damage = metrics.cache_damaged.inc
     access = _authenticator(settings, store)
 
@@ -292,6 +288,8 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
     leads = open_leads(settings.direct_database, settings.data_dir)
 
     jobs, work = _conversion_jobs(settings, store, service, pool, metrics)
+    writability = Writability(store.check_writable, intake.check)
+    metrics.operation = operation_metrics(settings, store, service.cache, writability)
     tiles = Tiles(store, service.cache)
     return Services(
         options=_api_options(settings),
@@ -314,7 +312,19 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         views=Views(store, tiles),
         leads=leads,
         fleet=FleetIntake(store, leads.lead(relay.NAME), bus_vouches=_bus_vouches(settings)),
-        writability=Writability(store.check_writable, intake.check),
+        writability=writability,
+    )
+
+
+def _maps(settings: Settings, store: Store, run: Callable[..., Any], run_trial: Callable[..., Any]) -> Maps:
+    return Maps(
+        store,
+        run,
+        settings.cache_dir,
+        settings.limits,
+        cache_bytes=settings.cache_bytes,
+        run_trial=run_trial,
+        shared=SharedMaps(store.made_maps) if settings.shares_maps else None,
     )
 
 
@@ -437,7 +447,7 @@ def start_relay(settings: Settings, services: Services) -> Relay | None:
             "Zenoh router: FLEETMAP_ZENOH_USERS is set but the router listens without TLS; passwords and messages are "
             "sent in clear text"
         )
-    options = _bus_options(settings)
+    options = bus_options(settings)
     zenoh_bus = Bus(
         options,
         query_handler=partial(events.answer_zenoh_query, services, options.max_reply_bytes),
@@ -457,7 +467,7 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
         return None
     publishing = Ros2Publisher(
         Ros2Options(chosen, parse_keys(settings.ros2_keys), settings.ros2_domain_id),
-        _bus_options(settings),
+        bus_options(settings),
         settings.data_dir,
         services.leads,
         generation=services.store.generation,
@@ -471,10 +481,11 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
 def check_bus(settings: Settings) -> None:
     """Check the Zenoh settings, including their files and users. Raises FleetMapError."""
     if settings.zenoh_mode != "off":
-        bus.check(_bus_options(settings))
+        bus.check(bus_options(settings))
 
 
-def _bus_options(settings: Settings) -> BusOptions:
+def bus_options(settings: Settings) -> BusOptions:
+    """Return the options of the Zenoh session and router."""
     return BusOptions(
         mode=settings.zenoh_mode,
         listen=settings.zenoh_listen,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import AsyncIterator
 from functools import partial
 
@@ -14,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from app import main
+from app import __version__, main, traces
 from app.api.http import problems
 from app.api.http.metrics import CONTENT_TYPE, QueueCollector
 from app.api.http.responses import json_response
@@ -22,6 +23,7 @@ from app.api.http.task_performer import TaskPerformer
 from app.backends.shared_queue import QueueWorker, SharedQueue
 from app.config import Settings
 from app.errors import FleetMapError, Invalid, Unavailable
+from app.watch import disk_metrics
 
 
 def check(settings: Settings) -> None:
@@ -42,6 +44,7 @@ def create_worker(settings: Settings) -> Starlette:
 
 @contextlib.asynccontextmanager
 async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
+    traces.start(os.environ, __version__)
     services = await run_in_threadpool(main.open_services, settings)
     queue = SharedQueue(services.store.transaction, waiting=settings.conversion_queue)
 
@@ -54,6 +57,7 @@ async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
     )
     await run_in_threadpool(services.pool.start)
     app.state.services, app.state.worker, app.state.queue = services, worker, queue
+    app.state.disks = disk_metrics(settings)
     running = asyncio.create_task(worker.run())
     try:
         yield
@@ -61,6 +65,7 @@ async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
         worker.stop()
         await running
         await run_in_threadpool(main.close_services, services)
+        await run_in_threadpool(traces.stop)
 
 
 async def _healthz(request: Request) -> Response:
@@ -81,8 +86,9 @@ async def _readyz(request: Request) -> Response:
 
 
 async def _metrics(request: Request) -> Response:
-    """Return the conversions of this worker and the state of the queue."""
+    """Return the conversions of this worker, its disks and the state of the queue."""
     registry = CollectorRegistry()
     registry.register(QueueCollector(request.app.state.queue.figures))
+    registry.register(request.app.state.disks)
     conversions = generate_latest(request.app.state.services.metrics.registry)
     return Response(conversions + await run_in_threadpool(generate_latest, registry), media_type=CONTENT_TYPE)

@@ -13,14 +13,14 @@ from cryptography.x509.oid import NameOID
 
 
 class Authority:
-    """Certification authority in a folder: ``NAME.pem`` is its own certificate."""
+    """Certification authority in a folder: ``NAME.pem`` is its own certificate, valid for some days."""
 
-    def __init__(self, folder: Path, name: str = "ca") -> None:
+    def __init__(self, folder: Path, name: str = "ca", days: int = 2) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._key = ec.generate_private_key(ec.SECP256R1())
         self._name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        self.pem = self._write(name, self._name, self._key, None)
+        self.pem = self._write(name, self._name, self._key, None, days)
 
     def sign(self, name: str, days: int = 2) -> tuple[Path, Path]:
         """Create a certificate for this machine and its key; return the two files. days: remaining validity."""

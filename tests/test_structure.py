@@ -71,6 +71,7 @@ WRITERS = {
     "app/api/http/uploads.py": "files of an upload, in a workspace",
     "app/convert/cache.py": "a map's files are renamed, linked and synced as one folder, which no other store does",
     "app/convert/trials.py": "a log of which one line is appended at a time",
+    "app/doctor/workers.py": "a file that a worker must not be able to create",
     "app/events/router.py": "hands settings to its process by a descriptor",
     "app/events/security.py": "files of passwords, which the router's process reads",
     "app/ingest/online.py": "a cache by address: nobody knows the hash of what a provider will send",

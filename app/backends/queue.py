@@ -13,10 +13,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import Any, Literal, Protocol
 
+from app import traces
 from app.errors import Unavailable
 
 Urgency = Literal["robot", "person"]
@@ -75,6 +76,19 @@ class Queue(Protocol):
         """Return the state of the queue."""
 
 
+def with_parent(task: Task) -> Task:
+    """Return the task with the current span, so that its own is within it wherever it is carried out."""
+    span = traces.parent()
+    return replace(task, arguments={**task.arguments, "trace": span}) if span else task
+
+
+def carry_out(performer: Performer, task: Task) -> None:
+    """Perform a task in a span of its own."""
+    span = str(task.arguments.get("trace", ""))
+    with traces.task_span(f"task {task.kind}", span, environment=task.environment, urgency=task.urgency):
+        performer.perform(task)
+
+
 @dataclass(slots=True)
 class _Entry:
     task: Task
@@ -97,6 +111,7 @@ class LocalQueue:
 
     def submit(self, task: Task) -> None:
         """Add a task, unless one with its key waits; that becomes as urgent as this. Raises Unavailable if full."""
+        task = with_parent(task)
         with self._lock:
             present = self._waiting.get(task.key)
             if present is not None and (present.urgency == "robot" or task.urgency == "person"):
@@ -136,7 +151,7 @@ class LocalQueue:
             del self._waiting[entry.task.key]
             self._running.append(entry)
         try:
-            self._performer.perform(entry.task)
+            carry_out(self._performer, entry.task)
         finally:
             with self._lock:
                 self._running.remove(entry)

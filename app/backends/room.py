@@ -1,9 +1,11 @@
-"""Whether a disk has room."""
+"""Whether a disk has room, and how much."""
 
 from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -19,3 +21,29 @@ def check_room(folder: Path) -> None:
             os.posix_fallocate(file.fileno(), 0, ROOM_BYTES)
     finally:
         probe.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True, slots=True)
+class DiskRoom:
+    """Free space of a folder's file system, for its ordinary users: bytes and inodes.
+
+    device: number of the file system. inodes: 0 on a file system without a fixed number of them.
+    """
+
+    device: int
+    size: int
+    free: int
+    inodes: int
+    free_inodes: int
+
+
+def disk_room(folder: Path, statvfs: Callable[[Path], os.statvfs_result] = os.statvfs) -> DiskRoom:
+    """Return the free space of a folder. Raises OSError."""
+    status = statvfs(folder)
+    return DiskRoom(
+        device=folder.stat().st_dev,
+        size=status.f_blocks * status.f_frsize,
+        free=status.f_bavail * status.f_frsize,
+        inodes=status.f_files,
+        free_inodes=status.f_favail,
+    )

@@ -28,7 +28,7 @@ from sqlalchemy import Connection, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import IntegrityError
 
-from app.backends.queue import FULL, Performer, QueueFigures, Task, Urgency
+from app.backends.queue import FULL, Performer, QueueFigures, Task, Urgency, carry_out, with_parent
 from app.errors import FleetMapError, Unavailable
 
 log = logging.getLogger(__name__)
@@ -114,7 +114,7 @@ class SharedQueue:
                 return
             if row.waiting >= self._limit:
                 raise Unavailable(FULL)
-            connection.execute(_DEFER, {**values, "name": TASK, "args": json.dumps(_as_arguments(task))})
+            connection.execute(_DEFER, {**values, "name": TASK, "args": json.dumps(_as_arguments(with_parent(task)))})
 
     def cancel(self, key: str) -> None:
         """Stop the task with this key, or remove it if it waits."""
@@ -267,7 +267,7 @@ class QueueWorker:
     async def _perform(self, **arguments: Any) -> None:
         """Carry out a task in a thread; if cancelled, end it and wait for that."""
         task = _as_task(arguments)
-        work = asyncio.get_running_loop().run_in_executor(self._threads, self._performer.perform, task)
+        work = asyncio.get_running_loop().run_in_executor(self._threads, carry_out, self._performer, task)
         try:
             await asyncio.shield(work)
         except asyncio.CancelledError:

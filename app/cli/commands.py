@@ -62,6 +62,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("jobs", "jobs:commands"),
         ("migrate", "server:migrate"),
         ("verify", "verify:verify"),
+        ("doctor", "doctor:doctor"),
     ),
 }
 """Commands in the order of the help: name, and path of its function or group below ``app.cli``."""

@@ -49,9 +49,9 @@ def print_status(text: str, *, style: str | None = None) -> None:
     _console(stderr=True).print(Text(single_line(text), style=style or ""), soft_wrap=True)
 
 
-def print_result(text: str) -> None:
+def print_result(text: str, *, style: str | None = None) -> None:
     """Print a line of the result to standard output."""
-    _console(stderr=False).print(Text(single_line(text)), soft_wrap=True)
+    _console(stderr=False).print(Text(single_line(text), style=style or ""), soft_wrap=True)
 
 
 def show_json(value: Any) -> None:

@@ -16,7 +16,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -234,10 +234,10 @@ def application(settings: Settings) -> Any:
     return server_app
 
 
-def load_settings(values: Mapping[str, Any]) -> Settings:
+def load_settings(values: Mapping[str, Any], *, warn: bool = True) -> Settings:
     """Load the settings from options, the environment, ``.env`` and mounted secrets, in this order of precedence.
 
-    Raises BadParameter for invalid settings.
+    warn: whether to print warnings about unused variables. Raises BadParameter for invalid settings.
     """
     local.require_server_python("serve")
     from pydantic import ValidationError
@@ -250,7 +250,8 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
         if not Path(folder).is_dir():
             raise typer.BadParameter(f"{SECRETS_DIR}: folder {folder} not found")
         given["_secrets_dir"] = folder
-    _warn_unknown(Settings.model_fields, Path(".env"))
+    for warning in unknown_settings() if warn else ():
+        output.print_status(f"warning: {warning}", style="yellow")
     try:
         return Settings(**given)
     except ValidationError as error:
@@ -263,15 +264,16 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
         raise typer.BadParameter("; ".join(reasons)) from error
 
 
-def _warn_unknown(settings: Iterable[str], file: Path) -> None:
-    """Warn about unused FLEETMAP_ variables in the environment or in a .env file."""
+def unknown_settings(file: Path = Path(".env")) -> list[str]:
+    """Return warnings about unused FLEETMAP_ variables in the environment or in a .env file."""
+    from app.config import Settings
+
     names = dict.fromkeys(name.upper() for name in os.environ if name.upper().startswith(variables.PREFIX))
     if file.is_file():
         lines = file.read_text(errors="replace").splitlines()
         names |= dict.fromkeys(match[1].upper() for line in lines if (match := _ASSIGNED.match(line)))
-    setting_names = {f"{variables.PREFIX}{name.upper()}" for name in settings} | {SECRETS_DIR}
-    for warning in variables.unknown(names, setting_names):
-        output.print_status(f"warning: {warning}", style="yellow")
+    setting_names = {f"{variables.PREFIX}{name.upper()}" for name in Settings.model_fields} | {SECRETS_DIR}
+    return variables.unknown(names, setting_names)
 
 
 def with_flags(function: Callable[..., None]) -> Callable[..., None]:

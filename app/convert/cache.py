@@ -176,6 +176,16 @@ class Cache:
                     shutil.rmtree(old, ignore_errors=True)
         self._total = sum(size for _, size, _ in self._entries())
 
+    @property
+    def size(self) -> int:
+        """Size of the entries on disk in bytes; what other processes have added is counted at the next eviction."""
+        return self._total
+
+    @property
+    def limit(self) -> int:
+        """Size limit on disk in bytes."""
+        return self._limit
+
     def get(self, key: str) -> CachedMap | None:
         """Return the map if it is cached and intact."""
         cached_map = self._read_checked(key)

@@ -159,6 +159,27 @@ def check(options: BusOptions) -> None:
         session_configuration(options)
 
 
+def probe_router(options: BusOptions, seconds: float) -> str | None:
+    """Connect to the router as the server does, and disconnect; return the router's version if it states it.
+
+    Raises Unavailable without a connection, Invalid for unusable settings.
+    """
+    config = zenoh.Config.from_json5(session_configuration(options))
+    _set(config, "connect/timeout_ms", int(seconds * 1000))
+    try:
+        session = zenoh.open(config)
+    except Exception as error:
+        raise Unavailable(connection_error(options, error)) from error
+    try:
+        for reply in session.get("@/*/router", timeout=seconds):
+            if reply.ok is not None:
+                described = json.loads(bytes(reply.ok.payload))
+                return str(described.get("version", "")).partition("-")[0].lstrip("v") or None
+        return None
+    finally:
+        _close(session)
+
+
 def client_endpoint(listen: str) -> str:
     """Return the endpoint for clients on this machine, from the listen endpoints."""
     first = listen.split(",", maxsplit=1)[0].strip()

@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from app import traces
 from app.backends.lead import Leads
 from app.events import leader
 from app.events.bus import EVENT_CACHE_SIZE, Bus
@@ -136,7 +137,8 @@ class Relay(LeaderThread):
 
     def _publish(self, event: Event) -> None:
         # After a rename the body keeps the old name; robots subscribe to both until they have synced.
-        self._bus.publish(event.environment, event.body)
+        with traces.span("publish", environment=event.environment, type=event.body["type"], sequence=event.sequence):
+            self._bus.publish(event.environment, event.body)
 
 
 def relay_state(data_dir: Path, mode: str) -> dict[str, Any]:

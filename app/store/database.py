@@ -238,6 +238,28 @@ class Database:
             kind = NoRoom if error.errno in DISK_FULL_ERRNOS else Unavailable
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
+    def versions(self) -> dict[str, str]:
+        """Return the versions of SQLite, or of PostgreSQL and PostGIS (``missing`` without it)."""
+        with self.connection() as connection:
+            if self.sqlite:
+                return {"SQLite": str(connection.exec_driver_sql("SELECT sqlite_version()").scalar_one())}
+            version = str(connection.exec_driver_sql("SHOW server_version").scalar_one()).partition(" ")[0]
+            extension = "SELECT extversion FROM pg_extension WHERE extname = 'postgis'"
+            postgis = connection.exec_driver_sql(extension).scalar()
+        return {"PostgreSQL": version, "PostGIS": str(postgis or "missing")}
+
+    def clock_offset(self) -> float | None:
+        """Return by how many seconds the database's clock is ahead of this machine's; None if it is the same clock.
+
+        The error is at most half of the time that the query takes.
+        """
+        if self.sqlite:
+            return None
+        with self.connection() as connection:
+            sent = time.time()
+            remote = float(connection.exec_driver_sql("SELECT extract(epoch FROM clock_timestamp())").scalar_one())
+            return remote - (sent + time.time()) / 2
+
     def tables(self) -> tuple[list[str], int]:
         """Return the names of SQLite's tables, and the bytes of its pages; none on PostgreSQL."""
         if not self.sqlite:

@@ -89,3 +89,4 @@ it; ``app.store.robot_counts`` joins the rows.
 """
 
 Index("ix_robot_held", robot.c.environment_id, robot.c.channel, robot.c.held_since)
+Index("ix_robot_map", robot.c.environment_id, robot.c.channel, robot.c.held_root, robot.c.held_overlays)

@@ -176,6 +176,17 @@ class Outbox:
             position = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
         return int(position or 0)
 
+    def unsent(self, now: datetime) -> tuple[int, float]:
+        """Return the number of events that were not handed to the bus yet, and the age of the oldest in seconds."""
+        table = tables.event
+        relayed = select(tables.relay.c.position).where(tables.relay.c.id == 1)
+        with self._database.read() as connection:
+            position = int(connection.execute(relayed).scalar() or 0)
+            newest = int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one())
+            after = select(table.c.time).where(table.c.position > position).order_by(table.c.position).limit(1)
+            oldest = connection.execute(after).scalar()
+        return max(0, newest - position), 0.0 if oldest is None else max(0.0, (now - oldest).total_seconds())
+
     def set_relayed(self, position: int) -> None:
         """Store the position up to which events were handed over. It never decreases."""
         table = tables.relay

@@ -90,6 +90,11 @@ def note_compatibility(connection: Connection, script: ScriptDirectory) -> None:
     connection.execute(update(server).values(min_compatible=max(declared)))
 
 
+def present(database: Database) -> str | None:
+    """Return the revision of the database's schema; None without one."""
+    return _present(database)[0]
+
+
 def is_empty(database: Database) -> bool:
     """Return whether the database has no schema yet."""
     return _present(database)[0] is None

@@ -25,6 +25,7 @@ from app.store.documents import StoredDocument
 from app.store.drafts import Drafts
 from app.store.edge_changes import EdgeChanges
 from app.store.environments import Environments
+from app.store.fleet_figures import FleetFigures
 from app.store.garbage_collection import GarbageCollector
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
@@ -82,6 +83,7 @@ class Store:
         self.overlays = Overlays(database)
         self.robots = Robots(database)
         self.robot_counts = RobotCounts(database)
+        self.fleet_figures = FleetFigures(database)
         self.mirror_source = MirrorSource(database, self.chunks)
         self.mirror_target = MirrorTarget(database)
         self.mirrors = Mirrors(database)
@@ -186,6 +188,18 @@ class Store:
     def now(self) -> datetime:
         """Return the present by the store's clock."""
         return self._database.now()
+
+    def integrity(self) -> str | None:
+        """Check all pages of SQLite's file, without noting a problem; return it, None if intact or on PostgreSQL."""
+        return self._database.integrity(10)
+
+    def database_versions(self) -> dict[str, str]:
+        """Return the versions of the database's programs and of the schema. Raises Unavailable."""
+        return {**self._database.versions(), "schema": schema.present(self._database) or "none"}
+
+    def clock_offset(self) -> float | None:
+        """Return by how many seconds the database's clock is ahead of this machine's; None with SQLite."""
+        return self._database.clock_offset()
 
     def epoch(self) -> int:
         """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""

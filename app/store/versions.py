@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
+from app import traces
 from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent
 from app.model.templates import template_changes
 from app.store import blob_rows, chunks, drafts, dry_runs, index, outbox, parts, tables
@@ -233,6 +234,19 @@ class Versions:
         if the key was used with another fingerprint, NotFound if ``prepared.pending`` has expired; a draft is removed,
         or StaleParent is raised if it was edited meanwhile.
         """
+        with traces.span("commit", environment=environment, chunks=len(prepared.chunks), files=len(prepared.blobs)):
+            return self._commit(environment, prepared, author, message, sources, warnings, idempotency)
+
+    def _commit(
+        self,
+        environment: str,
+        prepared: Prepared,
+        author: str,
+        message: str,
+        sources: Sequence[Source],
+        warnings: Sequence[Problem],
+        idempotency: Idempotency | None,
+    ) -> Version:
         checked_text(author, "an author")
         checked_text(message, "a message")
         if prepared.blobs:

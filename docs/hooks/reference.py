@@ -36,6 +36,7 @@ from app import derive, generate
 from app.api.http import problems
 from app.api.http.auth import RequireRole
 from app.api.http.metrics import Metrics, QueueCollector, _HeadVersionCollector, _Leaders, _Scrubs
+from app.api.http.operation_metrics import GAUGES
 from app.api.http.responses import API
 from app.backends.lead import LocalLeads
 from app.backends.queue import QueueFigures
@@ -412,6 +413,7 @@ def metrics() -> str:
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
                 rows.append((code(family.name), family.type, codes(labels), family.documentation))
+    rows += [(code(gauge.name), "gauge", codes(gauge.labels), gauge.meaning) for gauge in GAUGES]
     return table(("metric", "type", "labels", "meaning"), sorted(rows))
 
 

@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from app.api.http.operation_metrics import OperationCollector
 from app.backends.lead import Leads
 from app.backends.queue import QueueFigures
 from app.store.scrub import current_state, figures
@@ -53,6 +54,7 @@ class Metrics:
         self.uploads = Counter("fleetmap_uploads", "Number of uploads and edits.", ["result"], registry=self.registry)
 
         self.queue: Callable[[], QueueFigures] | None = None
+        self.operation: OperationCollector | None = None
         self._reserve()
 
     def _reserve(self) -> None:
@@ -79,6 +81,8 @@ class Metrics:
         if self.queue is not None:
             heads.register(QueueCollector(self.queue))
         heads.register(_Leaders(leads))
+        if self.operation is not None:
+            heads.register(self.operation)
         return generate_latest(registry) + generate_latest(heads)
 
 

@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app import traces
 from app.api.http import problems
 from app.api.http.auth import (
     ANONYMOUS_VIEWER,
@@ -90,12 +91,20 @@ class Guard:
         if head_only:
             # Handle HEAD as GET without a body; routes that treat HEAD specially read it from the state.
             scope = {**scope, "method": "GET", "state": {**scope["state"], "head": True}}
-        given = _headers(scope).get(b"x-request-id", b"")
+        headers = _headers(scope)
+        given = headers.get(b"x-request-id", b"")
         request_id = given.decode() if _REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
         REQUEST_ID.set(request_id)
         answer = _ResponseSender(send, head_only, request_id)
+        with traces.request_span(scope["method"], scope["path"], headers) as span:
+            try:
+                await self._handle(scope, _RequestBody(receive, services), answer, started)
+            finally:
+                traces.end_request(span, scope["method"], _route(scope), answer.status)
+
+    async def _handle(self, scope: Scope, body: _RequestBody, answer: _ResponseSender, started: float) -> None:
+        services: Services = scope["app"].state.services
         reason = ""
-        body = _RequestBody(receive, services)
         try:
             await self._pass(scope, body, answer, services)
         except _Disconnected:
@@ -114,7 +123,7 @@ class Guard:
         except Exception as error:  # noqa: BLE001  the last place where a bug can become a 500 with a shape
             await self._reject(problems.internal_error_response(error), scope, body, answer)
         finally:
-            route = scope["state"].get("route") or _template(scope)
+            route = _route(scope)
             method = scope["method"] if scope["method"] in _METHODS else "other"
             services.metrics.requests.labels(method, route, str(answer.status)).inc()
             seconds = time.perf_counter() - started
@@ -168,9 +177,9 @@ class Guard:
         await response(scope, body, answer)
 
 
-def _template(scope: Scope) -> str:
+def _route(scope: Scope) -> str:
     """Return the path template of the route that responded, ``other`` if none did."""
-    return str(getattr(scope.get("route"), "path", "")) or "other"
+    return str(scope["state"].get("route") or getattr(scope.get("route"), "path", "")) or "other"
 
 
 def _caller(scope: Scope, principal: Principal, environment: str | None) -> Caller | None:

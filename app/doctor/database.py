@@ -1,0 +1,141 @@
+"""Checks of the database, the stored files and their backup."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+
+from app.doctor.registry import Finding, check, error, human_size, ok, warning
+from app.doctor.site import Site
+from app.errors import FleetMapError
+from app.store.scrub import current_state, figures
+from app.store.store import Store
+
+MAX_PAGES_BYTES = 2**30
+"""Maximum size in bytes of an SQLite file whose pages are checked here: reading a larger one takes too long."""
+
+OLD_SCRUB = timedelta(days=14)
+OLD_BACKUP = timedelta(days=2)
+FIRST_START = "start the server: it creates the database"
+
+
+@check
+def database(site: Site) -> Iterator[Finding]:
+    """Look whether the database answers, is intact, and has a schema for this release."""
+    place = _without_password(site)
+    if not site.has_database:
+        yield warning("there is no database yet", place, FIRST_START)
+        return
+    try:
+        versions = site.store.database_versions()
+    except FleetMapError as failure:
+        advice = "start the database; check address, user and password (FLEETMAP_DATABASE_URL) and the network"
+        yield error(failure.detail, place, advice)
+        return
+    yield ok("answers: " + ", ".join(f"{name} {version}" for name, version in versions.items()), place)
+    if versions.get("PostGIS") == "missing":
+        advice = "install PostGIS 3, and run as a superuser in this database: CREATE EXTENSION postgis"
+        yield warning("the database has no PostGIS", place, advice)
+    try:
+        site.store.check()
+    except FleetMapError as failure:
+        advice = "run `fleetmap migrate` with this release, or this server with the release of the schema"
+        yield error(failure.detail, place, advice)
+    else:
+        yield ok("the schema suits this release", place)
+
+
+@check
+def database_pages(site: Site) -> Iterator[Finding]:
+    """Check the pages of an SQLite file of moderate size."""
+    file = site.database_file
+    if file is None or not file.exists():
+        yield ok("no SQLite file: PostgreSQL checks its pages itself" if file is None else "no file yet")
+        return
+    size = file.stat().st_size
+    if size > MAX_PAGES_BYTES:
+        yield ok(f"not checked, since it has {human_size(size)}: `fleetmap verify` does that", str(file))
+        return
+    problem = site.store.integrity()
+    if problem is None:
+        yield ok("all pages are intact", str(file))
+    else:
+        yield error(problem, str(file), "stop the server, run `fleetmap verify`, and restore a backup of the database")
+
+
+@check
+def stored_files(site: Site) -> Iterator[Finding]:
+    """Look whether the blob store can be written, by a small file."""
+    place = site.settings.blob_url or str(site.settings.blob_dir)
+    if not place.startswith("s3://") and not site.settings.blob_dir.is_dir():
+        yield warning("the folder of stored files does not exist yet", place, FIRST_START)
+        return
+    if not site.has_database:
+        yield ok("not checked without a database", place)
+        return
+    try:
+        site.store.blobs.files.check()
+    except FleetMapError as failure:
+        yield error(failure.detail, place, "check address, keys and rights of the store, and whether it has space")
+    else:
+        yield ok("can be written", place)
+
+
+@check
+def stored_data(site: Site) -> Iterator[Finding]:
+    """Look at the last background check of all stored data."""
+    if not site.has_database:
+        yield ok("not checked without a database")
+        return
+    state = figures(current_state(site.store))
+    damage = {kind: count for kind, count in state["findings"].items() if count and kind != "cache"}
+    if damage:
+        listed = ", ".join(f"{count} {kind}s" for kind, count in damage.items())
+        advice = "run `fleetmap verify`, which lists the versions, then `fleetmap verify --repair`"
+        yield error(f"stored data is damaged: {listed}", "", advice)
+    hours = site.settings.scrub_hours
+    if not hours:
+        advice = "set it, or run `fleetmap verify` regularly"
+        yield warning("stored data is never checked in the background", "FLEETMAP_SCRUB_HOURS=0", advice)
+    elif state["completed"] and state["age"] > max(OLD_SCRUB.total_seconds(), 2 * hours * 3600):
+        days = state["age"] / 86_400
+        advice = "see the log for `scrub:`, or raise FLEETMAP_SCRUB_BYTES_PER_SECOND"
+        yield warning(f"the last check of stored data ended {days:.0f} days ago", "", advice)
+    elif not damage:
+        age = f"{state['age'] / 86_400:.1f} days ago" if state["completed"] else "not yet"
+        yield ok(f"no damage known; last complete check: {age}")
+
+
+def last_backup(store: Store) -> datetime | None:
+    """Return when the last backup ended; None if none is known. Raises LookupError if this release keeps no record."""
+    backups = getattr(store, "backups", None)
+    if backups is None:
+        raise LookupError
+    last: datetime | None = backups.last()
+    return last
+
+
+@check
+def backup(site: Site) -> Iterator[Finding]:
+    """Look at the age of the last backup."""
+    if not site.has_database:
+        yield ok("nothing to back up yet")
+        return
+    try:
+        last = last_backup(site.store)
+    except LookupError:
+        yield ok("not known: this release keeps no record of backups")
+        return
+    advice = "run `fleetmap backup`, and schedule it daily"
+    if last is None:
+        yield warning("no backup is known", "", advice)
+    elif site.now() - last > OLD_BACKUP:
+        yield warning(f"the last backup is {(site.now() - last).days} days old", "", advice)
+    else:
+        yield ok(f"the last backup ended {last:%Y-%m-%d %H:%M} UTC")
+
+
+def _without_password(site: Site) -> str:
+    from sqlalchemy import make_url
+
+    return make_url(site.settings.database).render_as_string(hide_password=True)

@@ -1,0 +1,23 @@
+"""An index of robots by the map that they run, so that those behind their channel are counted without the others.
+
+Revision ID: 0025
+Revises: 0021
+"""
+
+from __future__ import annotations
+
+from alembic import op
+
+revision = "0025"
+down_revision = "0021"
+branch_labels = None
+depends_on = None
+min_compatible = "0019"
+
+
+def upgrade() -> None:
+    op.create_index("ix_robot_map", "robot", ["environment_id", "channel", "held_root", "held_overlays"])
+
+
+def downgrade() -> None:
+    op.drop_index("ix_robot_map", "robot")
