@@ -62,6 +62,8 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("jobs", "jobs:commands"),
         ("migrate", "server:migrate"),
         ("verify", "verify:verify"),
+        ("backup", "backup:backup"),
+        ("restore", "backup:restore"),
     ),
 }
 """Commands in the order of the help: name, and path of its function or group below ``app.cli``."""

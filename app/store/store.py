@@ -14,6 +14,10 @@ from app.backends.notify import CommitCounter
 from app.errors import DatabaseDamaged, NoRoom, Unavailable
 from app.store import schema, tables
 from app.store.audit import Audit, record
+from app.store.backup_source import BackupSource
+from app.store.backup_target import BackupTarget, raise_epoch
+from app.store.backups import DOCUMENT as BACKUP_DOCUMENT
+from app.store.backups import Backups
 from app.store.base import utcnow
 from app.store.blob_upkeep import BlobUpkeep
 from app.store.blobs import COPIES_BYTES, Blobs
@@ -97,6 +101,9 @@ class Store:
         self.jobs = Jobs(database)
         self.audit = Audit(database)
         self.made_maps = MadeMaps(database, self.blobs.files)
+        self.backups = Backups(StoredDocument(database, self.generation, BACKUP_DOCUMENT))
+        self.backup_source = BackupSource(database, self.blobs)
+        self.backup_target = BackupTarget(database, self.blobs)
         self.garbage = GarbageCollector(database, self.chunks, self.blobs, self.blob_upkeep, self.made_maps)
 
     def migrate(self) -> None:
@@ -191,6 +198,10 @@ class Store:
         """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""
         with self._database.read() as connection:
             return int(connection.execute(select(tables.server.c.epoch)).scalar_one_or_none() or 0)
+
+    def raise_epoch(self) -> int:
+        """Raise the server's epoch after a restore by other means, so that robots accept it; returns it."""
+        return raise_epoch(self._database)
 
     def close(self) -> None:
         """Close all connections."""
