@@ -10,9 +10,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
-from app.backends.blobs import BLOCK, StoredFile, Unreadable, unreadable_error, unwritable_error
+from app.backends.blobs import BLOCK, StoredFile, unreadable_error, unwritable_error
 from app.backends.workspaces import Workspaces
-from app.errors import Conflict
+from app.errors import Conflict, Damaged
 
 PART: Final = ".part"
 """End of the name of an archive that is being written: it gets its own name when it is complete."""
@@ -60,6 +60,12 @@ class ArchiveFiles:
         except OSError as error:
             raise unwritable_error(error) from error
         self._archive, self._new = None, False
+
+    def close(self) -> None:
+        """Close an archive that was read."""
+        if self._archive is not None and not self._new:
+            self._archive.close()
+            self._archive = None
 
     def discard(self) -> None:
         """Remove an archive that is not complete."""
@@ -115,7 +121,7 @@ class ArchiveFiles:
                     self._members[member.name] = member
             except tarfile.ReadError as error:
                 if self._archive is None:
-                    raise Unreadable(f"{self._path} is no backup: it is no tar archive, or cut off") from error
+                    raise Damaged(f"{self._path} is no backup: it is no tar archive, or it is cut off") from error
             except OSError as error:
                 raise unreadable_error(error) from error
         return self._archive

@@ -24,7 +24,7 @@ KEYS: Final = "keys"
 """Name of the keys among the tables of a manifest; their rows are (name, content)."""
 
 USED_SHARE: Final = 0.5
-"""Share of a pack's objects that are still needed below which they are written again, so that the pack can go."""
+"""Share of a pack's bytes that are still needed below which these are written again, so that the pack can go."""
 
 SMALL_PACK: Final = 2**20
 MANY_PACKS: Final = 64

@@ -71,7 +71,7 @@ def read_identities(path: Path) -> list[str]:
 
 def _pyrage() -> Any:
     try:
-        import pyrage  # type: ignore[import-untyped,import-not-found,unused-ignore]
+        import pyrage
     except ImportError as error:
         raise Unavailable(
             "encrypted backups need the package pyrage: install the server's dependencies again "

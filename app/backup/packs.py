@@ -2,8 +2,9 @@
 
 A pack is ``FMPACK01``, the length of its table (4 bytes, big-endian), the table ``[[kind, name, length], …]`` as
 MessagePack, then the objects. Its name is the SHA-256 of its bytes as they are stored, encrypted or not. Beside each
-pack is an index in the clear: names of its objects, 16 bytes each, made with the place's key, and a code over all that
-needs the key as well. So a server that cannot decrypt its own backups knows what they contain.
+pack is an index in the clear: names of its objects, 16 bytes each, made with the place's key, their sizes, 4 bytes
+each, and a code over all that needs the key as well. So a server that cannot decrypt its own backups knows what they
+contain.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ PACK_BYTES: Final = 32 * 2**20
 """Size in bytes of objects at which a pack is written."""
 
 NAME_BYTES: Final = 16
+ENTRY_BYTES: Final = NAME_BYTES + 4
 CODE_BYTES: Final = 32
 
 
@@ -77,9 +79,9 @@ def part_name(file: str, number: int) -> bytes:
 
 
 class PackWriter:
-    """Collects objects and writes a pack whenever it has enough. write: stores a pack's plain bytes and its names."""
+    """Collects objects and writes a pack whenever it has enough. write: stores a pack's plain bytes and its entries."""
 
-    def __init__(self, write: Callable[[bytes, Sequence[bytes]], PackReference], key: bytes) -> None:
+    def __init__(self, write: Callable[[bytes, bytes], PackReference], key: bytes) -> None:
         self._write, self._key = write, key
         self._table: list[tuple[int, bytes, int]] = []
         self._data: list[bytes] = []
@@ -99,10 +101,11 @@ class PackWriter:
         if not self._table:
             return
         table = ormsgpack.packb(self._table)
-        names = [object_name(self._key, Kind(kind), name) for kind, name, _ in self._table]
+        names = b"".join(object_name(self._key, Kind(kind), name) for kind, name, _ in self._table)
+        sizes = b"".join(min(length, 2**32 - 1).to_bytes(4, "big") for _, _, length in self._table)
         content = b"".join((MAGIC, len(table).to_bytes(4, "big"), table, *self._data))
         self._table, self._data, self._size = [], [], 0
-        self.packs.append(self._write(content, names))
+        self.packs.append(self._write(content, names + sizes))
 
 
 def read_entries(content: bytes) -> Iterator[PackEntry]:
@@ -121,16 +124,20 @@ def read_entries(content: bytes) -> Iterator[PackEntry]:
         raise Damaged(f"the table of a pack of the backup cannot be read ({error})") from error
 
 
-def index_of(pack: PackReference, names: Sequence[bytes], key: bytes) -> bytes:
-    """Return the content of a pack's index."""
-    body = INDEX_MAGIC + pack.size.to_bytes(8, "big") + b"".join(names)
+def index_of(pack: PackReference, entries: bytes, key: bytes) -> bytes:
+    """Return the content of a pack's index. entries: the names of its objects, then their sizes."""
+    body = INDEX_MAGIC + pack.size.to_bytes(8, "big") + entries
     return body + _code(pack.name, body, key)
 
 
 def read_index(name: str, content: bytes, key: bytes) -> tuple[int, bytes] | None:
-    """Check an index; returns the size of its pack and the names, None if it is cut off or altered."""
+    """Check an index; returns the size of its pack and the entries, None if it is cut off or altered."""
     body, code = content[:-CODE_BYTES], content[-CODE_BYTES:]
-    if body[:8] != INDEX_MAGIC or len(body) % NAME_BYTES or not hmac.compare_digest(code, _code(name, body, key)):
+    if (
+        body[:8] != INDEX_MAGIC
+        or (len(body) - 16) % ENTRY_BYTES
+        or not hmac.compare_digest(code, _code(name, body, key))
+    ):
         return None
     return int.from_bytes(body[8:16], "big"), body[16:]
 
@@ -140,22 +147,26 @@ def _code(name: str, body: bytes, key: bytes) -> bytes:
 
 
 class ObjectIndex:
-    """Which pack of a place has an object, of many objects in little memory (20 bytes each).
+    """Which pack of a place has an object, of many objects in little memory (25 bytes each).
+
+    entries: of the index of each pack.
 
     Two names with equal first halves, which is next to impossible, make one of them unknown: it is written again.
     """
 
-    def __init__(self, packs: Sequence[PackReference], names: Sequence[bytes]) -> None:
+    def __init__(self, packs: Sequence[PackReference], entries: Sequence[bytes]) -> None:
         self.packs = list(packs)
-        halves = [np.frombuffer(content, ">u8").reshape(-1, 2) for content in names]
-        both: NDArray[Any] = np.concatenate(halves) if halves else np.empty((0, 2), ">u8")
-        numbers = np.repeat(np.arange(len(halves), dtype=np.int32), [len(h) for h in halves])
+        counts = [len(content) // ENTRY_BYTES for content in entries]
+        joined = b"".join(e[: n * NAME_BYTES] for e, n in zip(entries, counts, strict=True))
+        both: NDArray[Any] = np.frombuffer(joined, ">u8").reshape(-1, 2)
+        joined = b"".join(e[n * NAME_BYTES :] for e, n in zip(entries, counts, strict=True))
+        sizes = np.frombuffer(joined, ">u4")
+        numbers = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
         order = np.argsort(both[:, 0], kind="stable")
         self._first = both[order, 0].astype(np.uint64)
         self._second = both[order, 1].astype(np.uint64)
-        self._pack = numbers[order]
+        self._pack, self._size = numbers[order], sizes[order].astype(np.int64) + NAME_BYTES
         self._used = np.zeros(len(order), bool)
-        self._sizes = np.bincount(numbers, minlength=len(halves)).astype(np.int64)
 
     def find(self, names: Sequence[bytes]) -> NDArray[np.int32]:
         """Return for each object name the number of its pack, -1 if the place does not have it."""
@@ -168,7 +179,8 @@ class ObjectIndex:
         return np.where(present, self._pack[at], -1).astype(np.int32)
 
     def used_shares(self) -> NDArray[np.float64]:
-        """Return for each pack the share of its objects that ``find`` was asked for."""
-        used = np.bincount(self._pack[self._used], minlength=len(self.packs))
-        shares: NDArray[np.float64] = used / np.maximum(self._sizes, 1)
+        """Return for each pack the share of its bytes that ``find`` was asked for."""
+        count = len(self.packs)
+        used = np.bincount(self._pack[self._used], self._size[self._used], count)
+        shares: NDArray[np.float64] = used / np.maximum(np.bincount(self._pack, self._size, count), 1)
         return shares

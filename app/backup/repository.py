@@ -165,11 +165,11 @@ class Repository:
         """Return a writer of new packs."""
         return PackWriter(self._write_pack, self.key)
 
-    def _write_pack(self, content: bytes, names: Sequence[bytes]) -> PackReference:
+    def _write_pack(self, content: bytes, entries: bytes) -> PackReference:
         data = self.age.encrypt(content)
         pack = PackReference(hashlib.sha256(data).hexdigest(), len(data))
         self.files.write({pack.key: data})
-        self.files.write({pack.index_key: index_of(pack, names, self.key)})
+        self.files.write({pack.index_key: index_of(pack, entries, self.key)})
         return pack
 
     def read_pack(self, pack: PackReference) -> Iterator[PackEntry]:
@@ -191,15 +191,15 @@ class Repository:
         """Read which objects the place has, in packs that are complete."""
         sizes = {file.key.rpartition("/")[2]: file.size for file in self.files.list("packs/")}
         packs: list[PackReference] = []
-        names: list[bytes] = []
+        entries: list[bytes] = []
         for file in self.files.list("index/"):
             name = file.key.rpartition("/")[2]
             content = self._bytes(file.key, file.size)
-            entry = None if content is None else read_index(name, content, self.key)
-            if entry is not None and sizes.get(name) == entry[0]:
-                packs.append(PackReference(name, entry[0]))
-                names.append(entry[1])
-        return ObjectIndex(packs, names)
+            index = None if content is None else read_index(name, content, self.key)
+            if index is not None and sizes.get(name) == index[0]:
+                packs.append(PackReference(name, index[0]))
+                entries.append(index[1])
+        return ObjectIndex(packs, entries)
 
     def remove_unused_packs(self, snapshots: Sequence[Snapshot]) -> int:
         """Remove the packs that none of these backups consists of; returns their bytes."""
@@ -229,6 +229,7 @@ class Repository:
                 out.intact.append(self._read_snapshot(file.key, match["id"]))
             except Damaged as error:
                 out.broken[match["id"]] = error.detail
+        out.intact.sort(key=lambda snapshot: snapshot.started)
         return out
 
     def remove_snapshots(self, ids: Sequence[str]) -> None:

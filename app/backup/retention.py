@@ -26,7 +26,7 @@ class KeepRule:
 
     def outdated(self, snapshots: Sequence[Snapshot], now: datetime) -> list[Snapshot]:
         """Return the backups that go, of backups in any order. The newest one always stays."""
-        newest_first = sorted(snapshots, key=lambda snapshot: snapshot.id, reverse=True)
+        newest_first = sorted(snapshots, key=lambda snapshot: snapshot.started, reverse=True)
         days: set[str] = set()
         months: set[str] = set()
         gone: list[Snapshot] = []

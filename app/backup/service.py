@@ -16,7 +16,7 @@ from app.backends.destinations import is_foreign, open_destination, shown
 from app.backends.lead import Lead, LeadLostError, Leads
 from app.backup.check import PlaceCheck, check_place
 from app.backup.create import BackupWriter, KeyBundle
-from app.backup.repository import Repository, Snapshot, SnapshotList, choose, finish, read_description
+from app.backup.repository import Repository, Snapshot, choose, finish, read_description
 from app.backup.restore import Restorer, RestoreResult, check_release
 from app.backup.retention import KeepRule
 from app.errors import Conflict, FleetMapError, Invalid, Unavailable
@@ -190,18 +190,17 @@ def opened_place(
     Raises Invalid if there are no backups, Damaged, Conflict for a newer form, Unavailable.
     """
     files = open_destination(place, scratch, new=False)
-    description = read_description(files)
-    repository = None
-    if description is not None:
-        repository = Repository.open(files, key=key(description.id), identities=identities)
-    if repository is None:
-        raise Invalid(f"{shown(place)} has no backups: fleetmap-backup.json is missing")
-    yield repository
-
-
-def list_backups(repository: Repository) -> SnapshotList:
-    """List the backups of a place."""
-    return repository.snapshots()
+    try:
+        description = read_description(files)
+        repository = None
+        if description is not None:
+            repository = Repository.open(files, key=key(description.id), identities=identities)
+        if repository is None:
+            raise Invalid(f"{shown(place)} has no backups: fleetmap-backup.json is missing")
+        yield repository
+    finally:
+        if isinstance(files, ArchiveFiles):
+            files.close()
 
 
 def verify_place(repository: Repository, progress: Progress = lambda size: None) -> PlaceCheck:
