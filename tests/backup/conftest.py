@@ -116,7 +116,10 @@ def empty_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[NewS
         request.getfixturevalue("postgres_cluster").drop_database(name)
 
 
-def rows_of(store: Store) -> dict[str, list[tuple[Any, ...]]]:
+Rows = dict[str, list[tuple[Any, ...]]]
+
+
+def rows_of(store: Store) -> Rows:
     """Read the rows of all tables that a backup contains."""
     out = {}
     with store._database.read() as connection:

@@ -16,7 +16,7 @@ from app.errors import Conflict, Damaged, Invalid, Unavailable
 from app.store import schema
 from app.store.backup_target import BackupTarget
 from app.store.store import Store
-from tests.backup.conftest import NewStore, back_up, restore_into, rows_of
+from tests.backup.conftest import NewStore, Rows, back_up, fill, restore_into, rows_of
 from tests.store.samples import GRID
 from tests.store.test_verify import spoil_chunk
 
@@ -81,13 +81,24 @@ SPOILT = {
 }
 
 
+@pytest.fixture(scope="module")
+def finished_backup(migrated_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Rows]:
+    """A place with one backup, which tests copy, and the rows that are in it."""
+    folder = tmp_path_factory.mktemp("finished")
+    shutil.copyfile(migrated_file, folder / "one.sqlite3")
+    with closing(Store(f"sqlite:///{folder / 'one.sqlite3'}", folder / "blobs")) as store:
+        store.migrate()
+        fill(store)
+        back_up(store, folder / "backup", folder / "data")
+        return folder / "backup", rows_of(store)
+
+
 @pytest.mark.parametrize("case", SPOILT)
 def test_spoilt_backup_is_refused_and_nothing_served(
-    case: str, sqlite_store: Store, tmp_path: Path, empty_store: NewStore
+    case: str, finished_backup: tuple[Path, Rows], tmp_path: Path, empty_store: NewStore
 ) -> None:
     spoil, kind, text = SPOILT[case]
-    place = tmp_path / "backup"
-    back_up(sqlite_store, place, tmp_path / "data")
+    place = shutil.copytree(finished_backup[0], tmp_path / "backup")
     spoil(place)
     target = empty_store()
     with pytest.raises(kind, match=text):
@@ -110,7 +121,7 @@ def test_altered_pack_is_refused_where_it_can_no_longer_be_served(
     target = empty_store()
     with pytest.raises(Damaged, match="does not match its hash"):
         restore_into(target, place, tmp_path / "other")
-    for refused in (target.check, target.initialise):
+    for refused in (target.check, target.migrate):
         with pytest.raises(Unavailable, match="being restored into this database"):
             refused()
     restore_into(target, tmp_path / "intact", tmp_path / "other")
@@ -290,11 +301,38 @@ STEPS = ("begin", "write_chunks", "write_blob_rows", "remove_blob_rows", "write_
 
 @pytest.mark.parametrize("step", STEPS)
 def test_interrupted_restore_is_refused_and_repeated(
-    step: str, store: Store, tmp_path: Path, empty_store: NewStore, monkeypatch: pytest.MonkeyPatch
+    step: str,
+    finished_backup: tuple[Path, Rows],
+    tmp_path: Path,
+    empty_store: NewStore,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    place = tmp_path / "backup"
-    back_up(store, place, tmp_path / "data")
+    place, rows = finished_backup
     target = empty_store()
+    interrupt(step, target, place, tmp_path, monkeypatch)
+    with pytest.raises(Unavailable, match="being restored"):
+        target.initialise()
+    restore_into(target, place, tmp_path / "other")
+    target.check()
+    assert rows_of(target) == rows
+    assert target.verifier().run().findings == []
+
+
+def test_interrupted_restore_on_any_database(
+    store: Store, tmp_path: Path, empty_store: NewStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    back_up(store, tmp_path / "backup", tmp_path / "data")
+    target = empty_store()
+    for step in ("write_table", "complete"):
+        interrupt(step, target, tmp_path / "backup", tmp_path, monkeypatch)
+        with pytest.raises(Unavailable, match="being restored"):
+            target.check()
+    restore_into(target, tmp_path / "backup", tmp_path / "other")
+    assert rows_of(target) == rows_of(store)
+
+
+def interrupt(step: str, target: Store, place: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restore until a step: after it if it can be repeated, else before it."""
     real = getattr(BackupTarget, step)
 
     def killed(*args: object) -> None:
@@ -305,13 +343,7 @@ def test_interrupted_restore_is_refused_and_repeated(
     with monkeypatch.context() as patch:
         patch.setattr(BackupTarget, step, killed)
         with pytest.raises(KeyboardInterrupt):
-            restore_into(target, place, tmp_path / "other")
-    with pytest.raises(Unavailable, match="being restored"):
-        target.initialise()
-    restore_into(target, place, tmp_path / "other")
-    target.check()
-    assert rows_of(target) == rows_of(store)
-    assert target.verifier().run().findings == []
+            restore_into(target, place, folder / "other")
 
 
 def test_raised_epoch_is_higher_than_after_an_earlier_restore(store: Store) -> None:
