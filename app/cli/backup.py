@@ -92,8 +92,7 @@ def backup(
 
     rule = None if keep is None else parse_rule(keep)
     chosen = BackupOptions(tuple(recipients or ()), _identities(identity), rule)
-    os.umask(0o077)
-    os.nice(NICENESS)
+    _stand_back()
     result = _back_up(settings, place, chosen, keys=keys)
     if as_json:
         output.show_json(_as_dict(result))
@@ -101,6 +100,12 @@ def backup(
         _show(result)
     if result.snapshot.damaged:
         raise typer.Exit(1)
+
+
+def _stand_back() -> None:
+    """Let this process's files be read by its user only, and the server go first."""
+    os.umask(0o077)
+    os.nice(NICENESS)
 
 
 def _back_up(settings: Settings, place: str, chosen: Any, *, keys: bool) -> BackupResult:
