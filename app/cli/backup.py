@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from app.signing import SigningKeys
     from app.store.store import Store
 
-NICENESS = 10
+NICENESS = 19
 """How much a backup stands back behind the server for processors."""
 
 DatabaseUrl = Annotated[str | None, typer.Option("--database-url", help="Database [default: FLEETMAP_DATABASE_URL].")]
@@ -79,6 +79,7 @@ def backup(
     local.require_server_python("backup")
     if show_list and verify:
         raise typer.BadParameter("--list and --verify cannot be combined")
+    _stand_back()  # before imports, which take seconds
     settings = _settings(database_url, data_dir, blob_url)
     if show_list or verify:
         with _opened(settings, place, identity) as repository:
@@ -92,7 +93,6 @@ def backup(
 
     rule = None if keep is None else parse_rule(keep)
     chosen = BackupOptions(tuple(recipients or ()), _identities(identity), rule)
-    _stand_back()
     result = _back_up(settings, place, chosen, keys=keys)
     if as_json:
         output.show_json(_as_dict(result))

@@ -128,6 +128,6 @@ def test_epoch_is_raised_after_a_restore_by_other_means(tmp_path: Path, capfd: O
         assert sync(api, tmp_path / "robot") == (1, 0)
         epoch = command(capfd, "restore", "--raise-epoch", "--data-dir", tmp_path / "data")["epoch"]
         promote(api, 1)
-        answer = api.get("environments/farm/channels/production/manifest").json()
+        answer = api.get("environments/farm/versions/production/manifest?formats=tmap2").json()
         assert answer["epoch"] == epoch
         assert sync(api, tmp_path / "robot")[0] == 1
