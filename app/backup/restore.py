@@ -6,7 +6,6 @@ leaves nothing that a server would serve; the next one begins anew there.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -193,9 +192,6 @@ class Restorer:
             if rows != content.rows:
                 raise Damaged(f"the backup has {rows} rows of the table {content.name} instead of {content.rows}")
             count += rows
-            for path in set(paths):
-                with contextlib.suppress(FileNotFoundError):
-                    path.unlink()
         return count
 
 

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -45,7 +46,8 @@ WRITERS = 5
 PAUSE_SECONDS = 0.1
 """Pause of a writer after a commit: so many writers would otherwise measure the server's processor."""
 
-PHASE_SECONDS = 15.0
+PHASE_SECONDS = 30.0
+CYCLES = 3
 ROBOTS = 20
 MAX_SLOWER, MAX_WRITTEN, MIN_VERIFY_MB, MIN_OF_SHA256SUM = 1.1, 1.1, 500.0, 0.8
 ENVIRONMENT = "filled"
@@ -61,7 +63,7 @@ def rows() -> list[dict[str, Any]]:
             store.migrate()
             fill(store, int(GIGABYTES * 2**30))
         with running_server(data) as (server, client):
-            out, acknowledged = _during(server, client, data, place)
+            out, acknowledged = _during(client, data, place)
             out += _incremental(client, data, place)
             robots = _Robots(server.address, folder / "robots")
             robots.sync()
@@ -158,41 +160,57 @@ def fleetmap(*arguments: str) -> Any:
 
 
 def _during(
-    server: ServerProcess, client: httpx.Client, data: Path, place: Path
+    client: httpx.Client, data: Path, place: Path
 ) -> tuple[list[dict[str, Any]], dict[str, dict[tuple[str, int], str]]]:
-    """Measure commits before, during and after a first backup; what was acknowledged before and after it."""
-    del server
+    """Measure commits without and during backups; returns what was acknowledged before and after the first one."""
     writers = Writers(client)
     time.sleep(PHASE_SECONDS / 3)
-    marks = [time.monotonic()]
-    time.sleep(PHASE_SECONDS)
-    marks.append(time.monotonic())
-    before = dict(writers.versions)
-    result = fleetmap("backup", str(place), "--keys", "--data-dir", str(data))
-    marks.append(time.monotonic())
-    time.sleep(PHASE_SECONDS)
-    marks.append(time.monotonic())
+    acknowledged: dict[str, dict[tuple[str, int], str]] = {}
+    quiet, busy = _Phase(), _Phase()
+    size = 0
+    for cycle in range(CYCLES):
+        quiet.measure(writers, lambda: time.sleep(PHASE_SECONDS))
+        acknowledged.setdefault("before", dict(writers.versions))
+        into = place if cycle == 0 else place.with_name(f"backup{cycle}")
+        size = busy.measure(writers, partial(_back_up, into, data))["bytes"]
+        acknowledged.setdefault("after", dict(writers.versions))
     writers.stop()
-    quiet = writers.times(marks[0], marks[1]) + writers.times(marks[2], marks[3])
-    busy = writers.times(marks[1], marks[2])
-    seconds = marks[2] - marks[1]
-    label = f"{result['bytes'] / 1e9:.1f} GB in {seconds:.0f} s, {WRITERS} writers"
+    label = f"{CYCLES} backups of {size / 1e9:.1f} GB, {busy.seconds / CYCLES:.0f} s each, {WRITERS} writers"
     return [
-        row(
-            f"commit during a backup (of {label}; peer: without)",
-            median(busy) * 1e3,
-            MAX_SLOWER,
-            "ms",
-            median(quiet) * 1e3,
-        ),
-        row(
-            "the same, commits a second (peer: during)",
-            len(quiet) / 2 / PHASE_SECONDS,
-            MAX_SLOWER,
-            "1/s",
-            len(busy) / seconds,
-        ),
-    ], {"before": before, "after": dict(writers.versions)}
+        row(f"{label}: commit (peer: without)", busy.median, MAX_SLOWER, "ms", quiet.median),
+        row("commits a second without a backup (peer: during)", quiet.rate, MAX_SLOWER, "1/s", busy.rate),
+    ], acknowledged
+
+
+def _back_up(place: Path, data: Path) -> Any:
+    return fleetmap("backup", str(place), "--keys", "--data-dir", str(data))
+
+
+class _Phase:
+    """Commits of a kind of time, which comes several times."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.times: list[float] = []
+
+    def measure(self, writers: Writers, work: Callable[[], Any]) -> Any:
+        """Do work, and take the commits meanwhile; returns its result."""
+        begin = time.monotonic()
+        result = work()
+        end = time.monotonic()
+        self.seconds += end - begin
+        self.times += writers.times(begin, end)
+        return result
+
+    @property
+    def rate(self) -> float:
+        """Commits a second."""
+        return len(self.times) / self.seconds
+
+    @property
+    def median(self) -> float:
+        """Median duration of a commit in milliseconds."""
+        return median(self.times) * 1e3
 
 
 def _incremental(client: httpx.Client, data: Path, place: Path) -> list[dict[str, Any]]:

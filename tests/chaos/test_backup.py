@@ -159,6 +159,7 @@ def is_refused(target: Path) -> bool:
 
 
 def is_complete(target: Path) -> bool:
+    """Return whether a server would serve what was restored."""
     if not (target / "fleetmap.sqlite3").exists():
         return False
     with closing(Store(f"sqlite:///{target / 'fleetmap.sqlite3'}", target / "blobs", readonly=True)) as store:
@@ -166,4 +167,4 @@ def is_complete(target: Path) -> bool:
             store.check()
         except Unavailable:
             return False
-        return True
+        return bool(store.environments.page(limit=1)[0])
