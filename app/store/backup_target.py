@@ -76,9 +76,9 @@ class BackupTarget:
             schema.create_for_restore(self._database, revision)
             return
         with self._database.write(notify=False, upkeep=True) as connection:
-            there = set(inspect(connection).get_table_names())
+            names = set(inspect(connection).get_table_names())
             for table in reversed(tables.metadata.sorted_tables):
-                if table.name in there:
+                if table.name in names:
                     connection.execute(delete(table))
             if present == revision:
                 mark = {"mark": schema.RESTORING + revision}
