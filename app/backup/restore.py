@@ -6,6 +6,7 @@ leaves nothing that a server would serve; the next one begins anew there.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,9 @@ from app.store.backup_target import BackupTarget, next_epoch
 from app.store.blob_rows import BlobRow
 from app.store.encode import decompress
 from app.store.verify import Finding, VerifyResult
+
+_FILE: Final = re.compile(r"[0-9a-f]{2}/[0-9a-f]{64}(\.[0-9a-z]+){0,2}|packs/[0-9a-f]{64}")
+"""Pattern of keys of stored files: nothing else is written, whatever a pack says."""
 
 BATCH_BYTES: Final = 4 * 2**20
 MAX_SHOWN: Final = 5
@@ -126,10 +130,13 @@ class Restorer:
         if entry.kind is Kind.CHUNK:
             pending.chunks[entry.name] = entry.data
         elif entry.kind is Kind.BLOB:
-            pending.rows.append(BlobRow(*ormsgpack.unpackb(entry.name)))
+            pending.rows.append(_blob_row(entry.name))
         elif entry.kind is Kind.PART:
-            file, _, number = entry.name.decode().rpartition("#")
-            self._take_part(file, int(number), int.from_bytes(entry.data[:4], "big"), entry.data[4:])
+            file, _, number = entry.name.decode("ascii", "replace").rpartition("#")
+            count = int.from_bytes(entry.data[:4], "big")
+            if not _FILE.fullmatch(file) or not number.isdecimal() or int(number) >= count:
+                raise Damaged(f"a pack of the backup has a file with the invalid name {file[:80]!r}")
+            self._take_part(file, int(number), count, entry.data[4:])
         else:
             name = object_name(self._repository.key, Kind.SEGMENT, entry.name)
             if name in self._wanted:
@@ -193,6 +200,17 @@ class Restorer:
                 raise Damaged(f"the backup has {rows} rows of the table {content.name} instead of {content.rows}")
             count += rows
         return count
+
+
+def _blob_row(packed: bytes) -> BlobRow:
+    """Read a blob's row. Raises Damaged."""
+    try:
+        row = BlobRow(*ormsgpack.unpackb(packed))
+    except (ValueError, TypeError) as error:
+        raise Damaged(f"a pack of the backup has an invalid row of a file ({type(error).__name__})") from error
+    if not _FILE.fullmatch(row.key):
+        raise Damaged(f"a pack of the backup has a file with the invalid name {row.key[:80]!r}")
+    return row
 
 
 def check_release(snapshot: Snapshot) -> None:

@@ -14,9 +14,9 @@ from sqlalchemy import Column, Connection, MetaData, Table, delete, func, insert
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.types import TypeEngine
 
-from app.errors import Conflict, Unavailable
+from app.errors import Conflict, Damaged, Unavailable
 from app.store import chunks, schema, tables
-from app.store.backup_tables import rows_of
+from app.store.backup_tables import dumped_tables, rows_of
 from app.store.blob_rows import BlobRow, select_rows
 from app.store.blobs import Blobs
 from app.store.database import Database
@@ -39,7 +39,7 @@ class BackupTarget:
         """
         present = schema.present_revision(self._database)
         if present is not None and present.startswith(schema.RESTORING):
-            if present not in (schema.RESTORING + revision, schema.RESTORING + schema.newest()):
+            if present != schema.RESTORING + revision:
                 raise Conflict(
                     "the restore of another backup was interrupted in this database: remove the database, create it "
                     "again, and restore then"
@@ -179,6 +179,8 @@ def _has_rows(connection: Connection, name: str) -> bool:
 
 def _table(connection: Connection, name: str, columns: Sequence[str]) -> Table:
     """Describe a table as the backup has it, whose schema may be older than that of this release."""
+    if name not in {table.name for table in dumped_tables()}:
+        raise Damaged(f"the backup has rows of the table {name[:80]}, which no backup contains")
     present = {column["name"]: column["type"] for column in inspect(connection).get_columns(name)}
     unknown = sorted(set(columns) - set(present))
     if unknown:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import ormsgpack
 import pytest
 
+from app.backup.packs import Kind, object_name, part_name
 from app.backup.repository import Repository, Snapshot
 from app.backup.service import opened_place, verify_place
 from app.errors import Conflict, Damaged, Invalid, Unavailable
 from app.store import schema
 from app.store.backup_target import BackupTarget
+from app.store.encode import compress, decompress, digest
 from app.store.store import Store
 from tests.backup.conftest import NewStore, Rows, back_up, fill, restore_into, rows_of
 from tests.store.samples import GRID
@@ -181,13 +185,6 @@ def older_snapshot(
     repository: Repository, snapshot: Snapshot, revision: str, tables: set[str], columns: set[str]
 ) -> Snapshot:
     """Write a manifest as the release before would have, with the rows of environments without the new columns."""
-    import dataclasses
-
-    import ormsgpack
-
-    from app.backup.packs import Kind, object_name
-    from app.store.encode import compress, decompress, digest
-
     wanted = {t.name: t for t in snapshot.tables}["environment"]
     entries = {
         object_name(repository.key, Kind.SEGMENT, e.name).hex(): e.data
@@ -207,6 +204,30 @@ def older_snapshot(
     rest = [environment if t.name == "environment" else t for t in snapshot.tables if t.name not in tables]
     packs = (*snapshot.packs, *writer.packs)
     return dataclasses.replace(snapshot, revision=revision, tables=tuple(rest), packs=packs)
+
+
+def test_forged_pack_writes_nothing_elsewhere(
+    finished_backup: tuple[Path, Rows], tmp_path: Path, empty_store: NewStore
+) -> None:
+    """Who may write to a place that is not encrypted can make a manifest that fits."""
+    place = shutil.copytree(finished_backup[0], tmp_path / "backup")
+    with opened_place(str(place), tmp_path, key=lambda _: None) as repository:
+        (snapshot,) = repository.snapshots().intact
+        for number, file in enumerate(("../../../escaped", "/tmp/escaped", "ab/../../escaped")):
+            writer = repository.writer()
+            writer.add(Kind.PART, part_name(file, 0), (1).to_bytes(4, "big") + b"evil")
+            writer.flush()
+            forged = dataclasses.replace(snapshot, id=f"2099010{number + 1}T000000Z-00000000")
+            repository.write_snapshot(dataclasses.replace(forged, packs=(*snapshot.packs, *writer.packs)))
+            with pytest.raises(Damaged, match="invalid name"):
+                restore_into(empty_store(), place, tmp_path / "other", forged.id)
+        foreign = dataclasses.replace(snapshot.tables[0], name="session")
+        repository.write_snapshot(
+            dataclasses.replace(snapshot, id="20990109T000000Z-00000000", tables=(*snapshot.tables, foreign))
+        )
+    with pytest.raises(Damaged, match="no backup contains"):
+        restore_into(empty_store(), place, tmp_path / "other", "20990109")
+    assert not list(tmp_path.rglob("escaped"))
 
 
 # --- places that are not empty ---
