@@ -17,6 +17,7 @@ from app.api.http.dependencies import Services
 from app.backends.lead import LeadLostError
 from app.errors import FleetMapError
 from app.fleet import next_step
+from app.store.garbage_collection import CONTENT_LEAD
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class _Housekeeping:
     def __init__(self, services: Services) -> None:
         self._services = services
         self._lead = services.leads.lead(NAME)
+        self._content = services.leads.lead(CONTENT_LEAD)
         self._newest = datetime.now(UTC)
         self._collect_at = self._newest + COLLECT_EVERY
 
@@ -69,6 +71,8 @@ class _Housekeeping:
                 await run_in_threadpool(self._run_in_each_process, is_beat)
                 if await run_in_threadpool(self._lead.try_acquire):
                     await run_in_threadpool(self._run_as_leader, is_beat)
+                else:
+                    self._content.release()
             except LeadLostError as error:
                 log.info("housekeeping: %s", error.detail)
             except FleetMapError as error:
@@ -100,10 +104,19 @@ class _Housekeeping:
             if is_beat:
                 store.sessions.sweep()
                 self._services.jobs.sweep()
-            if datetime.now(UTC) >= self._collect_at:
-                self._collect_at = datetime.now(UTC) + COLLECT_EVERY
-                store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))
+            if datetime.now(UTC) >= self._collect_at and self._content.try_acquire():
+                self._collect()
+
+    def _collect(self) -> None:
+        """Collect garbage, while no backup runs."""
+        store = self._services.store
+        self._collect_at = datetime.now(UTC) + COLLECT_EVERY
+        try:
+            store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))
+            with self._content.fenced():
                 store.garbage.collect(COLLECT_GRACE)
+        finally:
+            self._content.release()
 
 
 def _note_time(newest: datetime) -> datetime:

@@ -128,6 +128,19 @@ class Keys(SigningKeys):
             return None
         return _pack(*self._read_files())
 
+    def bring(self, content: bytes) -> None:
+        """Write the keys of an exported document into the folder, which has none.
+
+        Raises Conflict if it has keys, ValueError or KeyError if the content is no such document.
+        """
+        keys, private = _unpack(content)
+        with self._exclusive():
+            if self._stamp():
+                raise Conflict(f"{self._folder} already has signing keys: move them away first")
+            write_private(self._folder / f"{keys[0].id}.pem", _as_pem(private))
+            write_private(self._folder / "keys.json", json.dumps([k.as_dict() for k in keys], indent=1).encode())
+        self._loaded = None
+
     def _stamp(self) -> float:
         try:
             return (self._folder / "keys.json").stat().st_mtime_ns / 1.0
@@ -287,6 +300,11 @@ def _unpack(content: bytes) -> tuple[list[PublicKey], Ed25519PrivateKey]:
     members = json.loads(content)
     keys = [PublicKey.from_dict(line) for line in members["keys"]]
     return keys, _from_pem(members["private"].encode(), "the key in the database")
+
+
+def exported_key_ids(content: bytes) -> list[str]:
+    """Return the ids of the keys of an exported document, newest first."""
+    return [key.id for key in _unpack(content)[0]]
 
 
 def delegation_statement(public: bytes, environment: str, start: datetime, until: datetime) -> bytes:

@@ -69,6 +69,8 @@ PUBLIC_NAMES = {
 WRITERS = {
     "app/api/http/metrics.py": "gives room on the disk to files that Prometheus's client has made",
     "app/api/http/uploads.py": "files of an upload, in a workspace",
+    "app/backup/create.py": "rows of tables, in a workspace",
+    "app/backup/restore.py": "rows of tables and parts of files, in a workspace",
     "app/convert/cache.py": "a map's files are renamed, linked and synced as one folder, which no other store does",
     "app/convert/trials.py": "a log of which one line is appended at a time",
     "app/doctor/workers.py": "a file that a worker must not be able to create",

@@ -24,12 +24,12 @@ FOLDER: Final = re.compile(r"[0-9a-f]{2}|packs|made")
 
 
 class FolderFiles:
-    """Files below a folder."""
+    """Files below a folder. tops: pattern of the names of its folders; others belong to other uses."""
 
     remote = False
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, tops: re.Pattern[str] = FOLDER) -> None:
+        self._folder, self._tops = folder, tops
         self._workspaces = Workspaces(folder / "tmp")
 
     def prepare(self) -> None:
@@ -98,7 +98,7 @@ class FolderFiles:
         """List files. Those of other uses of the folder are left out."""
         tops = [prefix.split("/", maxsplit=1)[0]] if prefix else sorted(p.name for p in self._folder.iterdir())
         for top in tops:
-            if not FOLDER.fullmatch(top):
+            if not self._tops.fullmatch(top):
                 continue
             for path in (self._folder / top).rglob("*"):
                 key = path.relative_to(self._folder).as_posix()

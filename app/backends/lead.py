@@ -44,7 +44,9 @@ class LeadLostError(Unavailable):
 
 
 class Lead(ABC):
-    """Right to do one task. Thread-safe."""
+    """Right to do one task. Thread-safe. term: number of the election that this process won, if there are elections."""
+
+    term: int | None = None
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -181,14 +183,14 @@ class LocalLeads(Leads):
 
 
 class SharedLead(Lead):
-    """Lead by an advisory lock in the session of ``SharedLeads``. term: number of the election that it won."""
+    """Lead by an advisory lock in the session of ``SharedLeads``."""
 
     def __init__(self, leads: SharedLeads, name: str) -> None:
         super().__init__(name)
         self._leads = leads
         self.key = int.from_bytes(hashlib.sha256(f"fleetmap lead {name}".encode()).digest()[:8], "big", signed=True)
         self.is_wanted = False
-        self.term: int | None = None
+        self.term = None
 
     @property
     def is_held(self) -> bool:

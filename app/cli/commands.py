@@ -63,6 +63,8 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("migrate", "server:migrate"),
         ("verify", "verify:verify"),
         ("doctor", "doctor:doctor"),
+        ("backup", "backup:backup"),
+        ("restore", "backup:restore"),
     ),
 }
 """Commands in the order of the help: name, and path of its function or group below ``app.cli``."""

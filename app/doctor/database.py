@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime, timedelta
+from datetime import timedelta
 
 from app.doctor.registry import Finding, check, error, human_size, ok, warning
 from app.doctor.site import Site
 from app.errors import FleetMapError
 from app.store.scrub import current_state, figures
-from app.store.store import Store
 
 MAX_PAGES_BYTES = 2**30
 """Maximum size in bytes of an SQLite file whose pages are checked here: reading a larger one takes too long."""
@@ -106,33 +105,22 @@ def stored_data(site: Site) -> Iterator[Finding]:
         yield ok(f"no damage known; last complete check: {age}")
 
 
-def last_backup(store: Store) -> datetime | None:
-    """Return when the last backup ended; None if none is known. Raises LookupError if this release keeps no record."""
-    backups = getattr(store, "backups", None)
-    if backups is None:
-        raise LookupError
-    last: datetime | None = backups.last()
-    return last
-
-
 @check
 def backup(site: Site) -> Iterator[Finding]:
     """Look at the age of the last backup."""
     if not site.has_database:
         yield ok("nothing to back up yet")
         return
-    try:
-        last = last_backup(site.store)
-    except LookupError:
-        yield ok("not known: this release keeps no record of backups")
-        return
+    last, failures = site.store.backups.last(), site.store.backups.failures()
     advice = "run `fleetmap backup`, and schedule it daily"
     if last is None:
         yield warning("no backup is known", "", advice)
-    elif site.now() - last > OLD_BACKUP:
-        yield warning(f"the last backup is {(site.now() - last).days} days old", "", advice)
+    elif site.now() - last.finished > OLD_BACKUP:
+        yield warning(f"the last backup is {(site.now() - last.finished).days} days old", last.destination, advice)
     else:
-        yield ok(f"the last backup ended {last:%Y-%m-%d %H:%M} UTC")
+        yield ok(f"the last backup ended {last.finished:%Y-%m-%d %H:%M} UTC")
+    if failures.last is not None:
+        yield warning(f"{failures.count} backups failed since: {failures.last[1]}", "", "repair it, and back up")
 
 
 def _without_password(site: Site) -> str:

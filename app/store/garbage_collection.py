@@ -28,6 +28,9 @@ from app.store.made_maps import MadeMaps
 from app.store.manifest import unpack_manifest
 from app.store.robots import presence_seen
 
+CONTENT_LEAD: Final = "content"
+"""Lead of who removes content, or needs it all to stay: garbage collection and backups exclude each other."""
+
 IDEMPOTENCY_DAYS: Final = 7
 EVENT_DAYS: Final = 30
 JOB_DAYS: Final = 7

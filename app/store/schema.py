@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 RECORDED_SINCE = "0016"
 """First revision that states its ``min_compatible``: the revision of the oldest release that can use the schema."""
 
+RESTORING = "restoring-"
+"""Begin of the revision of a database that a backup is being restored into: no server may use it."""
+
 LOCK = 4_820_117_001
 """Key of PostgreSQL's advisory lock: two servers that start together migrate one after the other."""
 
@@ -90,9 +93,29 @@ def note_compatibility(connection: Connection, script: ScriptDirectory) -> None:
     connection.execute(update(server).values(min_compatible=max(declared)))
 
 
-def present(database: Database) -> str | None:
-    """Return the revision of the database's schema; None without one."""
+def present_revision(database: Database) -> str | None:
+    """Return the revision of the database's schema, None without one."""
     return _present(database)[0]
+
+
+def create_for_restore(database: Database, revision: str) -> None:
+    """Create the schema of a revision in an empty database, marked so that no server uses it.
+
+    Raises Unavailable as ``upgrade``.
+    """
+    _migrate(database, revision, marked=True)
+
+
+def upgrade_restored(database: Database) -> None:
+    """Migrate a database that is marked as being restored to the newest schema; it stays marked."""
+    present = present_revision(database) or ""
+    if present != RESTORING + newest():
+        _migrate(database, "head", marked=True, present=present.removeprefix(RESTORING))
+
+
+def unmark_restored(connection: Connection) -> None:
+    """Let servers use a database that was restored, with the newest schema."""
+    connection.execute(text("UPDATE alembic_version SET version_num = :revision"), {"revision": newest()})
 
 
 def is_empty(database: Database) -> bool:
@@ -106,11 +129,20 @@ def upgrade(database: Database) -> None:
     Raises Unavailable if this release cannot use it.
     """
     present, compatible = _present(database)
+    _check_restored(present)
     if present == newest():
         return
     if present is not None and present > newest():
         _check_compatible(present, compatible)
         return
+    _migrate(database, "head")
+
+
+def _migrate(database: Database, target: str, *, marked: bool = False, present: str | None = None) -> None:
+    """Migrate in one transaction. marked: leave the database marked as being restored.
+
+    present: revision of a database that is marked.
+    """
     from alembic import command
     from alembic.util import CommandError
 
@@ -121,8 +153,13 @@ def upgrade(database: Database) -> None:
             with connection.begin():
                 if not database.sqlite:
                     connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCK})")
+                if present is not None:
+                    connection.execute(text("UPDATE alembic_version SET version_num = :present"), {"present": present})
                 settings.attributes["connection"] = connection
-                command.upgrade(settings, "head")
+                command.upgrade(settings, target)
+                if marked:
+                    mark = {"mark": RESTORING}
+                    connection.execute(text("UPDATE alembic_version SET version_num = :mark || version_num"), mark)
         except CommandError as error:  # a newer release has migrated it in the meantime
             raise Unavailable("another server is migrating the database: start this one again") from error
         except exc.ProgrammingError as error:
@@ -135,11 +172,20 @@ def upgrade(database: Database) -> None:
 def check(database: Database) -> None:
     """Raise Unavailable unless this release can use the schema: it is the newest, or a newer one that is compatible."""
     present, compatible = _present(database)
+    _check_restored(present)
     if present is None or present < newest():
         raise Unavailable(
             f"the database's schema is {present or 'missing'}, this release needs {newest()}: run fleetmap migrate"
         )
     _check_compatible(present, compatible)
+
+
+def _check_restored(present: str | None) -> None:
+    if present is not None and present.startswith(RESTORING):
+        raise Unavailable(
+            "a backup is being restored into this database, or that was interrupted: wait until `fleetmap restore` has "
+            "ended, or run it again"
+        )
 
 
 def _check_compatible(present: str, compatible: str) -> None:

@@ -14,6 +14,10 @@ from app.backends.notify import CommitCounter
 from app.errors import DatabaseDamaged, NoRoom, Unavailable
 from app.store import schema, tables
 from app.store.audit import Audit, record
+from app.store.backup_source import BackupSource
+from app.store.backup_target import BackupTarget, raise_epoch
+from app.store.backups import DOCUMENT as BACKUP_DOCUMENT
+from app.store.backups import Backups
 from app.store.base import utcnow
 from app.store.blob_upkeep import BlobUpkeep
 from app.store.blobs import COPIES_BYTES, Blobs
@@ -99,6 +103,9 @@ class Store:
         self.jobs = Jobs(database)
         self.audit = Audit(database)
         self.made_maps = MadeMaps(database, self.blobs.files)
+        self.backups = Backups(StoredDocument(database, self.generation, BACKUP_DOCUMENT))
+        self.backup_source = BackupSource(database, self.blobs)
+        self.backup_target = BackupTarget(database, self.blobs)
         self.garbage = GarbageCollector(database, self.chunks, self.blobs, self.blob_upkeep, self.made_maps)
 
     def migrate(self) -> None:
@@ -195,7 +202,7 @@ class Store:
 
     def database_versions(self) -> dict[str, str]:
         """Return the versions of the database's programs and of the schema. Raises Unavailable."""
-        return {**self._database.versions(), "schema": schema.present(self._database) or "none"}
+        return {**self._database.versions(), "schema": schema.present_revision(self._database) or "none"}
 
     def clock_offset(self) -> float | None:
         """Return by how many seconds the database's clock is ahead of this machine's; None with SQLite."""
@@ -205,6 +212,10 @@ class Store:
         """Return the server's epoch: it rises when the database is restored from a backup; robots order by it first."""
         with self._database.read() as connection:
             return int(connection.execute(select(tables.server.c.epoch)).scalar_one_or_none() or 0)
+
+    def raise_epoch(self) -> int:
+        """Raise the server's epoch after a restore by other means, so that robots accept it; returns it."""
+        return raise_epoch(self._database)
 
     def close(self) -> None:
         """Close all connections."""

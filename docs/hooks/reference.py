@@ -35,9 +35,10 @@ from typer.main import get_command
 from app import derive, generate
 from app.api.http import problems
 from app.api.http.auth import RequireRole
-from app.api.http.metrics import Metrics, QueueCollector, _HeadVersionCollector, _Leaders, _Scrubs
+from app.api.http.metrics import Metrics, QueueCollector, _Backups, _HeadVersionCollector, _Leaders, _Scrubs
 from app.api.http.operation_metrics import GAUGES
 from app.api.http.responses import API
+from app.backends.documents import FileDocument
 from app.backends.lead import LocalLeads
 from app.backends.queue import QueueFigures
 from app.cli import commands
@@ -50,6 +51,7 @@ from app.generate import Generator
 from app.main import create_app
 from app.setting_values import format_size
 from app.store import encode, tree
+from app.store.backups import Backups
 
 FORMATS = "reference/formats"
 LIMITS = ("ge", "gt", "le")
@@ -407,9 +409,10 @@ def metrics() -> str:
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
-        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder), is_shared=False)
+        backups = Backups(FileDocument(Path(folder) / "backup"))
+        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder), is_shared=False, backups=backups)
         leaders, queue = _Leaders(LocalLeads(Path(folder))), QueueCollector(_no_tasks)
-        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), leaders, queue):
+        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), _Backups(empty), leaders, queue):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
                 rows.append((code(family.name), family.type, codes(labels), family.documentation))

@@ -22,6 +22,7 @@ from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
 from app.upload_reader import UploadHints
 from tests.bench import (
+    backup,
     closures,
     derived,
     events,
@@ -255,13 +256,15 @@ def main() -> int:
             "scale",
             "servers",
             "sizing",
+            "backup",
         ],
-        help="one of the tables; scale (half an hour), servers and sizing (with PostgreSQL) only if they are named",
+        help="one of the tables; scale (half an hour), servers and sizing (with PostgreSQL), and backup only if they "
+        "are named",
     )
     arguments = parser.parse_args()
     if arguments.only == "sizing":
         return sizing.report(arguments.json)
-    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale", "servers"):
+    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale", "servers", "backup"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
@@ -275,6 +278,7 @@ def main() -> int:
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     scale_rows = scale.rows() if arguments.only == "scale" else []
+    backup_rows = backup.rows() if arguments.only == "backup" else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
         tables |= {
@@ -284,6 +288,7 @@ def main() -> int:
             "generate": generation_rows,
             "derived": huge,
             "scale": scale_rows,
+            "backup": backup_rows,
         }
         print(json.dumps(tables, indent=2))
     else:
@@ -311,6 +316,7 @@ def main() -> int:
             "generated": generation_rows,
             "several servers": server_rows,
             "many against few": scale_rows,
+            "backup": backup_rows,
         }
         for title, rows in ratios.items():
             if not rows:
@@ -362,6 +368,7 @@ def main() -> int:
                 ogc_rows,
                 scale_rows,
                 server_rows,
+                backup_rows,
             )
             for r in rows
         )

@@ -23,7 +23,9 @@ from app.doctor import CHECKS, Finding, Site, all_checks, database, examine, reg
 from app.events import bus
 from app.events.router import Router
 from app.events.security import RouterSecurity
+from app.main import open_store
 from app.pool import Pool
+from app.store.backups import BackupRecord
 from tests.api.conftest import Api, empty_database, settings_for
 from tests.certificates import Authority
 from tests.events.conftest import free_port
@@ -167,8 +169,16 @@ def newer_schema(place: Place) -> Site:
 
 def with_backup(place: Place, age: timedelta | None) -> Site:
     site = place.site()
-    last = None if age is None else NOW - age
-    place.patch.setattr(site.store, "backups", SimpleNamespace(last=lambda: last), raising=False)
+    with closing(open_store(site.settings)) as store:
+        if age is not None:
+            store.backups.note_success(BackupRecord(NOW - age, "s3://backups", "1", 1, 1, 1.0))
+    return site
+
+
+def with_failed_backup(place: Place) -> Site:
+    site = with_backup(place, timedelta(hours=1))
+    with closing(open_store(site.settings)) as store:
+        store.backups.note_failure(NOW, "disk full")
     return site
 
 
@@ -249,6 +259,7 @@ CASES: list[Case] = [
     ("backup", "ok", "keeps no record", lambda p: p.site()),
     ("backup", "warning", "3 days old", lambda p: with_backup(p, timedelta(days=3, hours=1))),
     ("backup", "warning", "no backup", lambda p: with_backup(p, None)),
+    ("backup", "warning", "1 backups failed since: disk full", with_failed_backup),
     ("certificate-https", "ok", "trusted authority", lambda p: tls_site(p, 90, public_url="https://localhost/maps")),
     ("certificate-https", "warning", "20 days", lambda p: tls_site(p, 21)),
     ("certificate-https", "error", "1 days", lambda p: tls_site(p, 2)),

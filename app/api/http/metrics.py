@@ -7,7 +7,9 @@ With several worker processes prometheus_client keeps the counters in files (``P
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -78,6 +80,7 @@ class Metrics:
         heads = CollectorRegistry()
         heads.register(_HeadVersionCollector(store))
         heads.register(_Scrubs(store))
+        heads.register(_Backups(store))
         if self.queue is not None:
             heads.register(QueueCollector(self.queue))
         heads.register(_Leaders(leads))
@@ -142,6 +145,21 @@ class _Scrubs(Collector):
         for kind, count in state["findings"].items():
             findings.add_metric([kind], count)
         yield findings
+
+
+class _Backups(Collector):
+    """Age of the last successful backup, and failures since."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def collect(self) -> Iterable[Metric]:
+        last = self._store.backups.last()
+        age = math.inf if last is None else max(0.0, time.time() - last.finished.timestamp())
+        meaning = "Seconds since the end of the last successful backup; +Inf before the first one."
+        yield GaugeMetricFamily("fleetmap_backup_age_seconds", meaning, value=age)
+        failures = "Number of failed backups since the last successful one."
+        yield GaugeMetricFamily("fleetmap_backup_failures", failures, value=self._store.backups.failures().count)
 
 
 class QueueCollector(Collector):

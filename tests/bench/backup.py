@@ -1,0 +1,360 @@
+"""Backups: commits during one, what it contains, what a second one costs, the robots after a restore, verification.
+
+FLEETMAP_BENCH_BACKUP_GB: size of the store (1). Everything runs as an operator runs it: a server's process, 5 writers
+over HTTP, ``fleetmap backup`` and ``restore`` in processes of their own, agents in this one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import httpx
+import numpy as np
+
+from app.agent.agent import Agent
+from app.agent.options import AgentOptions
+from app.model.grid import OccupancyGrid
+from app.store.changes import Changes, Replace
+from app.store.store import Store
+from app.store.values import Source
+from tests.agent.conftest import network
+from tests.api.conftest import ADMIN
+from tests.cli.conftest import ServerProcess
+from tests.store.samples import GRID
+
+GIGABYTES = float(os.environ.get("FLEETMAP_BENCH_BACKUP_GB", "1"))
+STEP_BYTES = 24 * 2**20
+"""Bytes that each version of the filling adds: one third a grid's tiles, two thirds its upload."""
+
+SHARE_CHANGED = 0.05
+WRITERS = 5
+PAUSE_SECONDS = 0.1
+"""Pause of a writer after a commit: so many writers would otherwise measure the server's processor."""
+
+PHASE_SECONDS = 30.0
+CYCLES = 3
+ROBOTS = 20
+MAX_SLOWER, MAX_WRITTEN, MIN_VERIFY_MB, MIN_OF_SHA256SUM = 1.1, 1.1, 500.0, 0.8
+ENVIRONMENT = "filled"
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def rows() -> list[dict[str, Any]]:
+    """Measure everything on SQLite."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        data, place = folder / "data", folder / "backup"
+        with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs")) as store:
+            store.migrate()
+            fill(store, int(GIGABYTES * 2**30))
+        with running_server(data) as (server, client):
+            out, acknowledged = _during(client, data, place)
+            out += _incremental(client, data, place)
+            robots = _Robots(server.address, folder / "robots")
+            robots.sync()
+            promote(client, "writer-0", -1)
+            robots.sync()
+            port = int(server.address.rpartition(":")[2])
+        out += _restored(folder, place, acknowledged, robots, port)
+        out += _verification(folder / "restored")
+    return out
+
+
+# --- filling ---
+
+
+def fill(store: Store, size: int) -> None:
+    """Fill an environment with versions of noise, of which nothing can be compressed or shared."""
+    store.environments.create(ENVIRONMENT)
+    dice = np.random.default_rng(1)
+    for number in range(max(1, size // STEP_BYTES)):
+        _commit_noise(store, dice, number)
+
+
+def _commit_noise(store: Store, dice: np.random.Generator, number: int) -> None:
+    cells = dice.integers(0, 101, (2048, 4096), np.uint8)
+    change = Changes((Replace(GRID, OccupancyGrid(cells, 0.05, (0.0, 0.0, 0.0), mode="scale")),))
+    sha256 = store.blobs.put(dice.bytes(STEP_BYTES * 2 // 3))
+    prepared = store.versions.prepare(store.versions.get(ENVIRONMENT), change)
+    sources = [Source(f"scan{number}.bin", STEP_BYTES * 2 // 3, sha256)]
+    store.versions.commit(ENVIRONMENT, prepared, author="bench", message=str(number), sources=sources)
+
+
+# --- the server and its writers ---
+
+
+@contextlib.contextmanager
+def running_server(data: Path, port: int = 0) -> Iterator[tuple[ServerProcess, httpx.Client]]:
+    """Run a server on a data folder, with a client."""
+    variables = {"FLEETMAP_ADMIN_TOKEN": ADMIN, "FLEETMAP_LOG_LEVEL": "warning", "FLEETMAP_SCRUB_HOURS": "0"}
+    server = ServerProcess("--data-dir", str(data), "--port", str(port), environment=variables, folder=ROOT)
+    try:
+        address = server.ready()
+        headers = {"Authorization": f"Bearer {ADMIN}"}
+        with httpx.Client(base_url=f"{address}/api/v1", headers=headers, timeout=120, verify=False) as client:
+            yield server, client
+    finally:
+        server.stop()
+
+
+class Writers:
+    """Writers that commit small uploads, each to an environment of its own."""
+
+    def __init__(self, client: httpx.Client) -> None:
+        self._client = client
+        self._stopping = threading.Event()
+        self.commits: list[tuple[float, float]] = []
+        self.versions: dict[tuple[str, int], str] = {}
+        for number in range(WRITERS):
+            client.post("environments", json={"name": f"writer-{number}", "datum": {"latitude": 53, "longitude": 0}})
+        self._pool = ThreadPoolExecutor(WRITERS)
+        self._tasks = [self._pool.submit(self._write, f"writer-{number}") for number in range(WRITERS)]
+
+    def _write(self, environment: str) -> None:
+        moved = 0.0
+        while not self._stopping.is_set():
+            moved += 0.001
+            begin = time.perf_counter()
+            files = [("files", ("network.tmap2.yaml", network(moved, 100)))]
+            answer = self._client.post(f"environments/{environment}/versions", files=files)
+            answer.raise_for_status()
+            self.commits.append((time.monotonic(), time.perf_counter() - begin))
+            self.versions[environment, answer.json()["version"]] = answer.json()["root"]
+            self._stopping.wait(PAUSE_SECONDS)
+
+    def times(self, begin: float, end: float) -> list[float]:
+        """Return the durations of the commits that ended in this time."""
+        return [seconds for at, seconds in self.commits if begin <= at < end]
+
+    def stop(self) -> None:
+        """Let the writers end. Raises what they have met."""
+        self._stopping.set()
+        for task in self._tasks:
+            task.result()
+        self._pool.shutdown()
+
+
+def fleetmap(*arguments: str) -> Any:
+    """Run a command; returns its JSON."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
+    command = [sys.executable, "-m", "app.cli", *arguments, "--json"]
+    done = subprocess.run(command, env=clean, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"fleetmap {' '.join(arguments)}: {done.stdout}{done.stderr}")
+    return json.loads(done.stdout)
+
+
+def _during(
+    client: httpx.Client, data: Path, place: Path
+) -> tuple[list[dict[str, Any]], dict[str, dict[tuple[str, int], str]]]:
+    """Measure commits without and during backups; returns what was acknowledged before and after the first one."""
+    writers = Writers(client)
+    time.sleep(PHASE_SECONDS / 3)
+    acknowledged: dict[str, dict[tuple[str, int], str]] = {}
+    quiet, busy = _Phase(), _Phase()
+    size = 0
+    for cycle in range(CYCLES):
+        quiet.measure(writers, lambda: time.sleep(PHASE_SECONDS))
+        acknowledged.setdefault("before", dict(writers.versions))
+        into = place if cycle == 0 else place.with_name(f"backup{cycle}")
+        size = busy.measure(writers, partial(_back_up, into, data))["bytes"]
+        acknowledged.setdefault("after", dict(writers.versions))
+    writers.stop()
+    label = f"{CYCLES} backups of {size / 1e9:.1f} GB, {busy.seconds / CYCLES:.0f} s each, {WRITERS} writers"
+    return [
+        row(f"{label}: commit (peer: without)", busy.median, MAX_SLOWER, "ms", quiet.median),
+        row("commits a second without a backup (peer: during)", quiet.rate, MAX_SLOWER, "1/s", busy.rate),
+    ], acknowledged
+
+
+def _back_up(place: Path, data: Path) -> Any:
+    return fleetmap("backup", str(place), "--keys", "--data-dir", str(data))
+
+
+class _Phase:
+    """Commits of a kind of time, which comes several times."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self.times: list[float] = []
+
+    def measure(self, writers: Writers, work: Callable[[], Any]) -> Any:
+        """Do work, and take the commits meanwhile; returns its result."""
+        begin = time.monotonic()
+        result = work()
+        end = time.monotonic()
+        self.seconds += end - begin
+        self.times += writers.times(begin, end)
+        return result
+
+    @property
+    def rate(self) -> float:
+        """Commits a second."""
+        return len(self.times) / self.seconds
+
+    @property
+    def median(self) -> float:
+        """Median duration of a commit in milliseconds."""
+        return median(self.times) * 1e3
+
+
+def _incremental(client: httpx.Client, data: Path, place: Path) -> list[dict[str, Any]]:
+    """Measure what a second backup writes of a change: uploads, a large grid, and many small commits."""
+    former = _content_bytes(data)
+    with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs")) as store:
+        dice = np.random.default_rng(2)
+        for number in range(max(1, int(GIGABYTES * 2**30 * SHARE_CHANGED) // STEP_BYTES)):
+            _commit_noise(store, dice, number)
+    writers = Writers(client)
+    time.sleep(PHASE_SECONDS / 3)
+    writers.stop()
+    change = _content_bytes(data) - former
+    before = _folder_bytes(place)
+    begin = time.perf_counter()
+    fleetmap("backup", str(place), "--data-dir", str(data))
+    seconds = time.perf_counter() - begin
+    written = _folder_bytes(place) - before
+    label = f"second backup, {seconds:.0f} s: bytes written (peer: the change)"
+    return [row(label, written / 1e6, MAX_WRITTEN, "MB", change / 1e6)]
+
+
+def _content_bytes(data: Path) -> int:
+    """Count the bytes of chunks and files: less than what the database's file grows by."""
+    with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs", readonly=True)) as store:
+        with store._database.read() as connection:
+            chunks = int(connection.exec_driver_sql("SELECT sum(length(data)) FROM chunk").scalar_one())
+        return chunks + sum(file.size for file in store.blobs.files.list())
+
+
+def _folder_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+# --- restore ---
+
+
+class _Robots:
+    """Agents in this process, each with a map directory of its own that outlives it."""
+
+    def __init__(self, server: str, folder: Path) -> None:
+        self._server, self._folder = server, folder
+        folder.mkdir()
+
+    def sync(self) -> dict[str, int]:
+        """Let each agent sync once; returns the version that each has."""
+        with ThreadPoolExecutor(4) as pool:
+            return dict(pool.map(self._sync, range(ROBOTS)))
+
+    def _sync(self, number: int) -> tuple[str, int]:
+        name = f"robot-{number}"
+        options = AgentOptions(
+            server=self._server,
+            environment="writer-0",
+            formats=("tmap2",),
+            into=self._folder / name,
+            channel="production",
+            token=ADMIN,
+            robot=name,
+        )
+        agent = Agent(options, lambda *_, **__: None)
+        agent.open()
+        try:
+            is_done = agent.run_once()
+        finally:
+            agent.close()
+        manifest = self._folder / name / "current" / "manifest.json"
+        return name, json.loads(manifest.read_text())["version"] if is_done else -1
+
+
+def promote(client: httpx.Client, environment: str, version: int) -> int:
+    """Move the channel production; a negative version counts from the newest."""
+    if version < 0:
+        version = client.get(f"environments/{environment}/versions/latest").json()["version"] + 1 + version
+    client.put(f"environments/{environment}/channels/production", json={"version": version}).raise_for_status()
+    return version
+
+
+def _restored(
+    folder: Path, place: Path, acknowledged: dict[str, dict[tuple[str, int], str]], robots: _Robots, port: int
+) -> list[dict[str, Any]]:
+    """Restore the first backup, which the robots are ahead of, and let them converge."""
+    listed = fleetmap("backup", str(place), "--list")["backups"]
+    target = folder / "restored"
+    begin = time.perf_counter()
+    fleetmap("restore", str(place), "--snapshot", listed[0]["id"], "--data-dir", str(target))
+    seconds = time.perf_counter() - begin
+    with closing(Store(f"sqlite:///{target / 'fleetmap.sqlite3'}", target / "blobs", readonly=True)) as store:
+        roots = {
+            (e.name, v): store.versions.get(e.name, v).root
+            for e in store.environments.page(limit=100)[0]
+            if e.name != ENVIRONMENT
+            for v in range(1, e.head + 1)
+        }
+    missing = sum(roots.get(version) != root for version, root in acknowledged["before"].items())
+    invented = sum(acknowledged["after"].get(v) != root for v, root in roots.items() if v in acknowledged["after"])
+    invented += sum(v not in acknowledged["after"] and v[1] > 1 for v in roots)
+    with running_server(target, port) as (_, client):
+        version = promote(client, "writer-0", -1)
+        converged = sum(at == version for at in robots.sync().values())
+    label = f"restored in {seconds:.0f} s"
+    return [
+        row(f"{label}: acknowledged before the backup and not in it, of {len(acknowledged['before'])}", missing, 0, ""),
+        row(f"{label}: in it and never acknowledged, of {len(roots)}", invented, 0, ""),
+        row(f"{ROBOTS} robots, ahead of the backup, that do not follow the restored server", ROBOTS - converged, 0, ""),
+    ]
+
+
+# --- verification ---
+
+
+def _verification(data: Path) -> list[dict[str, Any]]:
+    """Compare ``fleetmap verify`` with sha256sum on the same data, by processor time of one core."""
+    files = [str(path) for path in data.rglob("*") if path.is_file()]
+    size = sum(Path(path).stat().st_size for path in files)
+    sums = min(_seconds(lambda: subprocess.run(["sha256sum", *files], check=True, capture_output=True)) for _ in "12")
+    ours = min(_seconds(lambda: fleetmap("verify", "--data-dir", str(data))) for _ in "12")
+    start = _seconds(lambda: fleetmap("verify", "--data-dir", str(_empty(data.parent))))
+    speed, floor = size / (ours - start) / 1e6, size / sums / 1e6
+    label = f"fleetmap verify of {size / 1e9:.1f} GB, a core (peer: sha256sum); or {MIN_VERIFY_MB:g} MB/s"
+    holds = speed >= MIN_VERIFY_MB or speed / floor >= MIN_OF_SHA256SUM
+    return [{**row(label, speed, MIN_OF_SHA256SUM, "MB/s", floor), "bound": f"≥ {MIN_OF_SHA256SUM:g}", "holds": holds}]
+
+
+def _empty(folder: Path) -> Path:
+    """Create a data folder without content, whose check takes what the command costs anyway."""
+    data = folder / "empty"
+    if not data.exists():
+        with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs")) as store:
+            store.migrate()
+    return data
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    """Measure the processor time of child processes."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    work()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def row(what: str, ours: float, bound: float, unit: str, peer: float | None = None) -> dict[str, Any]:
+    """Return a row of the table; the bound is of the ratio to the peer if there is one."""
+    ratio = None if not peer else ours / peer
+    holds = (ours if ratio is None else ratio) <= bound
+    shown = f"≤ {bound:g}" if bound else "0"
+    return {"what": what, "peer": peer, "ours": ours, "unit": unit, "ratio": ratio, "bound": shown, "holds": holds}
