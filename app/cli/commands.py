@@ -37,6 +37,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("show", "show:show"),
         ("diff", "versions:diff"),
         ("revert", "versions:revert"),
+        ("tag", "tags:tag"),
         ("draft", "drafts:commands"),
         ("where", "position:locate"),
         ("derive", "versions:derive"),
@@ -62,6 +63,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("jobs", "jobs:commands"),
         ("migrate", "server:migrate"),
         ("verify", "verify:verify"),
+        ("retention", "retention:retention"),
     ),
 }
 """Commands in the order of the help: name, and path of its function or group below ``app.cli``."""
