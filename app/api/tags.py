@@ -11,29 +11,29 @@ from app.api.http.auth import Editor
 from app.api.http.dependencies import ServicesDep
 from app.api.http.parameters import parse_version_ref
 from app.api.http.responses import api_router, json_response
-from app.api.http.schemas import EnvironmentPath, VersionOut, VersionPath, problem_responses
-from app.store.pending import check_committed
+from app.api.http.schemas import VERSION, EnvironmentPath, VersionOut, problem_responses
 from app.store.tags import TAG_NAME
 
 TagPath = Annotated[
     str, Path(pattern=f"^{TAG_NAME.pattern}$", max_length=63, description="Name of the tag.", examples=["season-2026"])
 ]
 
+TaggedPath = Annotated[
+    str,
+    Path(pattern=VERSION, description="Version: number, channel, or `latest`.", examples=["1"]),
+]
+
 router = api_router("versions", "/environments/{env}/versions/{v}/tags")
 
 
-@router.put("/{tag}", responses=problem_responses(VersionOut, 404, 409, 410), summary="Tag a version")
-def put_tag(env: EnvironmentPath, v: VersionPath, tag: TagPath, services: ServicesDep, principal: Editor) -> Response:
+@router.put("/{tag}", responses=problem_responses(VersionOut, 404, 409), summary="Tag a version")
+def put_tag(env: EnvironmentPath, v: TaggedPath, tag: TagPath, services: ServicesDep, principal: Editor) -> Response:
     """Give a version a name. Retention keeps a tagged version. A tag never moves: 409 if another version has it."""
-    ref = parse_version_ref(v)
-    check_committed(ref)
-    return json_response(services.store.tags.add(env, ref, tag, author=principal.name).as_dict())
+    return json_response(services.store.tags.add(env, parse_version_ref(v), tag, author=principal.name).as_dict())
 
 
 @router.delete("/{tag}", status_code=204, responses=problem_responses(None, 404), summary="Remove a tag")
-def delete_tag(env: EnvironmentPath, v: VersionPath, tag: TagPath, services: ServicesDep, _: Editor) -> Response:
+def delete_tag(env: EnvironmentPath, v: TaggedPath, tag: TagPath, services: ServicesDep, _: Editor) -> Response:
     """Remove a tag from a version, which retention may thin from then on."""
-    ref = parse_version_ref(v)
-    check_committed(ref)
-    services.store.tags.remove(env, ref, tag)
+    services.store.tags.remove(env, parse_version_ref(v), tag)
     return Response(status_code=204)

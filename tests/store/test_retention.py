@@ -332,9 +332,12 @@ def test_deleted_and_unchanged_environments_are_left_alone(history: Store):
 
 
 def test_report_that_is_being_stored_keeps_its_version(history: Store):
-    """A report whose transaction has begun and not ended when the removal starts."""
-    version = history.versions.get("farm", 5)
-    report(history, "r1", history.versions.get("farm", 20))
+    """A report whose transaction has begun and not ended when the removal starts.
+
+    It changes only what the robot holds, so that nothing but the lock of all reports makes the removal wait for it.
+    """
+    version, head = history.versions.get("farm", 5), history.versions.get("farm")
+    report(history, "r1", head, "downloading")
     plan = next(history.retention.plan(STRICT))
     removed: list[int] = []
 
@@ -344,7 +347,7 @@ def test_report_that_is_being_stored_keeps_its_version(history: Store):
     thread = threading.Thread(target=remove)
     with history._database.write(notify=False, upkeep=True) as connection:
         owner = connection.execute(text("SELECT id FROM environment")).scalar_one()
-        body = RobotReport("production", 5, version.root, "active")
+        body = RobotReport("production", 20, head.root, "downloading", holds=(5, version.root))
         assert _note(connection, owner, ReceivedReport("farm", "r1", body, datetime.now(UTC))) is None
         thread.start()
         _wait_until_blocked(history)

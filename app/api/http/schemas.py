@@ -235,6 +235,7 @@ def problem_responses(
         404: "Not found.",
         406: "None of the accepted media types is available.",
         409: "Conflict with the present state, or several items match and none is named.",
+        410: "A rule of retention has removed the content of the version.",
         412: "The head has moved since the version on which the change is based.",
         413: "Too large.",
         415: "Unsupported media type or content coding.",
