@@ -177,7 +177,7 @@ def thin(
     unlinked = table.c.linked.is_(None) | (table.c.linked <= now)
     chosen = (table.c.environment_id == environment.id, table.c.number.in_(gone), unlinked)
     changed = update(table).where(*chosen).values(thinned=told or now, thinned_rule=rule, manifest=b"")
-    out = tuple(connection.execute(changed.returning(table.c.number)).scalars())
+    out = tuple(sorted(connection.execute(changed.returning(table.c.number)).scalars(), reverse=True))
     files = (source.c.environment_id == environment.id, source.c.number.in_(out), source.c.removed.is_(None))
     connection.execute(update(source).where(*files).values(removed=told or now))
     if out:
