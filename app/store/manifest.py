@@ -84,8 +84,8 @@ def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple
 def version_columns() -> Select[Any]:
     """Return a query of versions' rows, each with ``tags``: their names in one text, None without any."""
     table, tag = tables.version, tables.version_tag
-    mine = (tag.c.environment_id == table.c.environment_id) & (tag.c.number == table.c.number)
-    tags = select(func.aggregate_strings(tag.c.name, TAG_SEPARATOR)).where(mine)
+    of_version = (tag.c.environment_id == table.c.environment_id) & (tag.c.number == table.c.number)
+    tags = select(func.aggregate_strings(tag.c.name, TAG_SEPARATOR)).where(of_version)
     return select(table, tags.scalar_subquery().label("tags"))
 
 

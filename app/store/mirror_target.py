@@ -411,7 +411,7 @@ def _thin(connection: Connection, page: MirrorPage, now: datetime) -> None:
         row = _row_by_id(connection, page.id)
         for start in range(numbers.start, numbers.stop, BATCH):
             some = list(range(start, min(start + BATCH, numbers.stop)))
-            thin(connection, row, some, thinning.rule, now, told=thinning.time)
+            thin(connection, row, some, thinning.rule, now, recorded=thinning.time)
 
 
 def _write_overlays(

@@ -73,12 +73,12 @@ class Retention:
         """
         rule.check()
         table = tables.environment
-        own = (table.c.deleted.is_(None), table.c.centre.is_(None))
+        is_own = (table.c.deleted.is_(None), table.c.centre.is_(None))
         with self._database.read() as connection:
-            names = list(connection.execute(select(table.c.id).where(*own).order_by(table.c.name)).scalars())
+            names = list(connection.execute(select(table.c.id).where(*is_own).order_by(table.c.name)).scalars())
         for environment_id in names:
             with self._database.snapshot() as connection:
-                row = connection.execute(select(table).where(table.c.id == environment_id, *own)).one_or_none()
+                row = connection.execute(select(table).where(table.c.id == environment_id, *is_own)).one_or_none()
                 if row is not None:
                     yield self._plan(connection, row, rule, writable)
 
@@ -109,8 +109,8 @@ class Retention:
         Does nothing if the environment or the version is gone: the link leads nowhere.
         """
         table, owner = tables.version, tables.environment
-        mine = select(owner.c.id).where(owner.c.name == environment).scalar_subquery()
-        row = (table.c.environment_id == mine, table.c.number == number)
+        environment_id = select(owner.c.id).where(owner.c.name == environment).scalar_subquery()
+        row = (table.c.environment_id == environment_id, table.c.number == number)
         with self._database.read() as connection:
             noted = connection.execute(select(table.c.linked).where(*row)).scalar_one_or_none()
         if noted is not None and noted >= expires:
@@ -161,25 +161,25 @@ def thin(
     rule: str,
     now: datetime,
     since: int = 0,
-    told: datetime | None = None,
+    recorded: datetime | None = None,
 ) -> tuple[int, ...]:
     """Remove the content of versions, except of those in use; returns the numbers of the removed ones.
 
-    The caller has locked the reports of robots, then the environment's row. since: as of ``read_protection``. told:
-    time that the history tells, by default ``now``.
+    The caller has locked the reports of robots, then the environment's row. since: as of ``read_protection``. recorded:
+    time for the history, by default ``now``.
     """
     table, source = tables.version, tables.source
     protection = read_protection(connection, environment, now, since)
-    mine = (table.c.environment_id == environment.id, table.c.number.in_(numbers), table.c.thinned.is_(None))
-    rows = connection.execute(select(table.c.number, table.c.root).where(*mine).with_for_update()).all()
+    with_content = (table.c.environment_id == environment.id, table.c.number.in_(numbers), table.c.thinned.is_(None))
+    rows = connection.execute(select(table.c.number, table.c.root).where(*with_content).with_for_update()).all()
     gone = [row.number for row in rows if protection.reason(row.number, row.root) is None]
     # a link may have been made since ``protection`` was read: the row is locked only now
     unlinked = table.c.linked.is_(None) | (table.c.linked <= now)
     chosen = (table.c.environment_id == environment.id, table.c.number.in_(gone), unlinked)
-    changed = update(table).where(*chosen).values(thinned=told or now, thinned_rule=rule, manifest=b"")
+    changed = update(table).where(*chosen).values(thinned=recorded or now, thinned_rule=rule, manifest=b"")
     out = tuple(sorted(connection.execute(changed.returning(table.c.number)).scalars(), reverse=True))
     files = (source.c.environment_id == environment.id, source.c.number.in_(out), source.c.removed.is_(None))
-    connection.execute(update(source).where(*files).values(removed=told or now))
+    connection.execute(update(source).where(*files).values(removed=recorded or now))
     if out:
         _note_removal(connection, environment, now)
     return out
@@ -189,8 +189,10 @@ def _lock_environment(connection: Connection, environment_id: str) -> Row[Any] |
     """Lock reports, then an environment's row; None if it is deleted or follows another server by now."""
     table = tables.environment
     lock_reports(connection)
-    own = (table.c.deleted.is_(None), table.c.centre.is_(None))
-    return connection.execute(select(table).where(table.c.id == environment_id, *own).with_for_update()).one_or_none()
+    is_own = (table.c.deleted.is_(None), table.c.centre.is_(None))
+    return connection.execute(
+        select(table).where(table.c.id == environment_id, *is_own).with_for_update()
+    ).one_or_none()
 
 
 def _note_removal(connection: Connection, environment: Row[Any], now: datetime) -> None:

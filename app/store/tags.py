@@ -41,13 +41,15 @@ class Tags:
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             version = read_version(connection, row, resolve(connection, row, ref))
-            mine = table.c.environment_id == row.id
-            present = connection.execute(select(table.c.number).where(mine, table.c.name == name)).scalar_one_or_none()
+            in_environment = table.c.environment_id == row.id
+            present = connection.execute(
+                select(table.c.number).where(in_environment, table.c.name == name)
+            ).scalar_one_or_none()
             if present == version.number:
                 return version
             if present is not None:
                 raise Conflict(f"version {present} of {environment} has the tag {name!r}: remove it there first")
-            count = connection.execute(select(func.count()).select_from(table).where(mine)).scalar_one()
+            count = connection.execute(select(func.count()).select_from(table).where(in_environment)).scalar_one()
             if count >= MAX_TAGS:
                 raise Conflict(f"{environment} has {MAX_TAGS} tags: remove one that is no longer needed")
             now = self._database.now()

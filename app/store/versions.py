@@ -469,10 +469,10 @@ def _append_sources(connection: Connection, environment_id: str, number: int, so
     again = [s for s in dict.fromkeys(sources) if present.get((s.name, s.sha256))]
     if again:  # uploaded again after a rule had removed them
         blob_rows.lock(connection, {s.sha256 for s in again}, kept=True)
-        mine = (table.c.environment_id == environment_id) & (table.c.number == number)
+        of_version = (table.c.environment_id == environment_id) & (table.c.number == number)
         for s in again:
             same = (table.c.name == storable_text(s.name)) & (table.c.sha256 == s.sha256)
-            connection.execute(update(table).where(mine, same).values(removed=None))
+            connection.execute(update(table).where(of_version, same).values(removed=None))
     new = [s for s in dict.fromkeys(sources) if (s.name, s.sha256) not in present]
     last = connection.execute(
         select(func.max(table.c.position)).where(table.c.environment_id == environment_id, table.c.number == number)

@@ -90,6 +90,7 @@ TAGS = {
     "session": "Sign-in of browsers.",
     "search": "Search in all environments.",
     "audit": "Log of changes with author and address.",
+    "retention": "What the rule of retention keeps and removes.",
     "health": "Liveness, readiness and metrics.",
 }
 
