@@ -20,7 +20,7 @@ ROBOT := app/__init__.py app/errors.py app/event_types.py app/backends/__init__.
 # Sources of the web page. Installing builds it (app/web/build.py) with Node 20.19 or newer, which pip brings if there is none.
 PAGE := $(shell find app/web -path app/web/node_modules -prune -o -path app/web/dist -prune -o -type f -not -name openapi.json -not -name schema.d.ts -print)
 
-.PHONY: run test lint docs bench bench-web chaos fuzz figures install install-dev clean
+.PHONY: run test lint docs bench bench-web chaos fuzz figures release install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -67,6 +67,10 @@ fuzz: install-dev
 figures: install-dev
 	@$(BIN)/python -m tests.figures hostile $(ARGS)
 	@$(BIN)/python -m tests.figures faults $(ARGS)
+
+# Wheel, sdist, bill of materials, checksums and their signature (RELEASE_KEY), from the last commit, into build/release.
+release: install-dev
+	@.ci/release
 
 install: $(VENV)/.installed
 

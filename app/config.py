@@ -14,17 +14,18 @@ from typing import Any, Literal, Self
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from pydantic import Field, SecretStr, ValidationInfo, field_validator, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import SettingsConfigDict
 
 from app.events.ros_names import parse_keys, parse_selectors
 from app.limits import Limits
 from app.logs import LogFormat
+from app.retention_settings import RetentionSettings
 from app.setting_values import basemap_origin, parse_networks, parse_size
 
 _DEFAULTS = Limits()
 
 
-class Settings(BaseSettings):
+class Settings(RetentionSettings):
     """Settings of the server. Times are in seconds. Sizes (``…_bytes``) are in bytes, or a number with a unit."""
 
     model_config = SettingsConfigDict(env_prefix="FLEETMAP_", env_file=".env", extra="ignore", frozen=True)

@@ -64,6 +64,10 @@ class Gone(NotFound):
     """A resource that has been deleted."""
 
 
+class Thinned(NotFound):
+    """A version or an uploaded file whose content a rule of retention has removed."""
+
+
 class Invalid(FleetMapError):
     """Invalid parameter, name or request body."""
 

@@ -17,6 +17,7 @@ from app.api.http.dependencies import Services
 from app.backends.lead import LeadLostError
 from app.errors import FleetMapError
 from app.fleet import next_step
+from app.formats import writable_formats
 from app.store.garbage_collection import CONTENT_LEAD
 
 log = logging.getLogger(__name__)
@@ -32,6 +33,9 @@ SEARCH_BATCH = 100
 """Maximum number of environments whose names are brought up to date in one run."""
 
 COLLECT_EVERY = timedelta(hours=24)
+MAX_PAUSE = timedelta(days=3)
+"""Maximum time between two daily runs; if it was longer, the clock may be wrong, and retention waits for the next."""
+
 COLLECT_GRACE = timedelta(hours=6)
 """Minimum age of unreferenced data that the daily garbage collection removes; uploads may still use younger data."""
 
@@ -114,9 +118,29 @@ class _Housekeeping:
         try:
             store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))
             with self._content.fenced():
+                last = store.garbage.last_run()
                 store.garbage.collect(COLLECT_GRACE)
+                self._thin(last)
         finally:
             self._content.release()
+
+    def _thin(self, last: datetime | None) -> None:
+        """Apply the rule of retention; its content goes with the next collection.
+
+        last: time of the collection before. After a long pause, or a leap of the clock, versions stay for another day:
+        so a clock that is wrong for hours thins nothing.
+        """
+        rule, store = self._services.options.retention, self._services.store
+        if rule is None:
+            return
+        if last is None or not timedelta(0) <= store.now() - last <= MAX_PAUSE:
+            log.warning("retention: no daily run within %d days before: versions stay for now", MAX_PAUSE.days)
+            return
+        for plan in store.retention.plan(rule, writable_formats()):
+            removed = list(store.retention.apply(plan, rule))
+            versions, files = sum(len(r.versions) for r in removed), sum(r.files for r in removed)
+            if versions or files:
+                log.info("retention: environment=%s versions=%d files=%d", plan.environment, versions, files)
 
 
 def _note_time(newest: datetime) -> datetime:

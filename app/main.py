@@ -376,6 +376,7 @@ def _api_options(settings: Settings) -> ApiOptions:
         public_url=settings.public_url,
         basemap_url=settings.basemap_url,
         basemap_attribution=settings.basemap_attribution.strip(),
+        retention=settings.retention,
     )
 
 

@@ -211,7 +211,7 @@ def list_environments(
 @router.post(
     "",
     status_code=201,
-    responses=problem_responses(EnvironmentOut, 400, 404, 409, 415, ok=201, description="The environment"),
+    responses=problem_responses(EnvironmentOut, 400, 404, 409, 410, 415, ok=201, description="The environment"),
     summary="Create an environment",
 )
 def create_environment(body: EnvironmentBody, services: ServicesDep, principal: Admin) -> Response:

@@ -150,7 +150,9 @@ async def link_to(
 
     def sign() -> Grant:
         environment = services.store.environments.get(version.environment)
-        return services.links.create(environment, path, values, seconds or services.links.max_seconds, principal)
+        grant = services.links.create(environment, path, values, seconds or services.links.max_seconds, principal)
+        services.store.retention.note_link(version.environment, version.number, grant.expires)
+        return grant
 
     grant = await run_in_threadpool(sign)
     return LinkedFile(base + grant.url, rfc3339(grant.expires), map_file)

@@ -86,6 +86,10 @@ class MirrorPageOut(BaseModel):
     events: list[dict[str, Any]]
     channels: list[dict[str, Any]]
     overlays: list[dict[str, Any]]
+    tags: list[dict[str, Any]]
+    thinned: list[dict[str, Any]] = Field(
+        description="Versions up to `after` whose content was removed since `thinned`: `{first, last, time, rule}`."
+    )
     chunks: str = Field(description="Beginnings (8 bytes each) of the hashes of the chunks of these versions, base64.")
     nonce: str
 
@@ -214,12 +218,15 @@ def get_mirror_page(
     nonce: Nonce,
     after: Annotated[int, Query(ge=-1, lt=2**31, description="Newest version that the mirror has.")] = -1,
     sequence: Annotated[int, Query(ge=0, lt=2**63, description="Newest event that the mirror has.")] = 0,
+    thinned: Annotated[
+        ApiTime | None, Query(description="Time up to which the mirror has removed thinned versions.")
+    ] = None,
 ) -> Response:
     """Return events, versions, channels and overlays after a sequence, also of a deleted environment.
 
     Signed as a manifest is. The content is named by hashes; a mirror requests what it lacks.
     """
-    return _signed(services, {**services.store.mirror_source.page(env, after, sequence), "nonce": nonce})
+    return _signed(services, {**services.store.mirror_source.page(env, after, sequence, thinned), "nonce": nonce})
 
 
 @router.post(

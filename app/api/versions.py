@@ -36,9 +36,9 @@ from app.api.http.schemas import (
 )
 from app.api.http.streams import IN_MEMORY, range_headers, raw_response, requested_range, stream_file
 from app.api.http.uploads import UploadForm
-from app.errors import FleetMapError, Invalid, NotFound, Problem
+from app.errors import FleetMapError, Invalid, NotFound, Problem, Thinned
 from app.ingest import CommitRequest, CommitResult, Upload, dry_run_as_json
-from app.store.values import Source
+from app.store.values import Source, rfc3339
 from app.upload_reader import DRAWN_LAYERS
 
 
@@ -346,6 +346,11 @@ def get_source(
 ) -> Response:
     """Return a file byte for byte as it was uploaded, always as an attachment that a browser does not display."""
     source = _source(services.store.versions.get(env, parse_version_ref(v)).sources, name, sha256)
+    if source.removed is not None:
+        raise Thinned(
+            f"the file {source.name[:200]!r} was removed on {rfc3339(source.removed)} by a rule of retention: request "
+            f"the map in its format{'' if source.format is None else f', {source.format},'} instead"
+        )
     etag = f'"{source.sha256}"'
     headers = [
         (b"content-type", b"application/octet-stream"),
@@ -372,7 +377,8 @@ def _source(sources: tuple[Source, ...], name: str, sha256: str | None) -> Sourc
     if not fitting:
         names = ", ".join(s.name for s in sources[:20]) or "none"
         raise NotFound(f"this version has no source {name[:200]!r}; available: {names}")
-    return next((s for s in fitting if s.used), fitting[0])
+    fitting.sort(key=lambda s: (s.removed is not None, not s.used))
+    return fitting[0]
 
 
 def _upload(form: UploadForm, request: Request, commit: CommitRequest) -> tuple[Upload, CommitRequest]:

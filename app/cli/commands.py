@@ -37,6 +37,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("show", "show:show"),
         ("diff", "versions:diff"),
         ("revert", "versions:revert"),
+        ("tag", "tags:tag"),
         ("draft", "drafts:commands"),
         ("where", "position:locate"),
         ("derive", "versions:derive"),
@@ -65,6 +66,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("doctor", "doctor:doctor"),
         ("backup", "backup:backup"),
         ("restore", "backup:restore"),
+        ("retention", "retention:retention"),
     ),
 }
 """Commands in the order of the help: name, and path of its function or group below ``app.cli``."""

@@ -45,7 +45,7 @@ WORKER_PORT = 8001
 """Port of a worker's health, beside a server's."""
 
 PANELS: Mapping[str, str] = {
-    **dict.fromkeys(("data", "database", "blob", "cache", "memory"), "Data"),
+    **dict.fromkeys(("data", "database", "blob", "cache", "memory", "retention"), "Data"),
     **dict.fromkeys(
         ("host", "port", "tls", "admin", "signing", "insecure", "token", "anonymous", "header", "body"),
         "Network and access",

@@ -26,7 +26,9 @@ def versions(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the versions of an environment, newest first, with the channels that point to each.
+    """List the versions of an environment, newest first, with its tags and the channels that point to each.
+
+    A thinned version has no content any more.
 
     Without a name it lists all environments, as `environment list` does.
 
@@ -43,15 +45,15 @@ def versions(
         output.show_json(rows)
         return
     output.show_table(
-        ("version", "channels", "time (UTC)", "author", "message", "changes"),
+        ("version", "channels, tags", "time (UTC)", "author", "message", "changes"),
         (
             (
                 row["version"],
-                ", ".join(standing.get(row["version"], ())),
+                ", ".join((*standing.get(row["version"], ()), *row.get("tags", ()))),
                 output.minute(row.get("time")),
                 row.get("author"),
                 row.get("message"),
-                summary(row.get("changes") or {}),
+                "thinned" if row.get("thinned") else summary(row.get("changes") or {}),
             )
             for row in rows
         ),

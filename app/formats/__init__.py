@@ -93,6 +93,11 @@ def all_formats() -> dict[str, Format]:
     return _registry.all()
 
 
+def writable_formats() -> frozenset[str]:
+    """Return the ids of the formats that are read and written: a file of one can be made again from its layers."""
+    return frozenset(name for name, fmt in all_formats().items() if fmt.read is not None and fmt.write is not None)
+
+
 def get_format(name: str) -> Format:
     """Return the format of this name. Raises NotFound, which lists the known formats."""
     formats = all_formats()

@@ -7,6 +7,7 @@ import contextlib
 import json
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -15,6 +16,7 @@ import httpx
 from app.agent import signatures
 from app.errors import Conflict, Denied, FleetMapError, NotFound, Unauthenticated, Unavailable, Untrusted
 from app.store.mirror_source import SIGNATURE
+from app.store.values import rfc3339
 
 API: Final = "/api/v1"
 MAX_PAGE_BYTES: Final = 512 * 2**20
@@ -60,10 +62,14 @@ class Centre:
         """
         return self._signed("/mirror", {"position": position})
 
-    def page(self, environment: str, after: int, sequence: int) -> dict[str, Any]:
-        """Read what follows a version and an event. Raises NotFound, Untrusted, Denied or Unavailable."""
+    def page(self, environment: str, after: int, sequence: int, thinned: datetime | None = None) -> dict[str, Any]:
+        """Read what follows a version and an event, and what was thinned since.
+
+        Raises NotFound, Untrusted, Denied or Unavailable.
+        """
         path = f"/environments/{quote(environment, safe='')}/mirror"
-        return self._signed(path, {"after": after, "sequence": sequence})
+        since = {} if thinned is None else {"thinned": rfc3339(thinned)}
+        return self._signed(path, {"after": after, "sequence": sequence, **since})
 
     def _signed(self, path: str, query: Mapping[str, Any]) -> dict[str, Any]:
         nonce = secrets.token_urlsafe(24)

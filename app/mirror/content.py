@@ -65,9 +65,9 @@ class Fetcher:
             content = new_content(self._store.chunks.stage(), base_parts, roots)
         except Damaged as error:
             raise Unavailable(f"{page.name}: incomplete content from {self._centre.url}: {error.detail}") from error
-        uploads = [source.sha256 for version, _ in page.versions for source in version.sources]
+        uploads = [s.sha256 for version, _ in page.versions for s in version.sources if s.removed is None]
         if page.base is not None:
-            uploads += [str(source["sha256"]) for source in page.base["sources"]]
+            uploads += [str(source["sha256"]) for source in page.base["sources"] if "removed" not in source]
         wanted = list(dict.fromkeys([*uploads, *sorted(content.blobs)]))
         stored = self._store.blobs.rows(wanted)
         missing = [name for name in wanted if name not in stored]

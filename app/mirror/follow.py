@@ -200,7 +200,8 @@ class Mirror:
         return same and read_time(str(item["updated"])) == local.updated and local.centre == self._centre.url
 
     def _page(self, item: Mapping[str, Any], after: int, sequence: int, epoch: int) -> MirrorPage:
-        page = parse_page(self._centre.page(str(item["name"]), after, sequence))
+        thinned = self._store.mirror_target.newest_thinned(str(item["id"])) if after >= 0 else None
+        page = parse_page(self._centre.page(str(item["name"]), after, sequence, thinned))
         if page.id != item["id"] or page.epoch != epoch:
             raise Unavailable(f"{item['name']}: it changed at {self._centre.url} meanwhile: the next attempt follows")
         return page

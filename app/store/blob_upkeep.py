@@ -44,7 +44,8 @@ class BlobUpkeep:
             idle = sorted(set(connection.execute(query).scalars()) - referenced)
             sources: set[str] = set()
             for start in range(0, len(idle), BATCH):
-                named = select(source.c.sha256).where(source.c.sha256.in_(idle[start : start + BATCH]))
+                some = idle[start : start + BATCH]
+                named = select(source.c.sha256).where(source.c.sha256.in_(some), source.c.removed.is_(None))
                 sources.update(connection.execute(named).scalars())
         self.keep(sources)
         return self._remove([name for name in idle if name not in sources], before, young=True)

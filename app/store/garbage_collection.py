@@ -1,8 +1,9 @@
 """Garbage collection: remove what no version, dry run or draft refers to and what was not used in the grace period.
 
 Most runs cost what was written since the last one: they walk the versions since then, mark what these contain as kept,
-and look only at what is not kept. Content of versions goes only when an environment is purged; the run after that, and
-one a month, looks at everything, also for files without a row and for events of purged environments.
+and look only at what is not kept. Content of versions goes only when an environment is purged or versions are thinned;
+the run after that, and one a month, looks at everything, also for files without a row and for events of purged
+environments. After thinning that run waits for the grace period, since somebody may still read what was thinned.
 
 It never races an upload. The chunks that a version in progress relies on are part of its base version, which exists
 while it is marked (else the commit fails), or were written or used again within the grace period. Rows are removed with
@@ -12,12 +13,13 @@ a condition on that time, in the statement that finds them.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Container, Iterable
+from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from types import MappingProxyType
 from typing import Final
 
-from sqlalchemy import ColumnElement, Connection, Table, delete, select, update
+from sqlalchemy import ColumnElement, Connection, Table, delete, func, literal, select, update
 
 from app.store import chunks, drafts, dry_runs, parts, tables
 from app.store.blob_upkeep import BlobUpkeep
@@ -26,6 +28,7 @@ from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.made_maps import MadeMaps
 from app.store.manifest import unpack_manifest
+from app.store.retention import EnvironmentPlan
 from app.store.robots import presence_seen
 
 CONTENT_LEAD: Final = "content"
@@ -90,7 +93,9 @@ class GarbageCollector:
         drafts.remove_expired(self._database)
         with self._database.read() as connection:
             state = connection.execute(select(tables.collection)).one()
-        complete = state.purges != state.collected or started - state.complete > COMPLETE_SECONDS
+        is_quiet = state.thinned < before
+        is_due = state.purges != state.collected and is_quiet
+        complete = is_due or started - state.complete > COMPLETE_SECONDS
         if complete:
             counts = self._collect_all(before)
         else:
@@ -98,7 +103,8 @@ class GarbageCollector:
         temporary = self._blobs.files.recover()
         self._made_maps.collect()
         self._tidy(complete=complete)
-        done = {"time": started, **({"complete": started, "collected": state.purges} if complete else {})}
+        done = {"time": started, **({"complete": started} if complete else {})}
+        done |= {"collected": state.purges} if complete and is_quiet else {}
         with self._database.write(notify=False, upkeep=True) as connection:
             connection.execute(update(tables.collection).values(done))
         return {**counts, "temporary": counts["temporary"] + temporary}
@@ -108,12 +114,43 @@ class GarbageCollector:
         with self._database.write(notify=False, upkeep=True) as connection:
             connection.execute(update(tables.collection).values(purges=tables.collection.c.purges + 1))
 
+    def last_run(self) -> datetime | None:
+        """Return when the last collection began; None if there was none."""
+        with self._database.read() as connection:
+            seconds = int(connection.execute(select(tables.collection.c.time)).scalar_one())
+        return datetime.fromtimestamp(seconds, UTC) if seconds else None
+
+    def removable_bytes(self, plans: Iterable[EnvironmentPlan] = ()) -> tuple[int, int]:
+        """Return the bytes that a complete collection would remove, and those stored in all; changes nothing.
+
+        plans: count what these would remove as removed. Reads the inner nodes of all trees, like such a collection.
+        """
+        listed = list(plans)
+        without = {plan.id: frozenset(plan.thinned) for plan in listed}
+        files = {(plan.id, *file) for plan in listed for file in plan.files}
+        with self._database.snapshot() as connection:
+            roots = [*_roots(connection, [tables.version], without=without), *_roots(connection, _PENDING)]
+            sources = _used_sources(connection, without, files) | _pending_sources(connection)
+        live = self._walk(roots) | _References(set(), sources)
+        chunk, blob = tables.chunk, tables.blob
+        removable = total = 0
+        with self._database.snapshot() as connection:
+            connection.execution_options(stream_results=True)
+            for name, size in connection.execute(select(chunk.c.hash, func.length(chunk.c.data))):
+                total += size
+                removable += 0 if bytes(name) in live.chunks else size
+            for name, size in connection.execute(select(blob.c.sha256, func.coalesce(blob.c.stored, blob.c.size))):
+                total += size
+                removable += 0 if name in live.blobs else size
+        return removable, total
+
     def _collect_all(self, before: int) -> dict[str, int]:
         self._chunks.forget()
         # one snapshot: else content could be missed if it is cloned and its origin purged during the walk
         with self._database.snapshot() as connection:
             kept_roots = _roots(connection, [tables.version])
-            sources = set(connection.execute(select(tables.source.c.sha256).distinct()).scalars())
+            present = tables.source.c.removed.is_(None)
+            sources = set(connection.execute(select(tables.source.c.sha256).where(present).distinct()).scalars())
             pending_roots, pending_sources = _roots(connection, _PENDING), _pending_sources(connection)
         kept = self._walk(kept_roots) | _References(set(), sources)
         live = kept | self._walk(pending_roots, kept.chunks) | _References(set(), pending_sources)
@@ -219,19 +256,43 @@ class _Either:
         return name in self._one or name in self._other
 
 
-def _roots(connection: Connection, of: Iterable[Table], *conditions: ColumnElement[bool]) -> list[bytes]:
-    """Return the parts of versions, dry runs or drafts, each once.
+def _roots(
+    connection: Connection,
+    of: Iterable[Table],
+    *conditions: ColumnElement[bool],
+    without: Mapping[str, Collection[int]] = MappingProxyType({}),
+) -> list[bytes]:
+    """Return the parts of versions, dry runs or drafts, each once; a thinned version has none.
 
-    An expired one counts as long as its row exists: a commit of it may have begun before it expired.
+    An expired one counts as long as its row exists: a commit of it may have begun before it expired. without: numbers
+    of versions to leave out, by environment.
     """
     hashes: dict[str, None] = {}
     for table in of:
-        query = select(table.c.manifest).where(*conditions)
+        number = table.c.number if table is tables.version else literal(-1)
+        query = select(table.c.environment_id, number, table.c.manifest).where(*conditions)
+        if table is tables.version:
+            query = query.where(table.c.thinned.is_(None))
         rows = connection.execution_options(stream_results=True).execute(query)
         for some in rows.partitions(PAGE):
-            for (manifest,) in some:
-                hashes.update((entry.hash, None) for entry in unpack_manifest(bytes(manifest))[2])
+            for environment_id, version, manifest in some:
+                if version not in without.get(environment_id, ()):
+                    hashes.update((entry.hash, None) for entry in unpack_manifest(bytes(manifest))[2])
     return [bytes.fromhex(name) for name in hashes]
+
+
+def _used_sources(
+    connection: Connection, without: Mapping[str, Collection[int]], files: Collection[tuple[str, int, int]]
+) -> set[str]:
+    """Return the files of versions, except of some versions, and except some (environment, version, position)."""
+    table = tables.source
+    query = select(table.c.environment_id, table.c.number, table.c.position, table.c.sha256)
+    rows = connection.execution_options(stream_results=True).execute(query.where(table.c.removed.is_(None)))
+    return {
+        r.sha256
+        for r in rows
+        if r.number not in without.get(r.environment_id, ()) and (r.environment_id, r.number, r.position) not in files
+    }
 
 
 def _pending_sources(connection: Connection) -> set[str]:

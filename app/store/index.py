@@ -31,7 +31,7 @@ from app.store.chunks import Chunks
 from app.store.column_types import from_wkb
 from app.store.database import Database
 from app.store.extent import geometry as to_geometry
-from app.store.manifest import read_version
+from app.store.manifest import read_if_kept, read_version
 from app.store.parts.boxes import split_box
 from app.store.prepare import differing_keys, index_rows, read_roots
 from app.store.values import Box, FeatureHit, PartEntry, Version
@@ -137,7 +137,7 @@ class SpatialIndex:
             if row is None or row.indexed == row.head:
                 return
             head = read_version(connection, row, row.head)
-            before = read_version(connection, row, row.indexed) if row.indexed >= 0 else None
+            before = read_if_kept(connection, row, row.indexed) if row.indexed >= 0 else None
             self._catch_up(connection, row, before, head)
             connection.execute(update(table).where(table.c.id == row.id).values(indexed=row.head))
 

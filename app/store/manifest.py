@@ -6,15 +6,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import ormsgpack
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import Connection, Row, Select, func, select
 
-from app.errors import Damaged, NotFound, Problem
+from app.errors import Damaged, NotFound, Problem, Thinned
 from app.model.frame import Datum, Level
 from app.model.layers import PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 from app.store import tables
 from app.store.encode import compress, decompress, pack
-from app.store.values import Box, PartEntry, Provenance, Source, Version
+from app.store.values import Box, PartEntry, Provenance, Source, Thinning, Version, rfc3339
+
+TAG_SEPARATOR: Final = ","
+"""Between tags in one text; no tag has it."""
 
 MANIFEST: Final = 1
 """Encoding of a version's manifest: [1, datum, levels, parts]. Older encodings stay readable by this number."""
@@ -78,9 +81,19 @@ def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple
     return (Datum(**place) if place else None), tuple(Level(n, e) for n, e in levels), parts, templates
 
 
+def version_columns() -> Select[Any]:
+    """Return a query of versions' rows, each with ``tags``: their names in one text, None without any."""
+    table, tag = tables.version, tables.version_tag
+    of_version = (tag.c.environment_id == table.c.environment_id) & (tag.c.number == table.c.number)
+    tags = select(func.aggregate_strings(tag.c.name, TAG_SEPARATOR)).where(of_version)
+    return select(table, tags.scalar_subquery().label("tags"))
+
+
 def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Version:
-    """Convert a row and its sources into a value."""
-    datum, levels, parts, templates = unpack_manifest(bytes(row.manifest))
+    """Convert a row of ``version_columns`` and its sources into a value; a thinned one has no parts."""
+    datum, levels, parts, templates = (
+        unpack_manifest(bytes(row.manifest)) if row.thinned is None else (None, (), (), NO_TEMPLATES)
+    )
     return Version(
         environment=environment,
         number=row.number,
@@ -96,6 +109,8 @@ def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Ve
         levels=levels,
         parts=parts,
         templates=templates,
+        tags=tuple(sorted(row.tags.split(TAG_SEPARATOR))) if row.tags else (),
+        thinned=None if row.thinned is None else Thinning(row.thinned, row.thinned_rule or ""),
     )
 
 
@@ -114,15 +129,43 @@ def read_sources(connection: Connection, environment_id: str, numbers: Sequence[
     )
     out: dict[int, list[Source]] = {n: [] for n in numbers}
     for r in connection.execute(query):
-        out[r.number].append(Source(r.name, r.size, r.sha256, r.format, r.used))
+        out[r.number].append(Source(r.name, r.size, r.sha256, r.format, r.used, r.removed))
     return out
 
 
 def read_version(connection: Connection, environment: Row[Any], number: int) -> Version:
-    """Read one version. Raises NotFound."""
+    """Read one version. Raises NotFound, or Thinned if its content was removed."""
+    version = read_history(connection, environment, number)
+    if version.thinned is not None:
+        raise Thinned(_thinned_detail(connection, environment, version))
+    return version
+
+
+def read_if_kept(connection: Connection, environment: Row[Any], number: int) -> Version | None:
+    """Read one version; None if its content was removed. Raises NotFound."""
+    version = read_history(connection, environment, number)
+    return version if version.thinned is None else None
+
+
+def read_history(connection: Connection, environment: Row[Any], number: int) -> Version:
+    """Read one version as the history lists it: without parts if it was thinned. Raises NotFound."""
     table = tables.version
-    query = select(table).where(table.c.environment_id == environment.id, table.c.number == number)
+    query = version_columns().where(table.c.environment_id == environment.id, table.c.number == number)
     row = connection.execute(query).one_or_none()
     if row is None:
         raise NotFound(f"{environment.name} has no version {number}; it has versions 0 to {environment.head}")
     return as_version(environment.name, row, read_sources(connection, environment.id, [number])[number])
+
+
+def _thinned_detail(connection: Connection, environment: Row[Any], version: Version) -> str:
+    table, thinned = tables.version, version.thinned
+    assert thinned is not None
+    kept = (table.c.environment_id == environment.id) & table.c.thinned.is_(None)
+    older = select(func.max(table.c.number)).where(kept, table.c.number < version.number)
+    newer = select(func.min(table.c.number)).where(kept, table.c.number > version.number)
+    near = [n for query in (older, newer) if (n := connection.execute(query).scalar_one()) is not None]
+    return (
+        f"version {version.number} of {environment.name} was thinned on {rfc3339(thinned.time)} by the rule "
+        f"{thinned.rule!r}: only its entry in the history is left. The nearest versions with content are "
+        f"{' and '.join(map(str, near))}"
+    )

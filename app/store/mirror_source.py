@@ -11,6 +11,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, Final
 
 from sqlalchemy import Connection, Row, select
@@ -23,7 +24,7 @@ from app.store.database import Database
 from app.store.environments import reaches
 from app.store.manifest import read_sources, unpack_manifest
 from app.store.tree import ChunkStage
-from app.store.values import rfc3339
+from app.store.values import Source, rfc3339
 
 FORM: Final = 1
 """Number of the form of pages. A mirror refuses one that it does not know."""
@@ -81,12 +82,13 @@ class MirrorSource:
             "environments": environments if is_new else None,
         }
 
-    def page(self, name: str, after: int, sequence: int) -> dict[str, Any]:
+    def page(self, name: str, after: int, sequence: int, thinned: datetime | None = None) -> dict[str, Any]:
         """Read the next page of an environment, also of a deleted one.
 
         Args:
             after: number of the newest version that the mirror has, -1 for none.
             sequence: of the newest event that it has, 0 for none.
+            thinned: time up to which it has thinned versions, None for none.
 
         Raises NotFound, or Mirrored if the environment is a mirror itself.
         """
@@ -101,6 +103,10 @@ class MirrorSource:
             if len(versions) > MAX_VERSIONS:
                 versions = versions[:MAX_VERSIONS]
                 upto = int(versions[-1]["sequence"])
+            if versions and "thinned" in versions[-1]:  # the mirror's newest version must have content
+                upto = _next_kept_sequence(connection, row, int(versions[-1]["number"]))
+                versions = _read_versions(connection, row, after, upto, limit=None)
+                events = _read_events(connection, row, sequence, limit=None)
             last = max([after, *(int(v["number"]) for v in versions)])
             is_last = upto == row.sequence
             overlay_ids = {e["body"]["overlay"]["id"] for e in events if "overlay" in e["body"]}
@@ -115,6 +121,8 @@ class MirrorSource:
                 "versions": versions,
                 "events": [e for e in events if e["sequence"] <= upto],
                 "channels": _read_channels(connection, row) if is_last else [],
+                "tags": _read_tags(connection, row) if is_last else [],
+                "thinned": _read_thinned(connection, row, after, thinned),
                 "overlays": _read_overlays(connection, row, overlay_ids) if is_last else [],
             }
         chunks = self.content(name, after, last).chunks
@@ -133,17 +141,18 @@ class MirrorSource:
                 if (cached := self._contents.get(key)) is not None:
                     return cached
             table = tables.version
-            query = select(table.c.number, table.c.manifest).where(
+            query = select(table.c.number, table.c.manifest, table.c.thinned).where(
                 table.c.environment_id == row.id, table.c.number >= after, table.c.number <= last
             )
-            manifests = {r.number: bytes(r.manifest) for r in connection.execute(query)}
+            rows = connection.execute(query).all()
+            manifests = {r.number: bytes(r.manifest) for r in rows if r.thinned is None}
             sources = read_sources(connection, row.id, sorted(manifests))
         if last > after and last not in manifests:
             raise NotFound(f"{name} has no version {last}")
         roots = {number: [entry.hash for entry in unpack_manifest(data)[2]] for number, data in manifests.items()}
         new = {root for number, listed in roots.items() if number > after for root in listed}
         content = new_content(self._chunks.stage(), roots.get(after, ()), new)
-        uploads = {source.sha256 for listed in sources.values() for source in listed}
+        uploads = {source.sha256 for listed in sources.values() for source in listed if source.removed is None}
         content = Content(content.chunks, content.blobs | uploads)
         with self._lock:
             self._contents[key] = content
@@ -200,23 +209,19 @@ def _read_base(connection: Connection, environment: Row[Any], number: int) -> di
     return {"root": row.root, "sequence": row.sequence, "time": rfc3339(row.time), "sources": listed}
 
 
-def _source_as_json(source: Any) -> dict[str, Any]:
-    return {
-        "name": source.name,
-        "size": source.size,
-        "sha256": source.sha256,
-        "format": source.format,
-        "used": source.used,
-    }
+def _source_as_json(source: Source) -> dict[str, Any]:
+    return source.as_dict()
 
 
-def _read_events(connection: Connection, environment: Row[Any], sequence: int) -> list[dict[str, Any]]:
+def _read_events(
+    connection: Connection, environment: Row[Any], sequence: int, limit: int | None = MAX_EVENTS + 1
+) -> list[dict[str, Any]]:
     table = tables.event
     query = (
         select(table)
         .where(table.c.environment_id == environment.id, table.c.sequence > sequence)
         .order_by(table.c.sequence)
-        .limit(MAX_EVENTS + 1)
+        .limit(limit)
     )
     return [
         {"sequence": r.sequence, "environment": r.environment, "time": rfc3339(r.time), "body": r.body}
@@ -224,13 +229,15 @@ def _read_events(connection: Connection, environment: Row[Any], sequence: int) -
     ]
 
 
-def _read_versions(connection: Connection, environment: Row[Any], after: int, upto: int) -> list[dict[str, Any]]:
+def _read_versions(
+    connection: Connection, environment: Row[Any], after: int, upto: int, limit: int | None = MAX_VERSIONS + 1
+) -> list[dict[str, Any]]:
     table = tables.version
     query = (
         select(table)
         .where(table.c.environment_id == environment.id, table.c.number > after, table.c.sequence <= upto)
         .order_by(table.c.number)
-        .limit(MAX_VERSIONS + 1)
+        .limit(limit)
     )
     rows = connection.execute(query).all()
     sources = read_sources(connection, environment.id, [r.number for r in rows])
@@ -247,9 +254,44 @@ def _read_versions(connection: Connection, environment: Row[Any], after: int, up
             "warnings": r.warnings,
             "manifest": base64.b64encode(bytes(r.manifest)).decode(),
             "sources": [_source_as_json(source) for source in sources[r.number]],
+            **({} if r.thinned is None else {"thinned": {"time": rfc3339(r.thinned), "rule": r.thinned_rule or ""}}),
         }
         for r in rows
     ]
+
+
+def _next_kept_sequence(connection: Connection, environment: Row[Any], number: int) -> int:
+    """Return the sequence of the next version with content after a thinned one: the head has content."""
+    table = tables.version
+    kept = (table.c.environment_id == environment.id, table.c.number > number, table.c.thinned.is_(None))
+    query = select(table.c.sequence).where(*kept).order_by(table.c.number).limit(1)
+    return int(connection.execute(query).scalar_one())
+
+
+def _read_thinned(
+    connection: Connection, environment: Row[Any], after: int, since: datetime | None
+) -> list[dict[str, Any]]:
+    """List the versions up to ``after`` that were thinned since, as ranges of numbers with equal time."""
+    table = tables.version
+    query = select(table.c.number, table.c.thinned, table.c.thinned_rule).where(
+        table.c.environment_id == environment.id, table.c.thinned.is_not(None), table.c.number <= after
+    )
+    if since is not None:
+        query = query.where(table.c.thinned > since)
+    out: list[dict[str, Any]] = []
+    for r in connection.execute(query.order_by(table.c.number)):
+        about = {"time": rfc3339(r.thinned), "rule": r.thinned_rule or ""}
+        if out and out[-1]["last"] == r.number - 1 and about.items() <= out[-1].items():
+            out[-1]["last"] = r.number
+        else:
+            out.append({"first": r.number, "last": r.number, **about})
+    return out
+
+
+def _read_tags(connection: Connection, environment: Row[Any]) -> list[dict[str, Any]]:
+    table = tables.version_tag
+    rows = connection.execute(select(table).where(table.c.environment_id == environment.id).order_by(table.c.name))
+    return [{"name": r.name, "number": r.number, "author": r.author, "time": rfc3339(r.time)} for r in rows]
 
 
 def _read_channels(connection: Connection, environment: Row[Any]) -> list[dict[str, Any]]:

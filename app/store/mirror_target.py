@@ -18,6 +18,8 @@ from typing import Any, Final
 from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from app.errors import Conflict, Damaged, Unavailable, Untrusted
+from app.model.frame import Datum, Level
+from app.model.templates import NO_TEMPLATES, Templates
 from app.store import blob_rows, outbox, tables
 from app.store import chunks as chunk_rows
 from app.store.base import check_environment_name, upsert
@@ -26,10 +28,19 @@ from app.store.manifest import unpack_manifest, warnings_from_row
 from app.store.mirror_source import FORM
 from app.store.overlays import read_closures_anew
 from app.store.prepare import version_root
-from app.store.values import Event, Source, Version
+from app.store.protection import lock_reports
+from app.store.retention import thin
+from app.store.values import Event, PartEntry, Source, Thinning, Version
 from app.store.versions import insert_sources, insert_version
 
 BATCH: Final = 500
+
+NO_CONTENT: Final[tuple[Datum | None, tuple[Level, ...], tuple[PartEntry, ...], Templates]] = (
+    None,
+    (),
+    (),
+    NO_TEMPLATES,
+)
 
 PAGE_PROBLEM: Final = "invalid page from the centre"
 
@@ -54,7 +65,10 @@ class MirroredEnvironment:
 
 @dataclass(frozen=True, slots=True)
 class MirrorPage:
-    """A checked page of an environment, see ``mirror_source``. blobs: files of its versions (SHA-256)."""
+    """A checked page of an environment, see ``mirror_source``.
+
+    thinned: numbers of versions that the mirror may have and whose content the centre has removed, with when and why.
+    """
 
     environment: Mapping[str, Any]
     epoch: int
@@ -67,6 +81,8 @@ class MirrorPage:
     overlays: tuple[Mapping[str, Any], ...]
     prefixes: tuple[bytes, ...]
     base: Mapping[str, Any] | None
+    tags: tuple[Mapping[str, Any], ...]
+    thinned: tuple[tuple[range, Thinning], ...]
 
     @property
     def id(self) -> str:
@@ -104,6 +120,8 @@ def parse_page(body: Mapping[str, Any]) -> MirrorPage:
             overlays=tuple(body["overlays"]),
             prefixes=tuple(prefixes[k : k + 8] for k in range(0, len(prefixes), 8)),
             base=body["base"],
+            tags=tuple(body["tags"]),
+            thinned=tuple((range(int(r["first"]), int(r["last"]) + 1), _read_thinning(r)) for r in body["thinned"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise Untrusted(f"{PAGE_PROBLEM}: {type(error).__name__}: {error}") from error
@@ -121,13 +139,29 @@ def read_time(text: str) -> datetime:
 
 def read_sources_of(rows: Sequence[Mapping[str, Any]]) -> tuple[Source, ...]:
     """Read the files of a version from a page."""
-    return tuple(Source(r["name"], int(r["size"]), r["sha256"], r["format"], bool(r["used"])) for r in rows)
+    return tuple(
+        Source(
+            r["name"],
+            int(r["size"]),
+            r["sha256"],
+            r["format"],
+            bool(r["used"]),
+            read_time(r["removed"]) if "removed" in r else None,
+        )
+        for r in rows
+    )
+
+
+def _read_thinning(row: Mapping[str, Any]) -> Thinning:
+    return Thinning(read_time(row["time"]), str(row["rule"]))
 
 
 def _read_version(environment: str, row: Mapping[str, Any]) -> Version:
-    manifest = base64.b64decode(row["manifest"], validate=True)
-    datum, levels, parts, templates = unpack_manifest(manifest)
-    root = version_root(parts, datum, levels, templates)
+    thinned = _read_thinning(row["thinned"]) if "thinned" in row else None
+    datum, levels, parts, templates = NO_CONTENT
+    if thinned is None:
+        datum, levels, parts, templates = unpack_manifest(base64.b64decode(row["manifest"], validate=True))
+    root = version_root(parts, datum, levels, templates) if thinned is None else str(row["root"])
     if root != row["root"]:
         raise Damaged(f"version {row['number']} has the root {root}, but {row['root']} is stated")
     return Version(
@@ -145,6 +179,7 @@ def _read_version(environment: str, row: Mapping[str, Any]) -> Version:
         levels=levels,
         parts=parts,
         templates=templates,
+        thinned=thinned,
     )
 
 
@@ -173,6 +208,16 @@ class MirrorTarget:
         stored = {h[:8] for h in present}
         return present, [p for p in prefixes if p not in stored]
 
+    def newest_thinned(self, environment_id: str) -> datetime | None:
+        """Return when the versions that are thinned here were thinned last; None without one."""
+        table = tables.version
+        query = select(func.max(table.c.thinned)).where(
+            table.c.environment_id == environment_id, table.c.thinned.is_not(None)
+        )
+        with self._database.read() as connection:
+            newest: datetime | None = connection.execute(query).scalar_one()
+        return newest
+
     def add_chunks(self, chunks: Mapping[str, bytes]) -> None:
         """Store chunks (hash in hex -> compressed bytes) that no version refers to yet."""
         with self._database.write(notify=False, upkeep=True) as connection:
@@ -191,6 +236,8 @@ class MirrorTarget:
         Raises Conflict if this server has an environment of its own under that name, Unavailable if content is missing.
         """
         with self._database.write(upkeep=True) as connection:
+            if page.thinned:
+                lock_reports(connection)
             row = _claim_row(connection, page, centre)
             if page.upto < row.sequence and not anew:
                 return  # another process has applied a newer one
@@ -209,6 +256,9 @@ class MirrorTarget:
             if page.base is not None:
                 _add_base_sources(connection, row, page)
             _write_channels(connection, row, page)
+            _write_tags(connection, row, page)
+            if not anew:
+                _thin(connection, page, self._database.now())
             _write_overlays(connection, row, page.overlays, self._database.now())
             _write_environment(connection, row, page, centre, digest)
             _retire_names(connection, page)
@@ -300,7 +350,7 @@ def _claim_row(connection: Connection, page: MirrorPage, centre: str) -> Row[Any
 def _clear(connection: Connection, row: Row[Any]) -> None:
     """Remove versions, channels, events and overlays of an environment, except what the centre has to get."""
     queued = select(tables.edge_change.c.overlay_id)
-    for table in (tables.source, tables.version, tables.channel, tables.event):
+    for table in (tables.source, tables.version, tables.version_tag, tables.channel, tables.event):
         connection.execute(delete(table).where(table.c.environment_id == row.id))
     overlay = tables.overlay
     connection.execute(delete(overlay).where(overlay.c.environment_id == row.id, overlay.c.id.not_in(queued)))
@@ -343,6 +393,25 @@ def _write_channels(connection: Connection, row: Row[Any], page: MirrorPage) -> 
         for name in ("time", "planned_at"):
             values[name] = None if values[name] is None else read_time(values[name])
         connection.execute(insert(table).values(environment_id=row.id, **values))
+
+
+def _write_tags(connection: Connection, row: Row[Any], page: MirrorPage) -> None:
+    if not page.complete:
+        return
+    table = tables.version_tag
+    connection.execute(delete(table).where(table.c.environment_id == row.id))
+    for tag in page.tags:
+        values = {**tag, "time": read_time(tag["time"])}
+        connection.execute(insert(table).values(environment_id=row.id, **values))
+
+
+def _thin(connection: Connection, page: MirrorPage, now: datetime) -> None:
+    """Thin what the centre has thinned, except of what is in use here: a robot may have reported only to the mirror."""
+    for numbers, thinning in page.thinned:
+        row = _row_by_id(connection, page.id)
+        for start in range(numbers.start, numbers.stop, BATCH):
+            some = list(range(start, min(start + BATCH, numbers.stop)))
+            thin(connection, row, some, thinning.rule, now, recorded=thinning.time)
 
 
 def _write_overlays(

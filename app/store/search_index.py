@@ -30,7 +30,7 @@ from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.encode import from_wkb
 from app.store.grams import SEPARATOR, fold, grams
-from app.store.manifest import read_version
+from app.store.manifest import read_if_kept, read_version
 from app.store.parts.features import Item
 from app.store.prepare import differing_keys, read_roots
 from app.store.values import PartEntry
@@ -157,7 +157,7 @@ class SearchIndex:
         production = select(channel.c.version).where(channel.c.environment_id == row.id, channel.c.name == PRODUCTION)
         number = connection.execute(production).scalar_one_or_none()
         version = read_version(connection, row, row.head if number is None else number)
-        before = read_version(connection, row, row.search_version) if row.search_version >= 0 else None
+        before = read_if_kept(connection, row, row.search_version) if row.search_version >= 0 else None
         afresh = before is None or before.datum != version.datum
         old = {} if before is None or afresh else _searched(before.parts)
         new = _searched(version.parts)

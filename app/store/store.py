@@ -40,11 +40,13 @@ from app.store.mirror_target import MirrorTarget
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
 from app.store.position import Areas
+from app.store.retention import Retention
 from app.store.robot_counts import RobotCounts
 from app.store.robots import Robots
 from app.store.search import Search
 from app.store.search_index import SearchIndex
 from app.store.sessions import Sessions
+from app.store.tags import Tags
 from app.store.tokens import Tokens
 from app.store.verify import Progress, Verifier
 from app.store.versions import Versions
@@ -81,6 +83,8 @@ class Store:
         self.blob_upkeep = BlobUpkeep(database, self.blobs)
         self.environments = Environments(database, self.chunks)
         self.versions = Versions(database, self.chunks, self.blobs)
+        self.tags = Tags(database)
+        self.retention = Retention(database)
         self.drafts = Drafts(database)
         self.content = ContentReader(self.chunks, self.blobs)
         self.channels = Channels(database)

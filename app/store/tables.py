@@ -119,8 +119,36 @@ version = Table(
     Column("changes", JSON, nullable=False),
     Column("warnings", JSON, nullable=False),
     Column("manifest", LargeBinary, nullable=False),
+    Column("thinned", UtcDateTime, nullable=True),
+    Column("thinned_rule", Text, nullable=True),
+    Column("linked", UtcDateTime, nullable=True),
 )
-"""Versions. manifest: datum, levels and parts, as packed by ``manifest.py``. sequence: of the version's event."""
+"""Versions. manifest: datum, levels and parts, as packed by ``manifest.py``. sequence: of the version's event.
+
+thinned, thinned_rule: when a rule of retention removed the content, and which; the manifest is empty then. linked: time
+until which a signed link may name the version.
+"""
+
+_thinned = version.c.thinned.is_not(None)
+Index(
+    "ix_version_thinned",
+    version.c.environment_id,
+    version.c.thinned,
+    sqlite_where=_thinned,
+    postgresql_where=_thinned,
+)
+
+version_tag = Table(
+    "version_tag",
+    metadata,
+    environment_key(primary_key=True),
+    Column("name", String(63), primary_key=True),
+    Column("number", Integer, nullable=False),
+    Column("author", Text, nullable=False),
+    Column("time", UtcDateTime, nullable=False),
+    Index("ix_version_tag_number", "environment_id", "number"),
+)
+"""Tags: names of versions, which keep them from being thinned."""
 
 source = Table(
     "source",
@@ -133,8 +161,9 @@ source = Table(
     Column("sha256", String(64), nullable=False, index=True),
     Column("format", Text, nullable=True),
     Column("used", Boolean, nullable=False),
+    Column("removed", UtcDateTime, nullable=True),
 )
-"""Files of a version, in the order of the upload."""
+"""Files of a version, in the order of the upload. removed: when a rule of retention removed the file."""
 
 
 def _pending_content() -> tuple[Column[Any], ...]:
@@ -243,9 +272,11 @@ collection = Table(
     Column("collected", BigInteger, nullable=False),
     Column("time", BigInteger, nullable=False),
     Column("complete", BigInteger, nullable=False),
+    Column("thinned", BigInteger, nullable=False, server_default="0"),
 )
 """State of garbage collection: one row. purges: number of removals of content that versions referred to; collected: the
 purges whose content is removed. time, complete: of the last run, and of the last one that looked at everything.
+thinned: when retention last removed something; what reads it may go on for a while.
 """
 
 made_map = Table(

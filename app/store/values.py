@@ -98,22 +98,27 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An uploaded file: its bytes are the blob ``sha256``. used: whether the version was made from it."""
+    """An uploaded file: its bytes are the blob ``sha256``. used: whether the version was made from it.
+
+    removed: when a rule of retention removed the file.
+    """
 
     name: str
     size: int
     sha256: str
     format: str | None = None
     used: bool = True
+    removed: datetime | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the source as JSON."""
+        """Return the source as JSON; ``removed`` only if it was."""
         return {
             "name": self.name,
             "size": self.size,
             "sha256": self.sha256,
             "format": self.format,
             "used": self.used,
+            **({} if self.removed is None else {"removed": rfc3339(self.removed)}),
         }
 
 
@@ -232,13 +237,22 @@ class Pending:
 
 
 @dataclass(frozen=True, slots=True)
+class Thinning:
+    """When a rule of retention removed the content of a version, and which."""
+
+    time: datetime
+    rule: str
+
+
+@dataclass(frozen=True, slots=True)
 class Version:
     """An immutable state of an environment.
 
     environment: its name. changes: counts of changes against its parent, by layer. warnings: of its sources. parts:
     sorted by key. templates: values for formats that need more than the layers have. closures: those that its maps
     show; None: none (as it is stored). pending: set if it is not committed; number is then ``PENDING_NUMBER`` and time
-    that of the dry run, or of the draft's last edit.
+    that of the dry run, or of the draft's last edit. tags: its names, sorted. thinned: set if its content was removed:
+    it has no parts then.
     """
 
     environment: str
@@ -257,6 +271,8 @@ class Version:
     templates: Templates = NO_TEMPLATES
     closures: Closures | None = None
     pending: Pending | None = None
+    tags: tuple[str, ...] = ()
+    thinned: Thinning | None = None
 
     @property
     def ref(self) -> int | str:
@@ -324,7 +340,7 @@ class Version:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the version as JSON; of a dry run or draft without number and time, but with ``id`` and expiry."""
-        pending = self.pending
+        pending, thinned = self.pending, self.thinned
         revision = pending.revision if pending is not None and pending.kind == "draft" else None
         return {
             "environment": self.environment,
@@ -339,6 +355,8 @@ class Version:
             "warnings": [warning.as_dict() for warning in self.warnings],
             "information": self.information,
             "stale": [self._describe_stale(key, changed) for key, changed in self.stale.items()],
+            "tags": list(self.tags),
+            **({} if thinned is None else {"thinned": {"time": rfc3339(thinned.time), "rule": thinned.rule}}),
             **({} if pending is None else {"id": self.ref, "expires": rfc3339(pending.expires), "revision": revision}),
         }
 

@@ -200,10 +200,11 @@ class Verifier:
             yield name.hex(), size, problem
 
     def versions(self) -> Iterator[tuple[str, Any]]:
-        """Iterate over (environment, row) of every version, also of deleted environments."""
+        """Iterate over (environment, row) of every version with content, also of deleted environments."""
         e, v = tables.environment, tables.version
         columns = (e.c.name, e.c.id, v.c.number, v.c.root, v.c.manifest, e.c.head, e.c.root.label("head_root"))
-        query = select(*columns).join(v, v.c.environment_id == e.c.id).order_by(e.c.id, v.c.number).limit(PAGE)
+        query = select(*columns).join(v, v.c.environment_id == e.c.id).where(v.c.thinned.is_(None))
+        query = query.order_by(e.c.id, v.c.number).limit(PAGE)
         environment, number = "", -1
         while True:
             later = (v.c.environment_id > environment) | ((v.c.environment_id == environment) & (v.c.number > number))
@@ -218,6 +219,7 @@ class Verifier:
     def _sources(self) -> list[tuple[str, int | str, str]]:
         e, s, d = tables.environment, tables.source, tables.dry_run
         query = select(e.c.name, s.c.number, s.c.sha256).join(s, s.c.environment_id == e.c.id)
+        query = query.where(s.c.removed.is_(None))
         tried = select(e.c.name, d.c.id, d.c.sources).join(d, d.c.environment_id == e.c.id)
         with self._database.read() as connection:
             out: list[tuple[str, int | str, str]] = [(r.name, r.number, r.sha256) for r in connection.execute(query)]

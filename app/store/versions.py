@@ -27,7 +27,14 @@ from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.chunks import Chunks
 from app.store.database import Database
 from app.store.extent import extent, geometry
-from app.store.manifest import as_version, pack_manifest, read_sources, read_version
+from app.store.manifest import (
+    as_version,
+    pack_manifest,
+    read_if_kept,
+    read_sources,
+    read_version,
+    version_columns,
+)
 from app.store.pending import check_committed
 from app.store.prepare import frame_changes, prepare, prepare_further, summarise
 from app.store.values import DRAFT_PREFIX, DRY_PREFIX, LATEST, Area, Idempotency, Pending, Source, Version
@@ -81,7 +88,7 @@ def insert_version(
             sequence=sequence,
             changes=dict(version.changes),
             warnings=[clean_problem(w).as_dict() for w in version.warnings],
-            manifest=pack_manifest(version.datum, version.levels, version.parts, version.templates),
+            **_content_values(version),
         )
     )
     insert_sources(connection, environment.id, version.number, version.sources, first=0)
@@ -109,6 +116,13 @@ def insert_version(
         write_area(connection, environment.id, area)
 
 
+def _content_values(version: Version) -> dict[str, Any]:
+    """Return the columns of a version's content, or of its thinning at another server."""
+    if version.thinned is not None:
+        return {"manifest": b"", "thinned": version.thinned.time, "thinned_rule": version.thinned.rule}
+    return {"manifest": pack_manifest(version.datum, version.levels, version.parts, version.templates)}
+
+
 def append_version_event(
     connection: Connection, environment: Row[Any], before: Version, version: Version, sequence: int
 ) -> None:
@@ -132,10 +146,10 @@ def append_version_event(
 def insert_sources(
     connection: Connection, environment_id: str, number: int, sources: Sequence[Source], first: int
 ) -> None:
-    """Write source rows; their blobs must exist and are marked as used."""
+    """Write source rows; the blobs of those that were not removed must exist and are marked as used."""
     if not sources:
         return
-    blob_rows.lock(connection, {s.sha256 for s in sources}, kept=True)
+    blob_rows.lock(connection, {s.sha256 for s in sources if s.removed is None}, kept=True)
     connection.execute(
         insert(tables.source),
         [
@@ -148,6 +162,7 @@ def insert_sources(
                 "sha256": s.sha256,
                 "format": s.format,
                 "used": s.used,
+                "removed": s.removed,
             }
             for k, s in enumerate(sources)
         ],
@@ -163,7 +178,7 @@ class Versions:
     def get(self, environment: str, ref: str | int = LATEST) -> Version:
         """Read a version by number, channel or ``latest``, a dry run by ``dry:<id>``, a draft by ``draft:<id>``.
 
-        Raises NotFound, or Gone if the environment is deleted.
+        Raises NotFound, Thinned if a rule removed its content, or Gone if the environment is deleted.
         """
         with self._database.read() as connection:
             row = environment_row(connection, environment)
@@ -179,11 +194,11 @@ class Versions:
         return self.get(environment, ref)
 
     def page(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
-        """List versions, newest first; ``before``: only those with a smaller number."""
+        """List versions, newest first, also thinned ones; ``before``: only those with a smaller number."""
         table = tables.version
         with self._database.read() as connection:
             row = environment_row(connection, environment)
-            query = select(table).where(table.c.environment_id == row.id)
+            query = version_columns().where(table.c.environment_id == row.id)
             if before is not None:
                 query = query.where(table.c.number < before)
             rows = connection.execute(query.order_by(table.c.number.desc()).limit(limit)).all()
@@ -191,10 +206,10 @@ class Versions:
         return [as_version(row.name, r, sources[r.number]) for r in rows]
 
     def get_with_base(self, environment: str, number: int) -> tuple[Version, Version | None]:
-        """Read a version, also of a deleted environment, and its predecessor."""
+        """Read a version, also of a deleted environment, and its predecessor, None if that was thinned."""
         with self._database.read() as connection:
             row = environment_row(connection, environment, deleted=True)
-            base = read_version(connection, row, number - 1) if number else None
+            base = read_if_kept(connection, row, number - 1) if number else None
             return read_version(connection, row, number), base
 
     def prepare(self, base: Version, changes: Changes) -> Prepared:
@@ -339,7 +354,7 @@ class Versions:
             row = environment_row(connection, environment)
             for start in range(0, len(names), NAMES_AT_ONCE):
                 some = list(names[start : start + NAMES_AT_ONCE])
-                named = (table.c.environment_id == row.id) & table.c.name.in_(some)
+                named = (table.c.environment_id == row.id) & table.c.name.in_(some) & table.c.removed.is_(None)
                 last = select(table.c.name, newest.label("number")).where(named).group_by(table.c.name).subquery()
                 same = (table.c.name == last.c.name) & (table.c.number == last.c.number)
                 query = select(table.c.name, table.c.sha256).join(last, same).where(named).order_by(table.c.position)
@@ -464,11 +479,15 @@ def _remember(
 def _append_sources(connection: Connection, environment_id: str, number: int, sources: Sequence[Source]) -> None:
     table = tables.source
     existing_sources = read_sources(connection, environment_id, [number])[number]
-    new = [
-        s
-        for s in dict.fromkeys(sources)
-        if not any(s.name == k.name and s.sha256 == k.sha256 for k in existing_sources)
-    ]
+    present = {(s.name, s.sha256): s.removed is not None for s in existing_sources}
+    again = [s for s in dict.fromkeys(sources) if present.get((s.name, s.sha256))]
+    if again:  # uploaded again after a rule had removed them
+        blob_rows.lock(connection, {s.sha256 for s in again}, kept=True)
+        of_version = (table.c.environment_id == environment_id) & (table.c.number == number)
+        for s in again:
+            same = (table.c.name == storable_text(s.name)) & (table.c.sha256 == s.sha256)
+            connection.execute(update(table).where(of_version, same).values(removed=None))
+    new = [s for s in dict.fromkeys(sources) if (s.name, s.sha256) not in present]
     last = connection.execute(
         select(func.max(table.c.position)).where(table.c.environment_id == environment_id, table.c.number == number)
     ).scalar_one()

@@ -90,7 +90,7 @@ ROWS = [
         "GET /docs/{name}, GET /healthz, GET /readyz",
     ),
     *rows("server", viewer="GET /metrics", admin=f"GET {API}/tokens, DELETE {API}/tokens/{{id}}, POST {API}/keys"),
-    *rows("server", admin=f"GET {API}/audit, GET {API}/stored/{{kind}}/{{sha256}}"),
+    *rows("server", admin=f"GET {API}/audit, GET {API}/retention, GET {API}/stored/{{kind}}/{{sha256}}"),
     Row(f"POST {API}/tokens", "admin", "server", {"name": "x", "role": "viewer", "environments": OTHERS}),
     *rows("filtered", viewer=f"GET {API}/formats, GET {API}/derivations, GET {API}/generators, GET {API}/templates"),
     *rows("filtered", viewer=f"GET {API}/keys, GET {API}/environments, GET {API}/robots, GET {API}/robots/{{robot}}"),
@@ -143,7 +143,8 @@ ROWS = [
         f"POST {E}/overlays/{{id}}/accept, POST {E}/overlays/{{id}}/reject, POST {E}/overlays/{{id}}/end, "
         f"POST {E}/overlays/{{id}}/keep, PATCH {E}/overlays/{{id}}, GET {E}/drafts, POST {E}/drafts, "
         f"GET {E}/drafts/{{draft}}, DELETE {E}/drafts/{{draft}}, POST {E}/drafts/{{draft}}/edits, "
-        f"POST {E}/drafts/{{draft}}/rebase, POST {E}/drafts/{{draft}}/commit",
+        f"POST {E}/drafts/{{draft}}/rebase, POST {E}/drafts/{{draft}}/commit, "
+        f"PUT {V}/tags/{{tag}}, DELETE {V}/tags/{{tag}}",
         admin=f"DELETE {E}, POST {E}/restore, POST {E}/purge",
     ),
 ]
@@ -153,7 +154,7 @@ LIMITED = " elsewhere"
 VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
           "channel": "staging", "id": "nosuch", "robot": "r1", "kind": "blobs", "sha256": "0" * 64,
           "collection": "nodes", "feature": "gate", "tms": "local", "z": "0", "row": "0", "col": "0",
-          "draft": "0" * 16}  # fmt: skip
+          "draft": "0" * 16, "tag": "season"}  # fmt: skip
 
 
 @dataclass

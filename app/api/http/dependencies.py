@@ -31,6 +31,7 @@ from app.ingest import CommitRequest, Ingest
 from app.limits import Limits
 from app.pool import Pool
 from app.signing import SigningKeys
+from app.store.retention_rule import Rule
 from app.store.store import Store
 
 WRITABLE_SECONDS = 2.0
@@ -59,6 +60,7 @@ class ApiOptions:
     public_url: str | None = None
     basemap_url: str | None = None
     basemap_attribution: str = ""
+    retention: Rule | None = None
 
 
 class Writability:

@@ -90,6 +90,7 @@ TAGS = {
     "session": "Sign-in of browsers.",
     "search": "Search in all environments.",
     "audit": "Log of changes with author and address.",
+    "retention": "What the rule of retention keeps and removes.",
     "health": "Liveness, readiness and metrics.",
 }
 
@@ -181,6 +182,8 @@ def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
         }
         common["422"] = "A parameter, the body or a file is invalid; `errors` has the details."
         common["503"] = "Overloaded, or a part of the server does not respond: try again after `Retry-After` seconds."
+        if "{env}" in path:
+            common["410"] = "A rule of retention has removed the content of the version; `detail` names the nearest."
         if method != "get":
             common["507"] = (
                 "The server's disk is full, and nothing was stored: try again when its operator has freed space."

@@ -55,6 +55,7 @@ class Throttled(errors.Denied):
 STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     errors.NotFound: (404, "Not found"),
     errors.Gone: (404, "Deleted"),
+    errors.Thinned: (410, "Thinned"),
     MalformedBody: (400, "Malformed body"),
     UnsupportedMedia: (415, "Unsupported media type"),
     NotAcceptable: (406, "Not acceptable"),

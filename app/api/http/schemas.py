@@ -82,13 +82,14 @@ class ProblemOut(BaseModel):
 
 
 class SourceOut(BaseModel):
-    """Uploaded file. `used`: whether the version uses it."""
+    """Uploaded file. `used`: whether the version uses it. `removed`: when a rule of retention removed it."""
 
     name: str
     size: int
     sha256: str
     format: str | None
     used: bool
+    removed: datetime | None = None
 
 
 class StaleOut(BaseModel):
@@ -100,6 +101,13 @@ class StaleOut(BaseModel):
     changed: list[str] = Field(description="Inputs that have changed.")
     method: str | None = Field(description="Derivation that computed it, or null.")
     parameters: dict[str, Any] = Field(description="Parameters that it was computed with.")
+
+
+class ThinnedOut(BaseModel):
+    """When the content of a version was removed, and by which rule."""
+
+    time: datetime
+    rule: str
 
 
 class VersionContentOut(BaseModel):
@@ -116,6 +124,7 @@ class VersionContentOut(BaseModel):
     stale: list[StaleOut] = Field(
         description="Derived parts whose inputs have changed since, with the changed inputs. Maps derive them again."
     )
+    tags: list[str] = Field([], description="Names of the version, which keep it from being thinned.")
 
 
 class VersionOut(VersionContentOut):
@@ -124,6 +133,9 @@ class VersionOut(VersionContentOut):
     version: int
     parent: int | None
     time: datetime
+    thinned: ThinnedOut | None = Field(
+        None, description="Set if a rule of retention has removed the content: only the history lists such a version."
+    )
 
 
 VersionName = Annotated[
@@ -223,6 +235,7 @@ def problem_responses(
         404: "Not found.",
         406: "None of the accepted media types is available.",
         409: "Conflict with the present state, or several items match and none is named.",
+        410: "A rule of retention has removed the content of the version.",
         412: "The head has moved since the version on which the change is based.",
         413: "Too large.",
         415: "Unsupported media type or content coding.",
