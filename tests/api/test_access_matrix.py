@@ -90,6 +90,8 @@ ROWS = [
         "GET /docs/{name}, GET /healthz, GET /readyz",
     ),
     *rows("server", viewer="GET /metrics", admin=f"GET {API}/tokens, DELETE {API}/tokens/{{id}}, POST {API}/keys"),
+    *rows("server", admin=f"GET {API}/webhooks, DELETE {API}/webhooks/{{id}}, POST {API}/webhooks/{{id}}/test"),
+    Row(f"POST {API}/webhooks", "admin", "server", {"url": "https://hooks.example.org/fleet"}),
     *rows("server", admin=f"GET {API}/audit, GET {API}/stored/{{kind}}/{{sha256}}"),
     Row(f"POST {API}/tokens", "admin", "server", {"name": "x", "role": "viewer", "environments": OTHERS}),
     *rows("filtered", viewer=f"GET {API}/formats, GET {API}/derivations, GET {API}/generators, GET {API}/templates"),
