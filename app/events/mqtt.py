@@ -85,7 +85,7 @@ class MqttBroker:
         self.opened = 0
         self._client: Client | None = None
         self._problem = "not connected yet"
-        self._answered = threading.Event()
+        self._answered, self._is_accepted = threading.Event(), False
         self._accepting: list[MQTTMessageInfo] = []
         self._refused: str | None = None
         self._next_try = 0.0
@@ -177,6 +177,7 @@ class MqttBroker:
         if options.tls:
             client.tls_set_context(ssl.create_default_context(cafile=options.ca))
         self._answered.clear()
+        self._is_accepted = False
         self._refused, self._accepting = None, []
         self._problem = f"{self._address} does not answer"
         self._client = client
@@ -195,6 +196,7 @@ class MqttBroker:
             client.loop_stop()
 
     def _on_connect(self, _: Client, __: Any, ___: ConnectFlags, code: ReasonCode, ____: Properties | None) -> None:
+        self._is_accepted = not code.is_failure
         if code.is_failure:
             self._problem = f"{self._address} refuses the connection: {code}"
         self._answered.set()
@@ -202,7 +204,7 @@ class MqttBroker:
     def _on_disconnect(
         self, _: Client, __: Any, flags: DisconnectFlags, code: ReasonCode, ___: Properties | None
     ) -> None:
-        if self._answered.is_set() and code.is_failure:
+        if self._is_accepted and code.is_failure:
             side = "the broker" if flags.is_disconnect_packet_from_server else "the connection"
             self._problem = f"lost {self._address}: {side} ended ({code}); reconnecting"
         self._answered.set()
