@@ -211,7 +211,11 @@ class Memory:
         """Measure, if the server is warm. Called right before it is killed, and at the end."""
         if time.monotonic() - self._started < WARM_SECONDS or world.server is None:
             return
-        size = process_memory(world.server.process.pid)
+        sizes = process_memory(world.server.process.pid)
+        size = sum(sizes)
+        print(
+            f"{time.strftime('%H:%M:%S')} memory: {size:.0f} MB = {' + '.join(f'{s:.0f}' for s in sizes)}", flush=True
+        )
         if self.first is None:
             self.first = size
         self.last.append(size)
@@ -221,17 +225,17 @@ class Memory:
         return max(self.last) - self.first if self.first is not None else float("inf")
 
 
-def process_memory(pid: int) -> float:
-    """Return the proportional set size of a process and its descendants, in MB."""
-    total, pending = 0, [pid]
+def process_memory(pid: int) -> list[float]:
+    """Return the proportional set sizes of a process and its descendants, in MB."""
+    sizes, pending = [], [pid]
     while pending:
         one = pending.pop()
         with contextlib.suppress(OSError):
             rollup = Path(f"/proc/{one}/smaps_rollup").read_text()
-            total += next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:"))
+            sizes.append(next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:")) / 1024)
             for task in Path(f"/proc/{one}/task").iterdir():
                 pending += map(int, (task / "children").read_text().split())
-    return total / 1024
+    return sizes
 
 
 class Soak:
