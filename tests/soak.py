@@ -14,6 +14,7 @@ import random
 import select
 import shutil
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -38,6 +39,10 @@ MEMORY_MB = 50
 DISK = "512m"
 WARM_SECONDS = 45.0
 """Age of a server from which its memory is measured; it has then answered each kind of request."""
+
+SAMPLE_SECONDS = 2.0
+SAMPLES = 7
+"""Interval of measurements of the memory, and number of those of which the median counts."""
 
 READERS = 3
 READ_PAUSE = 0.1
@@ -196,33 +201,37 @@ class Proxy:
 
 
 class Memory:
-    """Memory of the server's processes: proportional set size, in MB, of each of its lives that lasts long enough."""
+    """Memory of the server's processes, in MB: the median of some samples, since workers come and go.
+
+    A life is the time between two kills of the server. Each is measured once it is warm, and at its end.
+    """
 
     def __init__(self) -> None:
-        self.first: float | None = None
-        self.last: list[float] = []
-        self._started = time.monotonic()
+        self._lives: list[list[float]] = [[]]
+        self._started = self._sampled = time.monotonic()
 
     def restart(self) -> None:
         """Begin the next life."""
+        self._lives.append([])
         self._started = time.monotonic()
 
     def sample(self, world: World) -> None:
-        """Measure, if the server is warm. Called right before it is killed, and at the end."""
-        if time.monotonic() - self._started < WARM_SECONDS or world.server is None:
+        """Measure, if the server is warm and the last sample is some seconds old."""
+        now = time.monotonic()
+        if now - self._started < WARM_SECONDS or now - self._sampled < SAMPLE_SECONDS or world.server is None:
             return
-        sizes = process_memory(world.server.process.pid)
-        size = sum(sizes)
-        print(
-            f"{time.strftime('%H:%M:%S')} memory: {size:.0f} MB = {' + '.join(f'{s:.0f}' for s in sizes)}", flush=True
-        )
-        if self.first is None:
-            self.first = size
-        self.last.append(size)
+        self._sampled = now
+        self._lives[-1].append(sum(process_memory(world.server.process.pid)))
 
     @property
-    def growth(self) -> float:
-        return max(self.last) - self.first if self.first is not None else float("inf")
+    def first(self) -> float:
+        """Memory of the first life, once it was warm."""
+        return statistics.median(next(life for life in self._lives if life)[:SAMPLES])
+
+    @property
+    def last(self) -> float:
+        """Memory at the end of the life that needed most."""
+        return max(statistics.median(life[-SAMPLES:]) for life in self._lives if len(life) >= SAMPLES)
 
 
 def process_memory(pid: int) -> list[float]:
@@ -260,10 +269,9 @@ class Soak:
     def run(self, seconds: float, every: float) -> None:
         """Cause a fault about every ``every`` seconds, each kind as often as any other. The last part is quiet."""
         end = time.monotonic() + seconds
-        quiet = WARM_SECONDS + 15
+        quiet = WARM_SECONDS + 2 * SAMPLES * SAMPLE_SECONDS
         waiting: list[tuple[str, Callable[[], None]]] = []
-        self._rest(WARM_SECONDS + 5)
-        self.memory.sample(self._world)
+        self._rest(WARM_SECONDS + 2 * SAMPLES * SAMPLE_SECONDS)
         while (left := end - time.monotonic() - quiet) > 0:
             if not waiting:
                 waiting = self._dice.sample(self._faults, len(self._faults))
@@ -275,7 +283,6 @@ class Soak:
             cause()
             self.counts[name] += 1
         self._rest(max(0.0, end - time.monotonic()))
-        self.memory.sample(self._world)
 
     def _rest(self, seconds: float) -> None:
         """Wait; stop at once if a writer or watcher has found a problem."""
@@ -283,14 +290,15 @@ class Soak:
         fleet = self._fleet
         while time.monotonic() < end:
             time.sleep(min(0.5, max(0.0, end - time.monotonic())))
+            self.memory.sample(self._world)
             for one in (*fleet.writers, fleet.promoter, fleet.closer, fleet.watcher):
                 if one.problem is not None:
                     raise one.problem
 
     def _kill_server(self) -> None:
-        self.memory.sample(self._world)
         with self.windows.open():
             self._world.kill_server()
+            self.memory.restart()
             self._rest(self._dice.choice((0.0, 1.0)))
             self._world.revive("server")
         self.memory.restart()
@@ -373,8 +381,8 @@ def report(run: Soak, fleet: Fleet, readers: list[Reader], seconds: float, seed:
         reads.problems.update(reader.reads.problems)
     memory = run.memory
     faults = ", ".join(f"{count} x {name}" for name, count in sorted(run.counts.items()))
-    is_available, is_lean = reads.availability >= AVAILABILITY, memory.growth <= MEMORY_MB
-    sizes = f"{memory.first or 0:.0f} MB, then at most {max(memory.last, default=0):.0f} MB"
+    is_available, is_lean = reads.availability >= AVAILABILITY, memory.last <= memory.first + MEMORY_MB
+    sizes = f"{memory.first:.0f} MB before the first fault, later at most {memory.last:.0f} MB"
     rows = [
         ("faults", faults, ""),
         ("uploads · promotes · closures acknowledged", f"{fleet.count_commits()} · {len(fleet.promoter.moves)} · "
@@ -404,8 +412,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="order of the faults (default: random)")
     parser.add_argument("--sqlite", action="store_true", help="SQLite instead of PostgreSQL")
     given = parser.parse_args()
-    if given.minutes * 60 < 3 * WARM_SECONDS:
-        parser.error("give at least 3 minutes: the server's memory is measured once it is warm")
+    if given.minutes < 4:
+        parser.error("give at least 4 minutes: the server's memory is measured once it is warm")
     seed = random.SystemRandom().randrange(10**6) if given.seed is None else given.seed
     folder = Path(tempfile.mkdtemp(prefix="soak"))
     try:

@@ -12,7 +12,7 @@ import hmac
 import logging
 import random
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -182,6 +182,7 @@ class Courier:
         self._attempts = webhook.attempts
         self._lags: dict[str, Lag] = {}
         self._pause_until = 0.0
+        self._is_ending: Callable[[], bool] = lambda: False
 
     def close(self) -> None:
         """Close the connection."""
@@ -199,16 +200,17 @@ class Courier:
         self._lags = {lag.environment_id: lag for lag in self._store.webhooks.lags(webhook.id)}
         return last > self._position or any(_is_time(lag.attempts) for lag in self._lags.values())
 
-    def run(self, is_ending: Any) -> None:
-        """Send what there is. Logs errors: the next call continues."""
+    def run(self, is_ending: Callable[[], bool]) -> None:
+        """Send what there is, until ``is_ending()``. Logs errors: the next call continues."""
+        self._is_ending = is_ending
         try:
             with self._lead.fenced():
                 if self._delivered is not None:  # the last attempt to store it failed
                     self._store_position()
                 for lag in [lag for lag in self._lags.values() if _is_time(lag.attempts)]:
-                    if not is_ending() and not self._catch_up(lag):
+                    if is_ending() or not self._catch_up(lag):
                         return
-                self._follow(is_ending)
+                self._follow()
         except (LeadLostError, NotFound):  # another server sends, or the webhook was deleted
             pass
         except FleetMapError as error:
@@ -222,16 +224,16 @@ class Courier:
     def _id(self) -> str:
         return self._webhook.id
 
-    def _follow(self, is_ending: Any) -> None:
+    def _follow(self) -> None:
         """Deliver the events after the position, except those of environments that lag."""
         last = self._store.events.last_position()
-        for page in pages_after(self._store, self._position, is_ending, PAGE):
+        for page in pages_after(self._store, self._position, self._is_ending, PAGE):
             for event in page:
-                if is_ending() or not self._deliver(event):
+                if self._is_ending() or not self._deliver(event):
                     self._store_position()
                     return
             self._store_position()
-        if not is_ending() and last > self._position and self._send_resync(None, self._position + 1, last):
+        if not self._is_ending() and last > self._position and self._send_resync(None, self._position + 1, last):
             self._position = last
             self._store_position()
 
@@ -253,10 +255,13 @@ class Courier:
         return True
 
     def _catch_up(self, lag: Lag) -> bool:
-        """Deliver the events of an environment that waits; return False if the receiver is not reached."""
+        """Deliver the events of an environment that waits; return False to stop, since the receiver is not reached."""
         start = lag.position
         while events := self._store.webhooks.lagging_events(lag, self._position, PAGE):
             for event in events:
+                if self._is_ending():
+                    self._store.webhooks.put_lag(self._id, self._position, lag)
+                    return False
                 if self._wants(event):
                     attempt = send(self._client, self._webhook, event.body)
                     if attempt.outcome != "delivered":
