@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from sqlalchemy import delete
 
-from app.backends.lead import LocalLeads
+from app.backends.lead import LocalLeads, SharedLeads
 from app.errors import Invalid, NoRoom
 from app.events import outgoing
 from app.events.outgoing import OutgoingClient, OutgoingRules, RequestError, check_url
@@ -227,6 +227,39 @@ def test_another_server_takes_over(store: Store, receiver: Receiver, start: Any)
     eventually(lambda: len(receiver.sequences("farm")) == 11)
     assert receiver.sequences("farm") == list(range(1, 12)), "one server sends at a time"
     assert second is not first
+
+
+@pytest.mark.postgres
+def test_server_of_another_machine_takes_over(
+    postgres_url: str, tmp_path: Path, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its lead is lost, as when its machine has no network: it sends no more, and what it stores is refused."""
+    monkeypatch.setattr("app.events.webhooks.FIRST_RETRY_SECONDS", 0.01)
+    store = Store(postgres_url, tmp_path / "blobs")
+    store.migrate()
+    hook(store, receiver)
+    folders = [tmp_path / name for name in ("a", "b")]
+    leads, senders = [], []
+    for folder in folders:
+        folder.mkdir()
+        leads.append(SharedLeads(postgres_url, folder))
+        leads[-1].start()
+        senders.append(WebhookSender(store, folder, leads[-1], LOOPBACK))
+        senders[-1].start()
+        eventually(lambda: any(lead.lead("webhooks").is_held for lead in leads))
+    try:
+        store.environments.create("farm")
+        promote(store, "farm", 30)
+        eventually(lambda: len(receiver.sequences("farm")) >= 5)
+        leader = next(lead for lead in leads if lead.lead("webhooks").is_held)
+        leader.close()
+        promote(store, "farm", 10)
+        eventually(lambda: set(receiver.sequences("farm")) == set(range(1, 42)))
+        assert list(dict.fromkeys(receiver.sequences("farm"))) == list(range(1, 42))
+    finally:
+        for one in (*senders, *leads):
+            one.close()
+        store.close()
 
 
 def test_full_disk_does_not_repeat_deliveries(
