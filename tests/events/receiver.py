@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import ssl
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -22,7 +23,11 @@ class Handler(BaseHTTPRequestHandler):
     server: Server
 
     def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["content-length"]))
+        size = int(self.headers["content-length"])
+        body = self.rfile.read(size)
+        if len(body) < size:  # the sender was killed
+            self.close_connection = True
+            return
         receiver = self.server.receiver
         if receiver.secret is not None:
             Webhook(receiver.secret).verify(body, dict(self.headers.items()))
@@ -50,8 +55,11 @@ class Server(ThreadingHTTPServer):
     receiver: Receiver
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        self.receiver.problems.append(f"a request of {client_address} failed")
-        super().handle_error(request, client_address)
+        """Note what failed, such as a wrong signature; a sender may be killed at any time."""
+        problem = sys.exception()
+        if not isinstance(problem, ConnectionError):
+            self.receiver.problems.append(f"a request of {client_address} failed: {problem!r}")
+            super().handle_error(request, client_address)
 
 
 class Receiver:
