@@ -20,7 +20,7 @@ ROBOT := app/__init__.py app/errors.py app/event_types.py app/backends/__init__.
 # Sources of the web page. Installing builds it (app/web/build.py) with Node 20.19 or newer, which pip brings if there is none.
 PAGE := $(shell find app/web -path app/web/node_modules -prune -o -path app/web/dist -prune -o -type f -not -name openapi.json -not -name schema.d.ts -print)
 
-.PHONY: run test lint docs bench bench-web chaos fuzz figures release install install-dev clean
+.PHONY: run test lint docs bench bench-web chaos soak fuzz figures release install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -54,6 +54,10 @@ bench-web: install-dev
 # Kills of the server, the router and the database at random moments: 50 of each; `make test` does 4.
 chaos: install-dev
 	@FLEETMAP_CHAOS=$${FLEETMAP_CHAOS:-50} $(BIN)/python -m pytest -s tests/chaos $(ARGS)
+
+# An hour of load with faults at random, against bounds: ARGS="--minutes 5 --seed 7 --sqlite".
+soak: install-dev
+	@$(BIN)/python -m tests.soak $(ARGS)
 
 # Mutations of every sample through the read boundary, for some minutes: ARGS="--minutes 30 --seed 7 --format kml".
 # First the property tests with 2000 examples each instead of 60, and more odd values of properties.

@@ -11,16 +11,16 @@ import ipaddress
 import os
 from pathlib import Path
 from typing import Any, Literal, Self
-from urllib.parse import parse_qs, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
 from pydantic import Field, SecretStr, ValidationInfo, field_validator, model_validator
 from pydantic_settings import SettingsConfigDict
 
+from app import setting_values as forms
 from app.events.ros_names import parse_keys, parse_selectors
 from app.limits import Limits
 from app.logs import LogFormat
 from app.retention_settings import RetentionSettings
-from app.setting_values import basemap_origin, parse_networks, parse_size
 
 _DEFAULTS = Limits()
 
@@ -251,6 +251,27 @@ class Settings(RetentionSettings):
         "server's router drops messages that exceed both this size and 65 MiB, unless `zenoh_config` is set.",
     )
 
+    mqtt_url: SecretStr | None = Field(
+        default=None,
+        description="MQTT 5 broker that also gets the events, with the Zenoh keys as topics: "
+        "`mqtt://[user[:password]@]host[:port]`, or `mqtts://` for TLS. Unset: none.",
+    )
+    mqtt_password_file: Path | None = Field(
+        default=None, description="File with the password of the user in `mqtt_url`; read at each login."
+    )
+    mqtt_ca: Path | None = Field(
+        default=None,
+        description="Certification authority (PEM) of the broker's certificate. Unset: public ones.",
+    )
+    webhook_networks: str = Field(
+        default="",
+        description="Networks that webhooks may reach besides public addresses, also over plain HTTP: addresses or "
+        "CIDRs, comma-separated (`192.168.7.20,fd00:7::/64`). Unset: only public addresses, over HTTPS.",
+    )
+    webhook_ca: Path | None = Field(
+        default=None, description="File with certification authorities (PEM) that webhooks trust besides public ones."
+    )
+
     ros2_environments: str = Field(
         default="",
         description="Environments to publish as ROS 2 topics, comma-separated: names or patterns (`farm-*`), with "
@@ -410,6 +431,10 @@ class Settings(RetentionSettings):
         "basemap_url",
         "public_url",
         "models_dir",
+        "mqtt_url",
+        "mqtt_password_file",
+        "mqtt_ca",
+        "webhook_ca",
         mode="before",
     )
     @classmethod
@@ -420,22 +445,16 @@ class Settings(RetentionSettings):
     @classmethod
     def _sizes_have_units(cls, value: Any, info: ValidationInfo) -> Any:
         sized = isinstance(value, str) and str(info.field_name).endswith("_bytes")
-        return parse_size(value) if sized else value
+        return forms.parse_size(value) if sized else value
 
-    @field_validator("anonymous_networks")
+    @field_validator("anonymous_networks", "webhook_networks")
     @classmethod
     def _is_networks(cls, value: str) -> str:
-        parse_networks(value)
+        forms.parse_networks(value)
         return value
 
-    @field_validator("blob_url")
-    @classmethod
-    def _is_blob_url(cls, value: str | None) -> str | None:
-        if value is not None and "://" in value and not value.startswith(("file://", "s3://")):
-            raise ValueError("unsupported scheme: use a path, a file:// URL or s3://bucket/prefix")
-        if value is not None and value.startswith("s3://") and not urlsplit(value).netloc:
-            raise ValueError("no bucket: use s3://bucket or s3://bucket/prefix")
-        return value
+    _check_blob_url = field_validator("blob_url")(forms.check_blob_url)
+    _check_public_url = field_validator("public_url")(forms.check_public_url)
 
     @model_validator(mode="after")
     def _blob_keys_are_whole(self) -> Self:
@@ -511,37 +530,14 @@ class Settings(RetentionSettings):
         return self
 
     @model_validator(mode="after")
-    def _imagery_url_is_complete(self) -> Self:
-        if self.imagery_url is None:
-            return self
-        parts = urlsplit(self.imagery_url)
-        if parts.scheme not in ("http", "https") or not parts.hostname or "{" in parts.netloc:
-            raise ValueError("imagery_url must be a complete URL: https://host/…")
-        query = {key.upper() for key in parse_qs(parts.query, keep_blank_values=True)}
-        rows = ("{y}", "{-y}", "{TileRow}")
-        tiled = [("{z}", "{TileMatrix}"), ("{x}", "{TileCol}"), rows]
-        if self.imagery_kind == "xyz" and not all(any(n in self.imagery_url for n in names) for names in tiled):
-            raise ValueError("imagery_url of tiles must contain {z}, {x} and {y} (or {-y}; WMTS: {TileMatrix} …)")
-        if self.imagery_kind == "wms" and "LAYERS" not in query:
-            raise ValueError("imagery_url of a WMS must contain its layers: https://host/wms?layers=…")
+    def _urls_are_complete(self) -> Self:
+        if self.imagery_url is not None:
+            forms.check_imagery(self.imagery_url, self.imagery_kind)
+        if self.basemap_url is not None:
+            forms.check_basemap(self.basemap_url)
+        broker = None if self.mqtt_url is None else self.mqtt_url.get_secret_value()
+        forms.check_broker(broker, self.mqtt_password_file, self.mqtt_ca)
         return self
-
-    @model_validator(mode="after")
-    def _basemap_url_is_complete(self) -> Self:
-        if self.basemap_url is None:
-            return self
-        if basemap_origin(self.basemap_url) is None:
-            raise ValueError("basemap_url must be a complete URL without a user: https://host/{z}/{x}/{y}.png")
-        if not all(name in self.basemap_url for name in ("{z}", "{x}", "{y}")):
-            raise ValueError("basemap_url must contain {z}, {x} and {y}")
-        return self
-
-    @field_validator("public_url")
-    @classmethod
-    def _public_url_is_plain(cls, value: str | None) -> str | None:
-        if value is not None and (basemap_origin(value + "/") is None or "?" in value or "#" in value):
-            raise ValueError("public_url must be scheme, host and optional path: https://host/path")
-        return value
 
     @property
     def limits(self) -> Limits:
@@ -552,7 +548,12 @@ class Settings(RetentionSettings):
     @property
     def anonymous_list(self) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
         """Networks whose clients may read without a token."""
-        return parse_networks(self.anonymous_networks)
+        return forms.parse_networks(self.anonymous_networks)
+
+    @property
+    def webhook_list(self) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+        """Networks that webhooks may reach besides public addresses."""
+        return tuple(forms.parse_networks(self.webhook_networks))
 
     @property
     def database(self) -> str:

@@ -55,10 +55,13 @@ from app.errors import Conflict, DatabaseDamaged, FleetMapError, LostBlobs, Unav
 from app.events import bus, relay
 from app.events.bus import Bus, BusOptions
 from app.events.credentials import ZenohCredentials
+from app.events.mqtt import MqttBroker, MqttOptions
+from app.events.outgoing import OutgoingRules
 from app.events.relay import Relay
 from app.events.ros2 import Ros2Options, Ros2Publisher
 from app.events.ros_names import parse_keys, parse_selectors
 from app.events.security import RouterSecurity
+from app.events.webhooks import WebhookSender
 from app.fleet import ReportQueue as FleetIntake
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
@@ -108,7 +111,8 @@ async def _lifespan(settings: Settings, app: FleetMapApp) -> AsyncIterator[None]
     services.leads.start()
     listener = start_listener(settings, services)
     threading.Thread(target=_prepare, args=(services,), daemon=True).start()
-    publishing = [p for p in (start_ros2(settings, services), start_relay(settings, services)) if p is not None]
+    starting = (start_ros2, start_relay, start_mqtt, start_webhooks)
+    publishing = [thread for start in starting if (thread := start(settings, services)) is not None]
     app.response_cache = services.response_cache
     scrub = start_scrub(settings, services)
     try:
@@ -311,7 +315,7 @@ def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake:
         previews=Previews(store, tiles, service.cache),
         views=Views(store, tiles),
         leads=leads,
-        fleet=FleetIntake(store, leads.lead(relay.NAME), bus_vouches=_bus_vouches(settings)),
+        fleet=FleetIntake(store, leads.lead(relay.NAMES["zenoh"]), bus_vouches=_bus_vouches(settings)),
         writability=writability,
     )
 
@@ -377,6 +381,8 @@ def _api_options(settings: Settings) -> ApiOptions:
         basemap_url=settings.basemap_url,
         basemap_attribution=settings.basemap_attribution.strip(),
         retention=settings.retention,
+        mqtt=settings.mqtt_url is not None,
+        webhooks=OutgoingRules(settings.webhook_list, settings.webhook_ca),
     )
 
 
@@ -477,6 +483,24 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
     )
     publishing.start()
     return publishing
+
+
+def start_mqtt(settings: Settings, services: Services) -> Relay | None:
+    """Start the relay of events to an MQTT broker; None if there is none."""
+    if settings.mqtt_url is None:
+        return None
+    url, password_file = settings.mqtt_url.get_secret_value(), settings.mqtt_password_file
+    options = MqttOptions.from_url(url, settings.zenoh_prefix, password_file, settings.mqtt_ca)
+    thread = Relay(services.store, MqttBroker(options), settings.data_dir, services.leads)
+    thread.start()
+    return thread
+
+
+def start_webhooks(_: Settings, services: Services) -> WebhookSender:
+    """Start the thread that sends events to webhooks."""
+    thread = WebhookSender(services.store, services.options.data_dir, services.leads, services.options.webhooks)
+    thread.start()
+    return thread
 
 
 def check_bus(settings: Settings) -> None:

@@ -24,6 +24,7 @@ from app.main import create_app
 
 ROOT = Path(__file__).resolve().parents[1]
 TEXTS = (".py", ".md", ".toml", ".yaml", ".yml", ".svg", ".sh", ".service", ".env", ".js", "Makefile", "Dockerfile")
+NAMED_TEST = re.compile(r"(tests/[\w/]+\.py)::(test_\w+)")
 SKIPPED = frozenset({".git", ".venv", "build", "data", "dist", "node_modules"})
 
 
@@ -198,6 +199,17 @@ def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
     documented = {re.sub(r"{[a-z]+}", "*", word) for word in words(pages["reference/zenoh.html"])}
     for key in keys:
         assert key.replace("/**", "/*") in documented, key
+
+
+def test_tests_that_texts_name_exist() -> None:
+    """The promises of ``docs/security.md`` name the tests behind them."""
+    named = {match for path, text in texts() if path.suffix == ".md" for match in NAMED_TEST.findall(text)}
+    assert len([file for file, _ in named]) > 40
+    for file, name in named:
+        assert f"def {name}(" in (ROOT / file).read_text(), f"{file} has no {name}"
+    promises = (ROOT / "docs" / "security.md").read_text().split("| promise | test |")[1].split("\n\n")[0]
+    for row in promises.strip().splitlines()[1:]:
+        assert NAMED_TEST.search(row), f"no test behind this promise: {row}"
 
 
 def texts() -> Iterator[tuple[Path, str]]:

@@ -74,6 +74,7 @@ async def readyz(
     - `cache`: why maps are currently not cached on disk, or `ok`.
     - `events`: whether this server is connected to Zenoh, whether it is the one that publishes events (`leader`), and
       where robots find the router (`connect`, `prefix`). Maps are served even if events are not published.
+    - `mqtt`: the same for the MQTT broker, if there is one.
     - `mirror`: on a server that mirrors another one: `connected`, `starting` or `cut off`, the time of the last
       contact, how many changes wait for the centre, and until when robots accept its manifests without contact.
     - `ros2`: number of published topics, if the ROS 2 publisher is enabled; `standby`: another server publishes them.
@@ -95,6 +96,7 @@ async def readyz(
         endpoint = advertised_router(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
         events = {**events, "prefix": options.zenoh_prefix, **({"connect": endpoint} if endpoint else {})}
     topics = {"ros2": ros2.ros2_state(services.options.data_dir)} if services.options.ros2 else {}
+    broker = {"mqtt": relay_state(services.options.data_dir, "on", "mqtt")} if services.options.mqtt else {}
     state = {
         "status": "ready" if refusal is None else "read-only",
         "database": "ok",
@@ -106,7 +108,7 @@ async def readyz(
     mirror = await run_in_threadpool(services.store.mirrors.describe)
     shown = ("state", "contact", "waiting", "serves_until")
     mirrored = {} if mirror is None else {"mirror": {name: mirror[name] for name in shown}}
-    return json_response({**state, "events": events, **topics, **mirrored})
+    return json_response({**state, "events": events, **broker, **topics, **mirrored})
 
 
 @root_router.get(

@@ -27,6 +27,7 @@ from app.events import messages
 from app.events.credentials import describe_connection_failure, first_line
 from app.events.router import Router
 from app.events.security import RouterSecurity
+from app.store.outbox import RelayName
 
 log = logging.getLogger(__name__)
 
@@ -202,6 +203,9 @@ def _set(config: zenoh.Config, key: str, value: Any) -> None:
 class Bus:
     """Zenoh session of the server, and the embedded router. Reconnects after failures. Thread-safe."""
 
+    relay: RelayName = "zenoh"
+    history = EVENT_CACHE_SIZE
+
     def __init__(
         self,
         options: BusOptions,
@@ -301,6 +305,9 @@ class Bus:
             self._publishers.move_to_end(environment)
             publisher.put(messages.dumps(body), encoding=messages.JSON)
 
+    def flush(self) -> None:
+        """Do nothing: an event that was put is in the cache of its publisher."""
+
     def close_publishers(self) -> None:
         """Undeclare the publishers of events, with their caches."""
         with self._lock:
@@ -318,6 +325,11 @@ class Bus:
             if self._router is not None:
                 self._router.close()
                 self._router = None
+
+    @property
+    def title(self) -> str:
+        """Where it is connected to, for the log."""
+        return f"Zenoh at {self.endpoints}"
 
     @property
     def endpoints(self) -> str:

@@ -6,9 +6,9 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
-from sqlalchemy import Connection, func, insert, select, update
+from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import NotFound
 from app.event_types import EventType, check_members
@@ -16,6 +16,10 @@ from app.store import tables
 from app.store.base import environment_row
 from app.store.database import Database
 from app.store.values import Event, PartEntry, rfc3339
+
+RelayName = Literal["zenoh", "mqtt"]
+_RELAYS: Mapping[RelayName, int] = {"zenoh": 1, "mqtt": 2}
+"""Rows of the table ``relay``, by where the events go."""
 
 LOG_SEARCH_WINDOW = 100_000
 """Number of newest log positions in which former names are searched, and in which environments compete for history."""
@@ -124,6 +128,11 @@ def append_copies(connection: Connection, environment_id: str, events: Sequence[
     connection.execute(insert(tables.event), rows)
 
 
+def as_event(row: Row[Any]) -> Event:
+    """Convert a row into a value."""
+    return Event(row.sequence, row.environment, row.body, row.time, row.position, row.environment_id)
+
+
 def _edge_stream(environment_id: str) -> str:
     """Return the id under which a mirror logs its own changes of an environment."""
     return hashlib.sha256(f"edge {environment_id}".encode()).hexdigest()[:32]
@@ -163,23 +172,30 @@ class Outbox:
                         raise
                 query = query.where(condition, table.c.sequence > since).order_by(table.c.sequence)
             rows = connection.execute(query.limit(limit)).all()
-        return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
+        return [as_event(r) for r in rows]
 
     def last_sequence(self, environment: str) -> int:
         """Return the sequence of an environment's newest event."""
         with self._database.read() as connection:
             return int(environment_row(connection, environment, deleted=True).sequence)
 
-    def relay_position(self) -> int:
-        """Return the position up to which events were handed to the bus."""
+    def relay_position(self, relay: RelayName = "zenoh", *, from_now: bool = False) -> int:
+        """Return the position up to which a relay has handed events over.
+
+        from_now: one that has not handed over any begins with the next event instead of with the first one.
+        """
+        table = tables.relay
         with self._database.read() as connection:
-            position = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
+            position = connection.execute(select(table.c.position).where(table.c.id == _RELAYS[relay])).scalar()
+        if position is None and from_now:
+            position = self.last_position()
+            self.set_relayed(position, relay)
         return int(position or 0)
 
     def unsent(self, now: datetime) -> tuple[int, float]:
         """Return the number of events that were not handed to the bus yet, and the age of the oldest in seconds."""
         table = tables.event
-        relayed = select(tables.relay.c.position).where(tables.relay.c.id == 1)
+        relayed = select(tables.relay.c.position).where(tables.relay.c.id == _RELAYS["zenoh"])
         with self._database.read() as connection:
             position = int(connection.execute(relayed).scalar() or 0)
             newest = int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one())
@@ -187,15 +203,15 @@ class Outbox:
             oldest = connection.execute(after).scalar()
         return max(0, newest - position), 0.0 if oldest is None else max(0.0, (now - oldest).total_seconds())
 
-    def set_relayed(self, position: int) -> None:
-        """Store the position up to which events were handed over. It never decreases."""
-        table = tables.relay
+    def set_relayed(self, position: int, relay: RelayName = "zenoh") -> None:
+        """Store the position up to which a relay has handed events over. It never decreases."""
+        table, key = tables.relay, _RELAYS[relay]
         with self._database.write(notify=False, upkeep=True) as connection:
-            stored_position = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
+            stored_position = connection.execute(select(table.c.position).where(table.c.id == key)).scalar()
             if stored_position is None:
-                connection.execute(insert(table).values(id=1, position=position))
+                connection.execute(insert(table).values(id=key, position=position))
             elif stored_position < position:
-                connection.execute(update(table).where(table.c.id == 1).values(position=position))
+                connection.execute(update(table).where(table.c.id == key).values(position=position))
 
     def history(self, position: int, each: int, limit: int) -> list[HistoryRange]:
         """Choose the last ``each`` events up to a position of all environments, also purged ones, newest first.
@@ -245,7 +261,7 @@ class Outbox:
         )
         with self._database.read() as connection:
             rows = connection.execute(query).all()
-        return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in reversed(rows)]
+        return [as_event(r) for r in reversed(rows)]
 
     def last_position(self) -> int:
         """Return the position of the newest event."""

@@ -50,6 +50,7 @@ from app.store.tags import Tags
 from app.store.tokens import Tokens
 from app.store.verify import Progress, Verifier
 from app.store.versions import Versions
+from app.store.webhooks import Webhooks
 from app.store.wrong_tokens import WrongTokens
 
 
@@ -97,6 +98,7 @@ class Store:
         self.mirrors = Mirrors(database)
         self.edge_changes = EdgeChanges(database)
         self.events = Outbox(database)
+        self.webhooks = Webhooks(database)
         self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)
         self.search_index = SearchIndex(database, self.chunks)

@@ -28,7 +28,7 @@ from sqlalchemy import (
     true,
 )
 
-from app.store import fleet_tables, mirror_tables, table_base
+from app.store import fleet_tables, mirror_tables, table_base, webhook_tables
 from app.store.column_types import Grams, UtcDateTime, WkbGeometry, binary_text
 from app.store.table_base import POSTGRESQL, box, environment_key
 
@@ -37,6 +37,7 @@ metadata = table_base.metadata
 robot, robot_history = fleet_tables.robot, fleet_tables.robot_history
 robot_tally, presence = fleet_tables.robot_tally, fleet_tables.presence
 mirror, delegation, edge_change = mirror_tables.mirror, mirror_tables.delegation, mirror_tables.edge_change
+webhook, webhook_lag = webhook_tables.webhook, webhook_tables.webhook_lag
 
 SEARCH_STALE = "(search_sequence = sequence AND search_updated = updated) IS NOT TRUE"
 
@@ -349,7 +350,7 @@ relay = Table(
     Column("id", Integer, primary_key=True, autoincrement=False),
     Column("position", BigInteger, nullable=False),
 )
-"""One row: the position up to which events were handed to the bus."""
+"""Positions up to which events were handed over: 1 to Zenoh, 2 to the MQTT broker."""
 
 retired = Table(
     "retired",

@@ -436,7 +436,8 @@ def frame_input(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
 class Event:
     """One row of the log. sequence: of the environment, without gaps. body: the event as JSON.
 
-    position: in the whole log, increasing by one, so that one reader can follow all environments.
+    position: in the whole log, increasing by one, so that one reader can follow all environments. environment_id: stays
+    when the name changes.
     """
 
     sequence: int
@@ -444,6 +445,7 @@ class Event:
     body: Mapping[str, Any]
     time: datetime
     position: int = 0
+    environment_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)

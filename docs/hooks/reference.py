@@ -35,7 +35,15 @@ from typer.main import get_command
 from app import derive, generate
 from app.api.http import problems
 from app.api.http.auth import RequireRole
-from app.api.http.metrics import Metrics, QueueCollector, _Backups, _HeadVersionCollector, _Leaders, _Scrubs
+from app.api.http.metrics import (
+    Metrics,
+    QueueCollector,
+    _Backups,
+    _HeadVersionCollector,
+    _Leaders,
+    _Scrubs,
+    _Webhooks,
+)
 from app.api.http.operation_metrics import GAUGES
 from app.api.http.responses import API
 from app.backends.documents import FileDocument
@@ -409,10 +417,19 @@ def metrics() -> str:
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
-        backups = Backups(FileDocument(Path(folder) / "backup"))
-        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder), is_shared=False, backups=backups)
+        backups, webhooks = Backups(FileDocument(Path(folder) / "backup")), SimpleNamespace(all=list)
+        empty: Any = SimpleNamespace(
+            environments=environments, webhooks=webhooks, blob_dir=Path(folder), is_shared=False, backups=backups
+        )
         leaders, queue = _Leaders(LocalLeads(Path(folder))), QueueCollector(_no_tasks)
-        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), _Backups(empty), leaders, queue):
+        for collector in (
+            _HeadVersionCollector(empty),
+            _Scrubs(empty),
+            _Backups(empty),
+            _Webhooks(empty),
+            leaders,
+            queue,
+        ):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
                 rows.append((code(family.name), family.type, codes(labels), family.documentation))

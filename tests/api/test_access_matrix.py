@@ -91,6 +91,8 @@ ROWS = [
     ),
     *rows("server", viewer="GET /metrics", admin=f"GET {API}/tokens, DELETE {API}/tokens/{{id}}, POST {API}/keys"),
     *rows("server", admin=f"GET {API}/audit, GET {API}/retention, GET {API}/stored/{{kind}}/{{sha256}}"),
+    *rows("server", admin=f"GET {API}/webhooks, DELETE {API}/webhooks/{{id}}, POST {API}/webhooks/{{id}}/test"),
+    Row(f"POST {API}/webhooks", "admin", "server", {"url": "https://hooks.example.org/fleet"}),
     Row(f"POST {API}/tokens", "admin", "server", {"name": "x", "role": "viewer", "environments": OTHERS}),
     *rows("filtered", viewer=f"GET {API}/formats, GET {API}/derivations, GET {API}/generators, GET {API}/templates"),
     *rows("filtered", viewer=f"GET {API}/keys, GET {API}/environments, GET {API}/robots, GET {API}/robots/{{robot}}"),

@@ -70,6 +70,7 @@ def test_openapi_lists_every_address(schema: dict[str, Any]) -> None:
         "/api/v1/audit": "get", "/api/v1/retention": "get",
         "/api/v1/jobs": "get", "/api/v1/jobs/{id}": "get delete",
         "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete", "/api/v1/tokens/{id}/sign-in-code": "post",
+        "/api/v1/webhooks": "get post", "/api/v1/webhooks/{id}": "delete", "/api/v1/webhooks/{id}/test": "post",
         "/api/v1/session": "get post delete", "/api/v1/page": "get", "/api/v1/search": "get",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
         "/api/v1/stored/{kind}/{sha256}": "get", "/api/v1/mirror": "get", "/api/v1/mirror/delegations": "post",
@@ -259,6 +260,9 @@ def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path)
             if path == "/api/v1/tokens" and method == "post":
                 resource_ids["/api/v1/tokens/{id}"] = answer.json()["id"]
                 resource_ids["/api/v1/tokens/{id}/sign-in-code"] = answer.json()["id"]
+            if path == "/api/v1/webhooks" and method == "post":
+                resource_ids["/api/v1/webhooks/{id}"] = answer.json()["id"]
+                resource_ids["/api/v1/webhooks/{id}/test"] = answer.json()["id"]
             ran += 1
     assert ran >= len(calls)
 

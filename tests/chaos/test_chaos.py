@@ -1,4 +1,7 @@
-"""kill -9 of server, router and database at random moments, during commits, the event relay and downloads.
+"""kill -9 of server, router, database and collector at random moments.
+
+Meanwhile uploads, promotes and closures are written, garbage is collected, events are relayed and sent to a webhook,
+and robots download.
 
 Each is killed FLEETMAP_CHAOS times (4, ``make chaos``: 50), split between two setups: PostgreSQL with the server's own
 router, and SQLite with a separate router. FLEETMAP_CHAOS_SEED selects another order of moments.
@@ -9,12 +12,16 @@ from __future__ import annotations
 import json
 import os
 import random
+import subprocess
+import sys
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tests.agent.conftest import ROOT
 from tests.chaos.world import ANY, COMMIT, DOWNLOAD, ENVIRONMENT, RELAY, Fleet, World, fleet_of
 from tests.events.conftest import eventually
 from tests.postgres import Cluster, postgres_cluster
@@ -30,14 +37,14 @@ pytestmark = pytest.mark.timeout(240 + 3 * KILLS * SECONDS_A_KILL)
 
 @pytest.mark.postgres
 def test_postgresql_with_own_router_survives_kills(tmp_path: Path, postgres_cluster: Cluster) -> None:
-    each = {"server": KILLS - KILLS // 2, "router": KILLS - KILLS // 2, "database": KILLS}
+    each = {"server": KILLS - KILLS // 2, "router": KILLS - KILLS // 2, "database": KILLS, "collector": KILLS // 2}
     with fleet_of(tmp_path, postgres_cluster, own_router=True, seed=SEED) as fleet:
         kill_repeatedly(fleet, each)
         check(fleet)
 
 
 def test_sqlite_with_separate_router_survives_kills(tmp_path: Path) -> None:
-    each = {"server": KILLS // 2, "router": KILLS // 2}
+    each = {"server": KILLS // 2, "router": KILLS // 2, "collector": KILLS // 4}
     with fleet_of(tmp_path, None, own_router=False, seed=SEED + 100) as fleet:
         kill_repeatedly(fleet, each)
         check(fleet)
@@ -87,6 +94,12 @@ def check(fleet: Fleet) -> None:
     assert fleet.reader.sequences == expected, "server-sent events: a gap or a repeat"
     # A new leader publishes new events first, then those that it may have missed.
     eventually(lambda: sorted(set(fleet.listener.sequences())) == expected)
+    received = eventually(lambda: (s := _in_order(fleet.receiver.sequences(ENVIRONMENT)))[-1:] == [last] and s)
+    assert received == expected, "webhook: a gap, or an event before an earlier one"
+    assert fleet.receiver.problems == []
+    check_promotes(fleet, events)
+    check_closures(fleet)
+    check_stored_data(fleet)
     check_robots(fleet, head)
 
 
@@ -113,13 +126,49 @@ def lost_versions(fleet: Fleet, messages: dict[int, str]) -> list[int]:
     return [number for message, number in commits if messages.get(number) != message]
 
 
+def check_promotes(fleet: Fleet, events: list[dict[str, Any]]) -> None:
+    """Check that the log has each acknowledged move of the channel, in order."""
+    moves = iter(event["version"] for event in events if event["type"] == "channel.moved")
+    assert fleet.promoter.moves
+    assert all(version in moves for version in fleet.promoter.moves), "an acknowledged promote is lost"
+
+
+def check_closures(fleet: Fleet) -> None:
+    """Check that each closure is at least as far as it was acknowledged."""
+    ranks = fleet.closer.RANKS
+    assert "ended" in fleet.closer.states.values()
+    stored: dict[str, str] = {}
+    for state in ranks:
+        rows = fleet.world.get(f"environments/{ENVIRONMENT}/overlays?state={state}")
+        stored |= {row["id"]: row["state"] for row in rows}
+    lost = [key for key, state in fleet.closer.states.items() if ranks.get(stored.get(key, ""), -1) < ranks[state]]
+    assert lost == [], "an acknowledged closure is lost"
+
+
+def check_stored_data(fleet: Fleet) -> None:
+    """Check that all versions are whole, by ``fleetmap verify``, and that garbage was collected meanwhile."""
+    world = fleet.world
+    variables = {**os.environ, **world.variables, "FLEETMAP_DATA_DIR": str(world.folder / "data")}
+    command = [sys.executable, "-m", "app.cli", "verify", "--json"]
+    done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    log = (world.folder / "collector.log").read_text()
+    assert "'chunks':" in log, f"nothing was collected:\n{log[-2000:]}"
+    assert "Traceback" not in log, log[-2000:]
+
+
+def _in_order(sequences: list[int]) -> list[int]:
+    """Return each sequence once, in the order they first came."""
+    return list(dict.fromkeys(sequences))
+
+
 def _after(versions: list[dict[str, object]]) -> str:
     return f"&cursor={versions[-1]['version']}" if versions else ""
 
 
-def _events(world: World) -> list[dict[str, object]]:
+def _events(world: World) -> list[dict[str, Any]]:
     """Read the complete event log of the environment, like a new client."""
-    out: list[dict[str, object]] = []
+    out: list[dict[str, Any]] = []
     answer = world.http.get("events", params={"environment": ENVIRONMENT, "since": 0, "follow": False})
     assert answer.status_code == 200
     for line in answer.text.splitlines():

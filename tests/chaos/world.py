@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import httpx
 import zenoh
@@ -24,8 +24,10 @@ from app.events.router import Router
 from app.store.store import Store
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN
+from tests.chaos import collector
 from tests.cli.conftest import ServerProcess, seconds_until_healthy
 from tests.events.conftest import Listener, client_config, eventually, free_port
+from tests.events.receiver import Receiver
 from tests.postgres import Cluster
 
 ENVIRONMENT = "farm"
@@ -35,13 +37,19 @@ SIDE = 300
 
 SHADES = bytes((0, 205, 254)[k % 3] for k in range(256))
 
+UNAVAILABLE = (503, 507)
+"""Statuses of a server that is ending, starting, without its database, or on a full disk."""
+
 COMMIT, RELAY, DOWNLOAD, ANY = "commit", "relay", "download", "any"
 
 
 class World:
-    """Server, router and database. own_router: the server's own one; else a separate one."""
+    """Server, router, database, and a process that collects garbage.
 
-    def __init__(self, folder: Path, cluster: Cluster | None, *, own_router: bool) -> None:
+    own_router: the server's own one; else a separate one. more: further variables of the server.
+    """
+
+    def __init__(self, folder: Path, cluster: Cluster | None, *, own_router: bool, **more: str) -> None:
         self.folder, self.cluster, self.own_router = folder, cluster, own_router
         self.port, self.zenoh = free_port(), free_port()
         self.variables = {
@@ -50,6 +58,8 @@ class World:
             "FLEETMAP_LOG_LEVEL": "warning",
             "FLEETMAP_ZENOH_MODE": "router" if own_router else "client",
             "FLEETMAP_ZENOH_LISTEN": f"tcp/127.0.0.1:{self.zenoh}",
+            "FLEETMAP_WEBHOOK_NETWORKS": "127.0.0.1",
+            **more,
         }
         if not own_router:
             endpoint = f"tcp/127.0.0.1:{self.zenoh}"
@@ -65,6 +75,7 @@ class World:
         self.printed: list[str] = []
         self.server: ServerProcess | None = None
         self.serve()
+        self.revive_collector()
         self.http = httpx.Client(
             base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=HEADERS, timeout=20, verify=False
         )
@@ -131,8 +142,18 @@ class World:
         assert self.cluster is not None
         self.cluster.restart()
 
+    def kill_collector(self) -> None:
+        self.collector.kill()
+        self.collector.wait(60)
+
+    def revive_collector(self) -> None:
+        clean = {name: value for name, value in os.environ.items() if not name.startswith("FLEETMAP_")}
+        variables = {**clean, **self.variables, "FLEETMAP_DATA_DIR": str(self.folder / "data")}
+        self.collector = collector.start(variables, self.folder, self.folder / "collector.log")
+
     def close(self) -> None:
         self.http.close()
+        self.kill_collector()
         if self.server is not None:
             self.server.stop()
             self.printed += self.server.lines
@@ -157,9 +178,9 @@ class World:
 class Writer:
     """Writer that commits changes one by one, each with an idempotency key and repeated until acknowledged."""
 
-    def __init__(self, world: World, name: str, seed: int) -> None:
+    def __init__(self, world: World, name: str, seed: int, pause: float = 0.3) -> None:
         self._world, self._dice = world, random.Random(seed)
-        self.name = name
+        self.name, self._pause = name, pause
         self.busy = threading.Event()
         self.stopping = threading.Event()
         self.commits: dict[str, int] = {}
@@ -185,7 +206,7 @@ class Writer:
                 while not self.stopping.is_set():
                     count += 1
                     self._commit(client, f"{self.name} {count}")
-                    self.stopping.wait(self._dice.uniform(0, 0.3))
+                    self.stopping.wait(self._dice.uniform(0, self._pause))
         except BaseException as error:  # noqa: BLE001  the test's thread raises it
             self.problem = error
 
@@ -210,7 +231,7 @@ class Writer:
                 self.commits[message] = answer.json()["version"]
                 self.last = time.monotonic()
                 return
-            assert answer.status_code == 503, f"{answer.status_code} {answer.text}"
+            assert answer.status_code in UNAVAILABLE, f"{answer.status_code} {answer.text}"
             time.sleep(self._dice.uniform(0, 0.2))
 
     def _files(self) -> dict[str, bytes]:
@@ -235,7 +256,11 @@ class Mapper(Writer):
 
 
 class Promoter(Writer):
-    """Writer that moves the channel production forward, and sometimes back."""
+    """Writer that moves the channel production forward, and sometimes back. moves: acknowledged versions."""
+
+    def __init__(self, world: World, name: str, seed: int, pause: float = 0.3) -> None:
+        super().__init__(world, name, seed, pause)
+        self.moves: list[int] = []
 
     def _commit(self, client: httpx.Client, message: str) -> None:
         del message
@@ -243,14 +268,57 @@ class Promoter(Writer):
             head = client.get(f"environments/{ENVIRONMENT}/versions/latest")
             if head.status_code == 200:
                 back = self._dice.choice((0, 0, 0, 1, 3))
-                self.promote(client, max(2, head.json()["version"] - back))
-        self.stopping.wait(0.3)
+                version = max(2, head.json()["version"] - back)
+                if self.promote(client, version) and self.moves[-1:] != [version]:
+                    self.moves.append(version)
+        self.stopping.wait(self._pause)
 
     @staticmethod
     def promote(client: httpx.Client, version: int) -> bool:
         answer = client.put(f"environments/{ENVIRONMENT}/channels/production", json={"version": version})
-        assert answer.status_code in (200, 503), answer.text
-        return answer.status_code == 200
+        assert answer.status_code in (200, *UNAVAILABLE), answer.text
+        return bool(answer.status_code == 200)
+
+
+class Closer(Writer):
+    """Writer that reports closures, accepts them and ends most. states: what was acknowledged, by id."""
+
+    RANKS: ClassVar = {"pending": 0, "accepted": 1, "ended": 2}
+
+    def __init__(self, world: World, name: str, seed: int, pause: float = 1.5) -> None:
+        super().__init__(world, name, seed, pause)
+        self.states: dict[str, str] = {}
+
+    def _commit(self, client: httpx.Client, message: str) -> None:
+        x = self._dice.uniform(0, 40)
+        ring = [[x, 0], [x + 0.2, 0], [x + 0.2, 0.2], [x, 0]]
+        square = {"type": "Polygon", "coordinates": [ring]}
+        body = {"kind": "blocked", "polygon": square, "crs": "local", "ttl_seconds": 86_400, "detail": message}
+        url = f"environments/{ENVIRONMENT}/overlays"
+        created = self._send(client, url, body)
+        identifier = str(created["id"])
+        self.states[identifier] = "pending"
+        for step, state in (("accept", "accepted"), ("end", "ended")):
+            self.stopping.wait(self._dice.uniform(0, 0.5))
+            self._send(client, f"{url}/{identifier}/{step}", {})
+            self.states[identifier] = state
+        self.stopping.wait(self._dice.uniform(0.2, self._pause))
+
+    def _send(self, client: httpx.Client, path: str, body: dict[str, Any]) -> Any:
+        """Send until it is acknowledged. 409: an earlier try was carried out, and its response lost."""
+        while True:
+            self.busy.set()
+            try:
+                answer = client.post(path, json=body)
+            except httpx.TransportError:
+                time.sleep(self._dice.uniform(0, 0.2))
+                continue
+            finally:
+                self.busy.clear()
+            if answer.status_code in (200, 201, 409):
+                return answer.json()
+            assert answer.status_code in UNAVAILABLE, f"{path}: {answer.status_code} {answer.text}"
+            time.sleep(self._dice.uniform(0, 0.2))
 
 
 class Reader:
@@ -345,20 +413,30 @@ def check_current_map(into: Path) -> int | None:
 
 
 class Fleet:
-    """Robots, the two event readers and the writers of one world."""
+    """Robots, the event readers and the writers of one world.
 
-    def __init__(self, world: World, seed: int) -> None:
+    pause: maximum pause of a writer after each write, in seconds. proxy: port by which robots reach the server.
+    """
+
+    def __init__(self, world: World, seed: int, *, pause: float = 0.3, proxy: int | None = None) -> None:
         self.world = world
         self.dice = random.Random(seed)
+        self.receiver = Receiver()
+        hook = world.http.post("webhooks", json={"url": self.receiver.url}).raise_for_status().json()
+        self.receiver.secret = hook["secret"]
         world.http.post("environments", json={"name": ENVIRONMENT}).raise_for_status()
-        self.writers: list[Writer] = [Surveyor(world, "surveyor", seed + 1), Mapper(world, "mapper", seed + 2)]
+        self.writers: list[Writer] = [
+            Surveyor(world, "surveyor", seed + 1, pause),
+            Mapper(world, "mapper", seed + 2, pause),
+        ]
         self.first = [Mapper(world, "first map", seed + 3), Surveyor(world, "first network", seed + 4)]
         for writer in self.first:
             writer._commit(world.http, writer.name)
         assert Promoter.promote(world.http, 2)
-        self.promoter = Promoter(world, "promoter", seed + 5)
+        self.promoter = Promoter(world, "promoter", seed + 5, pause)
+        self.closer = Closer(world, "closer", seed + 6, max(1.5, pause))
         self.robots: list[Robot] = []
-        server = f"http://127.0.0.1:{world.port}"
+        server = f"http://127.0.0.1:{proxy or world.port}"
         for name, *more in (
             ("hearing", "--poll", "3600", "--channel", "latest"),  # only events, and the router's return
             ("polling", "--poll", "1", "--channel", "latest"),
@@ -384,7 +462,7 @@ class Fleet:
         self.listener = Listener(self.session, f"fleetmap/{ENVIRONMENT}/events")
         self.reader = Reader(world)
         self.watcher = Watcher(self.robots)
-        for writer in (*self.writers, self.promoter):
+        for writer in (*self.writers, self.promoter, self.closer):
             writer.start()
 
     def count_commits(self) -> int:
@@ -433,7 +511,7 @@ class Fleet:
 
     def settle(self, seconds: float = 90.0) -> dict[str, Any]:
         """Stop the writers, promote the head, and wait until all robots and readers have it. Returns the head."""
-        for writer in (*self.writers, self.promoter):
+        for writer in (*self.writers, self.promoter, self.closer):
             writer.stop()
         head: dict[str, Any] = self.world.get(f"environments/{ENVIRONMENT}/versions/latest")
         eventually(lambda: Promoter.promote(self.world.http, head["version"]), seconds)
@@ -446,12 +524,13 @@ class Fleet:
         return head
 
     def close(self) -> None:
-        for writer in (*self.writers, self.promoter):
+        for writer in (*self.writers, self.promoter, self.closer):
             writer.stopping.set()
         self.watcher.stopping.set()
         self.reader.stop()
         for robot in self.robots:
             robot.kill()
+        self.receiver.close()
         self.session.close()  # type: ignore[no-untyped-call]
 
 

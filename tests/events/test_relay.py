@@ -185,7 +185,7 @@ def test_status_over_zenoh_is_stored() -> None:
 class Deaf:
     """A bus that is always there."""
 
-    endpoints, opened, connected = "nowhere", 1, True
+    relay, history, title, opened, connected = "zenoh", 256, "nowhere", 1, True
     state: ClassVar = {"state": "connected"}
 
     def __init__(self) -> None:
@@ -196,6 +196,9 @@ class Deaf:
 
     def publish(self, _: str, body: Any) -> None:
         self.put.append(body["sequence"])
+
+    def flush(self) -> None:
+        """Everything is accepted."""
 
     def close(self) -> None:
         """Nothing is open."""
@@ -210,11 +213,11 @@ def test_database_outage_is_logged_once(
     store.environments.create("farm")
     relayed, reads = store.events.relay_position, []
 
-    def away() -> int:
+    def away(*args: Any, **more: Any) -> int:
         reads.append(1)
         if len(reads) < 20:
             raise Unavailable("the database is away")
-        return relayed()
+        return relayed(*args, **more)
 
     monkeypatch.setattr(store.events, "relay_position", away)
     bus = Deaf()

@@ -26,6 +26,7 @@ from app.convert.preview import Previews
 from app.convert.tiles import Tiles
 from app.convert.views import Views
 from app.errors import Unavailable
+from app.events.outgoing import OutgoingRules
 from app.fleet import ReportQueue as FleetIntake
 from app.ingest import CommitRequest, Ingest
 from app.limits import Limits
@@ -61,6 +62,8 @@ class ApiOptions:
     basemap_url: str | None = None
     basemap_attribution: str = ""
     retention: Rule | None = None
+    mqtt: bool = False
+    webhooks: OutgoingRules = field(default_factory=OutgoingRules)
 
 
 class Writability:

@@ -11,6 +11,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest, multiprocess
@@ -81,6 +82,7 @@ class Metrics:
         heads.register(_HeadVersionCollector(store))
         heads.register(_Scrubs(store))
         heads.register(_Backups(store))
+        heads.register(_Webhooks(store))
         if self.queue is not None:
             heads.register(QueueCollector(self.queue))
         heads.register(_Leaders(leads))
@@ -160,6 +162,33 @@ class _Backups(Collector):
         yield GaugeMetricFamily("fleetmap_backup_age_seconds", meaning, value=age)
         failures = "Number of failed backups since the last successful one."
         yield GaugeMetricFamily("fleetmap_backup_failures", failures, value=self._store.backups.failures().count)
+
+
+class _Webhooks(Collector):
+    """Events that webhooks have still to get, and for how long they have failed."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def collect(self) -> Iterable[Metric]:
+        waiting = GaugeMetricFamily(
+            "fleetmap_webhook_waiting",
+            "Number of events that a webhook has still to get, at most 1000.",
+            labels=["webhook"],
+        )
+        failing = GaugeMetricFamily(
+            "fleetmap_webhook_failing_seconds",
+            "Seconds since the first failed attempt after the last success, of the receiver or of an environment; 0: "
+            "none failed.",
+            labels=["webhook"],
+        )
+        for webhook in self._store.webhooks.all():
+            waiting.add_metric([webhook.id], self._store.webhooks.count_waiting(webhook))
+            failures = (webhook.attempts, *(lag.attempts for lag in self._store.webhooks.lags(webhook.id)))
+            since = [attempts.since for attempts in failures if attempts.since is not None]
+            failing.add_metric([webhook.id], (datetime.now(UTC) - min(since)).total_seconds() if since else 0)
+        yield waiting
+        yield failing
 
 
 class QueueCollector(Collector):

@@ -87,6 +87,7 @@ TAGS = {
     "mirrors": "For servers that follow this one.",
     "stored data": "Stored bytes, for the repair of another server.",
     "tokens": "Access tokens.",
+    "webhooks": "Addresses that get each event, signed and repeated until acknowledged.",
     "session": "Sign-in of browsers.",
     "search": "Search in all environments.",
     "audit": "Log of changes with author and address.",
