@@ -26,7 +26,7 @@ DOCKER = TOP / "docker"
 OWN_IMAGES = {"fleet-map-server": "Dockerfile", "fleet-map-agent": "agent.Dockerfile"}
 """Images of this project that tests run as processes, and their files."""
 
-TRANSLATED_FILES = ("Caddyfile", "router.json5")
+TRANSLATED_FILES = ("Caddyfile", "router.json5", "prometheus.yml")
 """Mounted files that name paths, ports and services."""
 
 STORE_PORTS = ("master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port", "filer.port.grpc")
@@ -200,10 +200,16 @@ class Container:
         sources = {source: target for source, target, *_ in volumes if source.startswith("./")}
         for path in set(self._mounts) - set(sources.values()):
             (self.folder / path[1:]).mkdir(exist_ok=True)
-        files = {DOCKER / source: self.folder / target[1:] for source, target in sources.items()}
+        files = {
+            path: self.folder / target[1:] / path.relative_to(DOCKER / source)
+            for source, target in sources.items()
+            for path in [DOCKER / source, *(DOCKER / source).rglob("*")]
+            if path.is_file()
+        }
         files |= {self.compose.secrets / name: self.secret_path(name) for name in service.get("secrets", ())}
         for file, copy in files.items():
             text = file.read_text()
+            copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_text(self.translate(text) if file.name in TRANSLATED_FILES else text)
         if "fleetmap_database_url" in service.get("secrets", ()):
             self.secret_path("fleetmap_database_url").write_text(self.compose.database_url + "\n")

@@ -108,6 +108,23 @@ def test_only_proxy_router_and_grafana_are_published(compose: dict[str, Any]) ->
     assert aliases["web"] == aliases["monitoring"] == {"aliases": ["server"]}
 
 
+def test_monitoring_reads_only_what_is_mounted(compose: dict[str, Any]) -> None:
+    """Paths and addresses in the files of Prometheus and Grafana are those of their services."""
+    services = compose["services"]
+    mounts = [text.split(":") for name in ("prometheus", "grafana") for text in services[name]["volumes"]]
+    secrets = {f"/run/secrets/{name}" for name in services["prometheus"]["secrets"]}
+    addresses = {f"{name}:{port}" for name, service in services.items() for port in service.get("expose", ())}
+    addresses |= {
+        f"{name}:{text.rpartition(':')[2]}" for name, one in services.items() for text in one.get("ports", ())
+    }
+    for file in (TOP / "docker" / "monitoring").rglob("*.yml"):
+        text = re.sub(r"^\s*#.*$", "", file.read_text(), flags=re.MULTILINE)
+        for path in re.findall(r"(?<![\w/])/(?:etc|run|var)/[\w./-]+", text):
+            sources = [source + path.removeprefix(target) for source, target, *_ in mounts if path.startswith(target)]
+            assert path in secrets or any((TOP / "docker" / source).exists() for source in sources), f"{file}: {path}"
+        assert set(re.findall(r"\b(?:server|proxy|prometheus|grafana):\d+", text)) <= addresses, file
+
+
 def test_profiles_start_one_server(compose: dict[str, Any]) -> None:
     profiles = {name: set(service.get("profiles", ())) for name, service in compose["services"].items()}
     for profile in ("postgres", "sqlite"):
