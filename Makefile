@@ -20,7 +20,7 @@ ROBOT := app/__init__.py app/errors.py app/event_types.py app/backends/__init__.
 # Sources of the web page. Installing builds it (app/web/build.py) with Node 20.19 or newer, which pip brings if there is none.
 PAGE := $(shell find app/web -path app/web/node_modules -prune -o -path app/web/dist -prune -o -type f -not -name openapi.json -not -name schema.d.ts -print)
 
-.PHONY: run test lint docs bench bench-web chaos soak fuzz figures release install install-dev clean
+.PHONY: run test lint docs bundle bench bench-web chaos soak fuzz figures release install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -75,6 +75,11 @@ figures: install-dev
 # Wheel, sdist, bill of materials, checksums and their signature (RELEASE_KEY), from the last commit, into build/release.
 release: install-dev
 	@.ci/release
+
+# For machines without internet, into build/: wheels of uv.lock, container images if there is an engine, checksums, install.sh.
+# ARGS="--processor aarch64 --python 3.12": for another machine; --robot: only the agent.
+bundle: install
+	@$(BIN)/python docker/make_bundle.py $(ARGS)
 
 install: $(VENV)/.installed
 

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import psycopg
 import pytest
+import yaml
 from psycopg import sql
 
 FOLDERS = ("/usr/local/bin", *(f"/usr/lib/postgresql/{n}/bin" for n in range(20, 12, -1)))
@@ -86,6 +87,12 @@ class Cluster:
         """Remove a database, even with open connections."""
         with self.connect() as connection:
             connection.execute(sql.SQL("DROP DATABASE IF EXISTS {} WITH (FORCE)").format(sql.Identifier(name)))
+
+
+def _initdb_options() -> list[str]:
+    """Options with which the compose files create the database."""
+    compose = yaml.safe_load((Path(__file__).resolve().parents[1] / "docker" / "compose.yaml").read_text())
+    return str(compose["services"]["database"]["environment"]["POSTGRES_INITDB_ARGS"]).split()
 
 
 def _missing(message: str) -> None:
@@ -159,7 +166,8 @@ def running_cluster() -> Iterator[Cluster]:
 
     try:
         process = run(
-            str(folder / "initdb"), "-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync"
+            str(folder / "initdb"),
+            *("-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync", *_initdb_options()),
         )
         if process.returncode:
             pytest.fail(f"initdb failed: {process.stderr}")

@@ -47,7 +47,10 @@ def pages_with_commands() -> list[str]:
 
 
 class Place:
-    """A folder in which a demo server runs, as after ``make run``, with ``fleetmap`` in its ``.venv``."""
+    """A folder in which a demo server runs, as after ``make run``, with ``fleetmap`` in its ``.venv``.
+
+    Of the checkout it also has ``docker``, in which pages create secrets.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -57,6 +60,8 @@ class Place:
         command = binaries / "fleetmap"
         command.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m app.cli "$@"\n')
         command.chmod(0o755)
+        shutil.copytree(ROOT / "docker", folder / "docker", ignore=shutil.ignore_patterns("secrets", ".env"))
+        (folder / "app").symlink_to(ROOT / "app")
         self.server = ServerProcess(
             "--demo",
             environment={

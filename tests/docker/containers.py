@@ -15,7 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +25,19 @@ from tests.preloaded import PreloadedProcess
 
 TOP = Path(__file__).resolve().parents[2]
 DOCKER = TOP / "docker"
-OWN_IMAGE = "fleet-map-server"
-TRANSLATED_FILES = ("Caddyfile", "router.json5")
+OWN_IMAGES = {"fleet-map-server": "Dockerfile", "fleet-map-agent": "agent.Dockerfile"}
+"""Images of this project that tests run as processes, and their files."""
+
+TRANSLATED_FILES = ("Caddyfile", "router.json5", "prometheus.yml")
 """Mounted files that name paths, ports and services."""
 
 STORE_PORTS = ("master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port", "filer.port.grpc")
 """Ports of SeaweedFS on the loopback address of its container, which all services share here."""
 
 
-def instructions() -> list[tuple[str, str]]:
-    """Parse the Dockerfile's last stage into (instruction, argument), with continued lines joined."""
-    text = (DOCKER / "Dockerfile").read_text()
+def instructions(file: str = "Dockerfile") -> list[tuple[str, str]]:
+    """Parse a Dockerfile's last stage into (instruction, argument), with continued lines joined."""
+    text = (DOCKER / file).read_text()
     text = re.sub(r"^\s*#.*\n", "", text, flags=re.MULTILINE)
     lines = [line.strip() for line in re.sub(r"\\\n", " ", text).splitlines() if line.strip()]
     pairs = [(line.split(None, 1)[0], line.split(None, 1)[1]) for line in lines]
@@ -43,10 +45,10 @@ def instructions() -> list[tuple[str, str]]:
     return pairs[start:]
 
 
-def image() -> dict[str, Any]:
-    """Read the image's environment, entry point, command and health check."""
+def image(file: str = "Dockerfile") -> dict[str, Any]:
+    """Read an image's environment, entry point, command and health check."""
     configuration: dict[str, Any] = {"env": {}}
-    for word, argument in instructions():
+    for word, argument in instructions(file):
         if word == "ENV":
             configuration["env"].update(re.findall(r"(\w+)=(\S+)", argument))
         elif word in ("ENTRYPOINT", "CMD", "WORKDIR"):
@@ -63,9 +65,22 @@ def free_ports(count: int) -> list[int]:
         return [int(one.getsockname()[1]) for one in sockets]
 
 
-def with_defaults(text: str) -> str:
-    """Replace ``${NAME:-default}`` by the default."""
-    return re.sub(r"\$\{\w+:-(.*?)\}", r"\1", text)
+def with_defaults(text: str, values: Mapping[str, str] | None = None) -> str:
+    """Replace variables by their values, and ``${NAME:-default}`` by the default without one.
+
+    Raises KeyError for a required variable (``${NAME}`` and ``${NAME:?message}``) without a value.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        name, operator, default = match.groups()
+        value = (values or {}).get(name, "")
+        if value or (operator == "-" and name in (values or {})):
+            return value
+        if operator in (":-", "-"):
+            return default
+        raise KeyError(match[0])
+
+    return re.sub(r"\$\{(\w+)(?:(:-|-|:\?)(.*?))?\}", replace, text)
 
 
 class Compose:
@@ -74,17 +89,28 @@ class Compose:
     Args:
         file: name of the file in ``docker``.
         options: options of make_secrets.py.
+        variables: of the operator's ``.env``.
+        secrets: existing folder of secrets. Default: one that make_secrets.py creates.
 
     Attributes:
         ports: (service, port) -> loopback port.
     """
 
-    def __init__(self, file: str, folder: Path, database_url: str, *options: str) -> None:
-        described = yaml.safe_load(with_defaults((DOCKER / file).read_text()))
+    def __init__(
+        self,
+        file: str,
+        folder: Path,
+        database_url: str,
+        *options: str,
+        variables: Mapping[str, str] | None = None,
+        secrets: Path | None = None,
+    ) -> None:
+        described = yaml.safe_load(with_defaults((DOCKER / file).read_text(), variables))
         self.services: dict[str, dict[str, Any]] = described["services"]
         self.folder, self.database_url = folder, database_url
-        self.secrets = folder / "secrets"
-        self.make_secrets(*options)
+        self.secrets = secrets or folder / "secrets"
+        if secrets is None:
+            self.make_secrets(*options)
         networks = [network or {} for network in described.get("networks", {}).values()]
         self.subnets = [one["subnet"] for network in networks for one in network.get("ipam", {}).get("config", ())]
         keys = [(name, port) for name, service in self.services.items() for port in _container_ports(service)]
@@ -92,7 +118,7 @@ class Compose:
         self.published = {
             host: self.ports[name, port]
             for name, service in self.services.items()
-            for host, _, port in (text.partition(":") for text in service.get("ports", ()))
+            for host, _, port in (text.rpartition(":") for text in service.get("ports", ()))
         }
 
     def make_secrets(self, *options: str) -> None:
@@ -130,19 +156,20 @@ class Container:
 
     def __init__(self, compose: Compose, name: str) -> None:
         service = compose.services[name]
-        is_own = service["image"].startswith(OWN_IMAGE)
-        configuration = image() if is_own else {"env": {}, "entrypoint": [], "cmd": [], "workdir": "/tmp"}
+        file = OWN_IMAGES.get(service["image"].partition(":")[0])
+        configuration = image(file) if file else {"env": {}, "entrypoint": [], "cmd": [], "workdir": "/tmp"}
         self.compose, self.name = compose, name
         self.folder = compose.folder / name
         volumes = [text.split(":") for text in service.get("volumes", ())]
         tmpfs = [text.partition(":")[0] for text in service.get("tmpfs", ())]
         self._mounts = sorted({"/run/secrets", "/tmp", *tmpfs, *(volume[1] for volume in volumes)}, key=len)[::-1]
         environment = {**configuration["env"], **service.get("environment", {})}
-        self.environment = {k: self.translate(str(v)) for k, v in environment.items()} | self._of_machine()
+        self.environment = {
+            k: self.translate("" if v is None else str(v)) for k, v in environment.items()
+        } | self._of_machine()
         entrypoint = service.get("entrypoint") or configuration["entrypoint"]
-        self.command = [
-            self.translate(word) for word in (*entrypoint, *(service.get("command") or configuration["cmd"]))
-        ]
+        command = (*entrypoint, *(service.get("command") or configuration["cmd"]))
+        self.command = [self.translate(word) for word in command]
         if "seaweedfs" in service["image"]:
             self.command += [f"-{option}={port}" for option, port in zip(STORE_PORTS, free_ports(6), strict=True)]
         self.healthcheck = configuration.get("healthcheck", [])
@@ -175,10 +202,16 @@ class Container:
         sources = {source: target for source, target, *_ in volumes if source.startswith("./")}
         for path in set(self._mounts) - set(sources.values()):
             (self.folder / path[1:]).mkdir(exist_ok=True)
-        files = {DOCKER / source: self.folder / target[1:] for source, target in sources.items()}
+        files = {
+            path: self.folder / target[1:] / path.relative_to(DOCKER / source)
+            for source, target in sources.items()
+            for path in [DOCKER / source, *(DOCKER / source).rglob("*")]
+            if path.is_file()
+        }
         files |= {self.compose.secrets / name: self.secret_path(name) for name in service.get("secrets", ())}
         for file, copy in files.items():
             text = file.read_text()
+            copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_text(self.translate(text) if file.name in TRANSLATED_FILES else text)
         if "fleetmap_database_url" in service.get("secrets", ()):
             self.secret_path("fleetmap_database_url").write_text(self.compose.database_url + "\n")
@@ -226,6 +259,15 @@ class Container:
                 start_new_session=True,
             )
         return self.process
+
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        """Run the service within a block."""
+        self.start()
+        try:
+            yield
+        finally:
+            self.stop()
 
     def stop(self, number: int = signal.SIGTERM) -> int | None:
         """Stop the service, and kill its processes if they stay. Returns the exit status, None if it never ran."""

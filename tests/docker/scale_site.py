@@ -6,180 +6,38 @@ import base64
 import contextlib
 import hashlib
 import itertools
-import json
-import re
-import signal
-import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx
 
 from app.agent.signatures import key_id, verify_signature
 from app.errors import Untrusted
-from app.events.credentials import ZenohCredentials
-from app.events.router import Router
 from tests.agent.conftest import network
-from tests.docker.containers import Compose, Container
-from tests.events.conftest import client_config, eventually
+from tests.docker.site import START_SECONDS, Site
+from tests.events.conftest import eventually
 
 SERVERS = ("server-1", "server-2", "server-3")
 WORKERS = ("worker-1", "worker-2")
 ROUTERS = ("router-1", "router-2")
-ROBOT, ROBOT_PASSWORD = "tractor-7", "ploughs-at-dawn"
-START_SECONDS = 120.0
 
 
-class Site:
-    """Running services. https: client of the proxy; servers, workers: clients of each one behind it."""
+class ScaleSite(Site):
+    """Services of compose.scale.yaml."""
 
-    def __init__(self, folder: Path, database_url: str) -> None:
-        self.compose = Compose("compose.scale.yaml", folder, database_url, "--scale", "--host", "127.0.0.1")
-        with (self.compose.secrets / "robots").open("a") as robots:
-            robots.write(f"{ROBOT}:{ROBOT_PASSWORD}\n")
-        self.compose.make_secrets("--scale")
-        names = [name for name in self.compose.services if name != "database"]
-        self.containers = {name: Container(self.compose, name) for name in names}
-        self.routers: dict[str, Router] = {}
-        token = self.containers[SERVERS[0]].secret("fleetmap_admin_token")
-        self.headers = {"Authorization": f"Bearer {token}"}
-        self.https = self.client()
-        self.servers = {name: self._inside(name) for name in SERVERS}
-        self.workers = {name: self._inside(name) for name in WORKERS}
-
-    def client(self) -> httpx.Client:
-        """Return another client of the proxy, which trusts the authority of the secrets."""
-        trust = ssl.create_default_context(cafile=self.compose.secrets / "ca.pem")
-        address = f"https://{self.compose.address('proxy')}"
-        return httpx.Client(base_url=address, headers=self.headers, verify=trust, timeout=60)
-
-    def _inside(self, name: str) -> httpx.Client:
-        return httpx.Client(base_url=f"http://{self.compose.address(name)}", headers=self.headers, timeout=60)
-
-    # --- processes ---
-
-    def start(self) -> None:
-        """Start everything in the order of ``depends_on``."""
-        self.containers["store"].start()
-        for name in ROUTERS:
-            self.start_router(name)
-        migrate = self.containers["migrate"]
-        done = migrate.run(migrate.command)
-        assert done.returncode == 0, done.stderr
-        eventually(lambda: self._answers("store"), START_SECONDS)
-        for name in (*SERVERS, *WORKERS, "proxy"):
-            self.containers[name].start()
-        for name in (*SERVERS, *WORKERS):
-            self.wait_ready(name)
-        eventually(lambda: all(self.is_connected(name) for name in SERVERS))
-        eventually(lambda: self.is_ready(self.https), START_SECONDS)
-
-    def _answers(self, name: str) -> bool:
-        try:
-            return httpx.get(f"http://{self.compose.address(name)}/healthz", timeout=5).status_code == 200
-        except httpx.TransportError:
-            return False
-
-    def start_router(self, name: str) -> None:
-        """Start a router as zenohd does with the service's command."""
-        options = self.containers[name].command
-        values = dict(option.partition("=")[::2] for option in options)
-        configuration = json.loads(Path(values["--config"]).read_text())
-        if "--connect" in values:
-            configuration["connect"] = {"endpoints": [values["--connect"]]}
-        assert "--no-multicast-scouting" in values
-        assert configuration["scouting"]["multicast"]["enabled"] is False
-
-        def starts() -> bool:  # its port may be taken for a moment after a stop
-            self.routers[name] = Router(json.dumps(configuration))
-            return self.routers[name].problem is None
-
-        eventually(starts)
-
-    def wait_ready(self, name: str) -> None:
-        """Wait until a server or worker is ready; fails at once if it has ended."""
-        container, client = self.containers[name], {**self.servers, **self.workers}[name]
-
-        def ready() -> bool:
-            assert container.process is not None
-            assert container.process.poll() is None, f"{name} has ended:\n{container.log[-3000:]}"
-            return self.is_ready(client)
-
-        eventually(ready, START_SECONDS)
-
-    @staticmethod
-    def is_ready(client: httpx.Client) -> bool:
-        """Whether /readyz returns 200."""
-        try:
-            return client.get("/readyz").status_code == 200
-        except httpx.TransportError:
-            return False
-
-    def is_connected(self, name: str) -> bool:
-        """Whether a server is connected to a Zenoh router."""
-        return bool(self.servers[name].get("/readyz").json()["events"]["state"] == "connected")
-
-    def leaders(self, names: Sequence[str] = SERVERS) -> list[str]:
-        """Servers that relay events."""
-        return [name for name in names if self.servers[name].get("/readyz").json()["events"].get("leader")]
-
-    def leader(self, names: Sequence[str] = SERVERS) -> str:
-        """Wait until one server relays events; return its name."""
-        (name,) = eventually(lambda: len(leaders := self.leaders(names)) == 1 and leaders)
-        return str(name)
-
-    def robot_session(self, router: str) -> Any:
-        """Open the Zenoh session of a robot at one of the routers."""
-        import zenoh
-
-        port = int(self.compose.address(router).rpartition(":")[2])
-        login = ZenohCredentials(self.compose.secrets / "ca.pem", user=ROBOT, password=ROBOT_PASSWORD)
-        endpoint = {"connect/endpoints": [f"tls/127.0.0.1:{port}"], "listen/endpoints": []}
-        return zenoh.open(client_config(port, **endpoint, **login.values()))
-
-    def close(self) -> None:
-        """Stop everything."""
-        for client in (self.https, *self.servers.values(), *self.workers.values()):
-            client.close()
-        for name in ("proxy", *SERVERS, *WORKERS):
-            process = self.containers[name].process
-            if process is not None and process.poll() is None:
-                process.terminate()  # all at once; stop() waits
-        for container in self.containers.values():
-            # SeaweedFS first waits for clients, for 25 seconds.
-            container.stop(signal.SIGKILL if container.name == "store" else signal.SIGTERM)
-        for router in self.routers.values():
-            router.close()
-
-    # --- requests ---
-
-    def call(self, client: httpx.Client, method: str, path: str, **request: Any) -> Any:
-        """Call the API and return its JSON; path: below /api/v1."""
-        answer = client.request(method, f"/api/v1/{path}", **request)
-        assert answer.status_code < 300, f"{answer.status_code} {answer.text}"
-        return answer.json() if answer.content else None
-
-    def upload(self, client: httpx.Client, environment: str, moved: float, nodes: int = 60) -> int:
-        """Upload a network with one node moved by some metres; return the version."""
-        files = {"files": ("n.tmap2.yaml", network(moved, nodes))}
-        return int(self.call(client, "POST", f"environments/{environment}/versions", files=files)["version"])
-
-    def conversions(self) -> dict[str, int]:
-        """Number of maps that each server and worker has made."""
-        clients = {**self.servers, **self.workers}
-        texts = {name: client.get("/metrics").text for name, client in clients.items()}
-        pattern = re.compile(r'^fleetmap_conversions_total\{.*result="made"\} (\S+)', re.MULTILINE)
-        return {name: sum(int(float(value)) for value in pattern.findall(text)) for name, text in texts.items()}
+    FILE = "compose.scale.yaml"
+    OPTIONS = ("--scale",)
+    SERVERS, WORKERS, ROUTERS = SERVERS, WORKERS, ROUTERS
+    OTHERS = ("proxy", "store", "migrate")
 
 
 @contextlib.contextmanager
-def running_site(folder: Path, database_url: str) -> Iterator[Site]:
+def running_site(folder: Path, database_url: str) -> Iterator[ScaleSite]:
     """Run all services on a database."""
-    site = Site(folder, database_url)
+    site = ScaleSite(folder, database_url)
     try:
         site.start()
         yield site

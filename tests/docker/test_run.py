@@ -1,73 +1,161 @@
-"""Run the server as the image's entry point and environment and the compose file start it, on a real PostgreSQL."""
+"""Services of compose.yaml as processes, with the exact commands, environment and files of the file.
+
+Real Caddy, PostgreSQL and Zenoh router; all start once for this module. The last test stops the server.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
-import time
-import urllib.error
-import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
+import zenoh
 
-from app.cli.server import wait_ready
+from app.config import Settings
 from tests.cli.conftest import Fleetmap
 from tests.docker.containers import Compose, Container, image, instructions
+from tests.docker.site import ROBOT, Site
+from tests.events.conftest import Listener, eventually
+from tests.postgres import Cluster
+
+VARIABLES = {"COMPOSE_PROFILES": "postgres"}
 
 
-@pytest.fixture
-def containers(tmp_path_factory: pytest.TempPathFactory, postgres_url: str) -> tuple[Container, Container]:
-    """Migrate service and server, with a new database, in a folder with a short path: a socket lies in its /tmp."""
-    compose = Compose("compose.yaml", tmp_path_factory.mktemp("site"), postgres_url)
-    return Container(compose, "migrate"), Container(compose, "server")
+class PostgresSite(Site):
+    """Services of compose.yaml with the profile postgres."""
+
+    FILE = "compose.yaml"
+    VARIABLES = VARIABLES
+    SERVERS, ROUTERS, OTHERS = ("server",), ("router",), ("proxy", "migrate")
+
+    def variables(self) -> dict[str, str]:
+        """Variables of a client or robot at the proxy."""
+        ca = str(self.compose.secrets / "ca.pem")
+        return {"FLEETMAP_SERVER": str(self.https.base_url), "FLEETMAP_TOKEN": self.token, "FLEETMAP_CA": ca}
+
+
+@pytest.fixture(scope="module")
+def site(postgres_cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PostgresSite]:
+    name = postgres_cluster.create_database()
+    site = PostgresSite(tmp_path_factory.mktemp("site"), postgres_cluster.url(name))
+    server = site.containers["server"]
+    assert server.run(server.healthcheck).returncode != 0
+    try:
+        site.start()
+        yield site
+    finally:
+        site.close()
+        postgres_cluster.drop_database(name)
 
 
 @pytest.mark.postgres
-def test_image_serves_maps_from_postgis(
-    containers: tuple[Container, Container], offline: Fleetmap, tmp_path: Path
+def test_image_serves_maps_from_postgis_over_https(
+    site: PostgresSite, offline: Fleetmap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    migrate, server = containers
-    address = f"http://127.0.0.1:{server.environment['FLEETMAP_PORT']}"
-    token = server.secret("fleetmap_admin_token")
+    server = site.containers["server"]
+    assert server.run(server.healthcheck).returncode == 0
+    assert site.https.get("/readyz").status_code == 200
+    assert site.https.get("/api/v1/environments", headers={"Authorization": ""}).status_code == 401
+    with pytest.raises(httpx.ConnectError, match="CERTIFICATE_VERIFY_FAILED"):
+        httpx.get(site.https.base_url, timeout=60)
 
-    for _ in range(2):  # compose runs it on every start
-        done = migrate.run(migrate.command)
+    for name, value in site.variables().items():
+        monkeypatch.setenv(name, value)
+    result = offline("demo", "--json")
+    assert result.status == 0, result.err
+    out = tmp_path / "map.yaml"
+    assert offline("export", "orchard", "tmap2", "-o", out).status == 0
+    assert "Dock" in out.read_text()
+    moved = out.with_suffix(".tmap2.yaml")
+    moved.write_text(out.read_text().replace("xy_goal_tolerance: 0.3", "xy_goal_tolerance: 0.4"))
+    assert offline("import", moved, "-e", "copy").status == 0
+    entries = site.call(site.https, "GET", "audit?environment=copy", headers={"X-Forwarded-For": "203.0.113.9"})
+    assert {entry["address"] for entry in entries} == {"127.0.0.1"}, "the proxy names the client"
+
+
+@pytest.mark.postgres
+def test_robot_of_the_compose_file_syncs_with_tls_and_user(site: PostgresSite, tmp_path: Path) -> None:
+    site.call(site.https, "POST", "environments", json={"name": "farm"})
+    site.upload(site.https, "farm", 0.0)
+    token = site.call(site.https, "POST", "tokens", json={"name": ROBOT, "role": "robot"})["token"]
+    variables = {
+        "FLEETMAP_SERVER": str(site.https.base_url),
+        "FLEETMAP_TOKEN": token,
+        "FLEETMAP_ROBOT": ROBOT,
+        "FLEETMAP_ZENOH_PASSWORD": site.robot_password,
+        "ENVIRONMENT": "farm",
+        "FORMATS": "tmap2",
+    }
+    compose = Compose("robot.compose.yaml", tmp_path, "", variables=variables, secrets=site.compose.secrets)
+    agent = Container(compose, "agent")
+    with agent.running():
+        maps = agent.folder / "var/lib/fleetmap/maps/current/tmap2/network.tmap2.yaml"
+        eventually(maps.is_file)
+        state = eventually(lambda: next((r for r in site.call(site.https, "GET", "robots") if r["online"]), None))
+        assert (state["robot"], state["version"]) == (ROBOT, 1), "its presence is announced over Zenoh"
+        before = maps.read_text()
+        site.upload(site.https, "farm", 0.5)  # an event: the next poll is a minute away
+        eventually(lambda: maps.read_text() != before, 30)
+    assert "Traceback" not in agent.log
+
+
+@pytest.mark.postgres
+def test_router_rejects_clients_without_its_users(site: PostgresSite) -> None:
+    site.call(site.https, "POST", "environments", json={"name": "yard"})
+    with site.robot_session("router") as robot, site.robot_session("router") as other:
+        listener = Listener(other, "fleetmap/yard/events")
+        listener.wait(lambda events: events.sequences() == [1])
+        robot.put("fleetmap/yard/events", b'{"sequence": 3}')  # the router drops it
+        site.upload(site.https, "yard", 0.0)
+        listener.wait(lambda events: events.sequences() == [1, 2])
+    with pytest.raises(zenoh.ZError):
+        site.robot_session("router", password="guessed")
+
+
+@pytest.mark.postgres
+def test_migrations_may_be_repeated(site: PostgresSite) -> None:
+    migrate = site.containers["migrate"]
+    assert (done := migrate.run(migrate.command)).returncode == 0, done.stderr
+
+
+@pytest.mark.postgres
+def test_database_accepts_its_command(site: PostgresSite, postgres_cluster: Cluster) -> None:
+    """PostgreSQL reads its settings and stops; the tests' cluster was created with POSTGRES_INITDB_ARGS."""
+    for file in ("compose.yaml", "compose.scale.yaml"):
+        compose = Compose(file, site.compose.folder, "", variables=VARIABLES, secrets=site.compose.secrets)
+        program, *options = compose.services["database"]["command"]
+        command = [str(postgres_cluster.bin / program), "-D", str(postgres_cluster.data), *options]
+        done = postgres_cluster.run(*command, "-C", "max_connections")
         assert done.returncode == 0, done.stderr
+        assert f"max_connections={done.stdout.strip()}" in options
+    with postgres_cluster.connect() as connection:
+        assert connection.execute("SHOW data_checksums").fetchone() == ("on",)
+        collation = connection.execute("SELECT datcollate FROM pg_database WHERE datname = 'postgres'").fetchone()
+        assert collation == ("C.UTF-8",)
 
-    assert server.run(server.healthcheck).returncode != 0
-    process = server.start()
-    try:
-        wait_ready(address)
-        assert server.run(server.healthcheck).returncode == 0
-        with pytest.raises(urllib.error.HTTPError) as refused:
-            urllib.request.urlopen(f"{address}/api/v1/environments", timeout=60)
-        refused.value.close()
-        assert refused.value.code == 401
 
-        access = ["--server", address, "--token", token]
-        result = offline("demo", "--json", *access)
-        assert result.status == 0, result.err
-        out = tmp_path / "map.yaml"
-        assert offline("export", "orchard", "tmap2", "-o", out, *access).status == 0
-        assert "Dock" in out.read_text()
-        moved = out.with_suffix(".tmap2.yaml")
-        moved.write_text(out.read_text().replace("xy_goal_tolerance: 0.3", "xy_goal_tolerance: 0.4"))
-        assert offline("import", moved, "-e", "copy", *access).status == 0
-        with urllib.request.urlopen(f"{address}/readyz", timeout=60) as ready:
-            assert ready.status == 200
-    finally:
-        began = time.monotonic()
-        process.send_signal(signal.SIGTERM)
-        status = process.wait(30)
-        took = time.monotonic() - began
-    log = server.log
-    assert status == 0, log
-    assert took < 20
-    assert token not in log, "the log contains a secret"
-    assert "Traceback" not in log
-    assert (server.folder / "data").is_dir()
-    assert not list((server.folder / "data").glob("*.sqlite3")), "everything is in PostgreSQL"
+def test_sqlite_service_has_no_database_and_the_same_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compose = Compose("compose.yaml", tmp_path, "", "--sqlite", variables={"COMPOSE_PROFILES": "sqlite"})
+    assert not (compose.secrets / "fleetmap_database_url").exists()
+    services = compose.services
+    differing = {"profiles", "secrets", "volumes", "networks", "depends_on"}
+    assert {k: v for k, v in services["server"].items() if k not in differing} == {
+        k: v for k, v in services["server-sqlite"].items() if k not in differing
+    }
+    container = Container(compose, "server-sqlite")
+    for name in [name for name in os.environ if name.startswith("FLEETMAP_")]:
+        monkeypatch.delenv(name)
+    for name, value in container.environment.items():
+        if name.startswith("FLEETMAP_"):
+            monkeypatch.setenv(name, value)
+    settings = Settings(_env_file=None, _secrets_dir=container.environment["FLEETMAP_SECRETS_DIR"])
+    assert settings.database_url is None
+    assert settings.zenoh_password is not None
+    assert settings.admin_token is not None
 
 
 def test_image_needs_no_shell() -> None:
@@ -78,11 +166,20 @@ def test_image_needs_no_shell() -> None:
 
 
 def test_image_writes_only_to_its_volume() -> None:
-    from app.config import Settings
-
     configuration = image()
     folder = Path(configuration["env"]["FLEETMAP_DATA_DIR"])
     settings = Settings(data_dir=folder, _env_file=None)
     volumes = [Path(v) for word, argument in instructions() if word == "VOLUME" for v in json.loads(argument)]
     for path in (settings.blob_dir, settings.cache_dir, settings.spool_dir):
         assert any(path.is_relative_to(volume) for volume in volumes), path
+
+
+@pytest.mark.postgres
+def test_server_stops_cleanly_and_logs_no_secret(site: PostgresSite) -> None:
+    server = site.containers["server"]
+    assert server.stop(signal.SIGTERM) == 0, server.log
+    assert "Traceback" not in server.log
+    for name in ("fleetmap_admin_token", "fleetmap_zenoh_password", "database_password"):
+        secret = (site.compose.secrets / name).read_text().strip()
+        assert all(secret not in site.containers[one].log for one in ("server", "proxy")), name
+    assert not list((server.folder / "data").glob("*.sqlite3")), "everything is in PostgreSQL"
