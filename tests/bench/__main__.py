@@ -253,15 +253,18 @@ def main() -> int:
             "derived",
             "ogc",
             "scale",
+            "scale-postgresql",
             "servers",
             "sizing",
         ],
-        help="one of the tables; scale (half an hour), servers and sizing (with PostgreSQL) only if they are named",
+        help="one of the tables; scale and scale-postgresql (half an hour each), servers and sizing (with PostgreSQL) "
+        "only if they are named",
     )
     arguments = parser.parse_args()
     if arguments.only == "sizing":
         return sizing.report(arguments.json)
-    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale", "servers"):
+    is_scale = arguments.only in ("scale", "scale-postgresql")
+    if not DATA.is_dir() and not is_scale and arguments.only not in ("generate", "large", "derived", "servers"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
@@ -274,7 +277,7 @@ def main() -> int:
     server_rows = servers.rows() if arguments.only == "servers" else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
-    scale_rows = scale.rows() if arguments.only == "scale" else []
+    scale_rows = scale.rows(postgres=arguments.only == "scale-postgresql") if is_scale else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
         tables |= {
