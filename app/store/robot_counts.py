@@ -14,7 +14,22 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Column, Connection, Row, Select, and_, bindparam, delete, false, func, insert, or_, select, true
+from sqlalchemy import (
+    Column,
+    ColumnElement,
+    Connection,
+    Row,
+    Select,
+    and_,
+    bindparam,
+    delete,
+    false,
+    func,
+    insert,
+    or_,
+    select,
+    true,
+)
 
 from app.store import tables
 from app.store.base import environment_row
@@ -126,18 +141,25 @@ def _groups_query() -> Select[Any]:
     return query.group_by(*_group_columns()).having(number != 0)
 
 
-def _online_query() -> Select[Any]:
-    """Count robots by the rule of ``app.fleet.is_online``."""
+def is_online() -> ColumnElement[bool]:
+    """SQL expression on a robot and its presence: the rule of ``app.fleet.is_online``.
+
+    Its parameters are ``on_bus_after`` and ``heard_after``, see ``RobotCounts.read``.
+    """
     table, presence = tables.robot, tables.presence
     on_bus, seen = func.coalesce(presence.c.there, false()), presence_seen()
     has_left = and_(presence.c.there.is_(False), seen >= table.c.time)
     is_heard = and_(table.c.time > bindparam("heard_after", type_=UtcDateTime), func.coalesce(~has_left, true()))
-    is_online = or_(and_(on_bus, seen > bindparam("on_bus_after", type_=UtcDateTime)), is_heard)
+    return or_(and_(on_bus, seen > bindparam("on_bus_after", type_=UtcDateTime)), is_heard)
+
+
+def _online_query() -> Select[Any]:
+    table, presence = tables.robot, tables.presence
     return (
         select(table.c.channel, func.count().label("number"))
         .select_from(table)
         .outerjoin(presence, presence.c.robot == table.c.robot)
-        .where(table.c.environment_id == bindparam("environment"), is_online)
+        .where(table.c.environment_id == bindparam("environment"), is_online())
         .group_by(table.c.channel)
     )
 
