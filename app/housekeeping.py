@@ -82,6 +82,7 @@ class _Housekeeping:
         store.tokens.store_uses()
         store.sessions.store_uses()
         services.access.share_failures()
+        services.jobs.store_progress()
         if is_beat:
             services.jobs.send_heartbeats()
 

@@ -1,4 +1,4 @@
-"""An index of the robots that report a failure, which open rollouts look for each second.
+"""An index of the robots that report a failure, which open rollouts look for each second; steps of jobs.
 
 Revision ID: 0026
 Revises: 0021
@@ -17,6 +17,7 @@ min_compatible = "0019"
 
 
 def upgrade() -> None:
+    op.add_column("job", sa.Column("step", sa.Text, nullable=True))
     failed = sa.text("state = 'failed'")
     op.create_index(
         "ix_robot_failed", "robot", ["environment_id", "channel", "root"], sqlite_where=failed, postgresql_where=failed
@@ -25,3 +26,4 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     op.drop_index("ix_robot_failed", "robot")
+    op.drop_column("job", "step")
