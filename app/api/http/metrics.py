@@ -15,6 +15,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from app.api.http.mirror_metrics import MirrorCollector
 from app.backends.lead import Leads
 from app.backends.queue import QueueFigures
 from app.store.scrub import current_state, figures
@@ -79,6 +80,7 @@ class Metrics:
         if self.queue is not None:
             heads.register(QueueCollector(self.queue))
         heads.register(_Leaders(leads))
+        heads.register(MirrorCollector(store))
         return generate_latest(registry) + generate_latest(heads)
 
 
