@@ -105,6 +105,7 @@ class _Housekeeping:
                 self._collect_at = datetime.now(UTC) + COLLECT_EVERY
                 store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))
                 store.garbage.collect(COLLECT_GRACE)
+                store.search_index.merge()
 
 
 def _note_time(newest: datetime) -> datetime:

@@ -83,6 +83,7 @@ def fill(url: str, folder: Path, environments: int, versions: int) -> float:
     with joined(store):
         store.index.refresh()  # of those with a copied history; commits have done the others
     store.search_index.refresh(environments)
+    store.search_index.merge()  # as every day
     if not url.startswith("sqlite"):
         with store._database.engine.connect() as connection:
             connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM ANALYZE")
