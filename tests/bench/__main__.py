@@ -29,6 +29,7 @@ from tests.bench import (
     generate,
     http,
     large,
+    mirror,
     networks,
     ogc,
     scale,
@@ -254,6 +255,7 @@ def main() -> int:
             "ogc",
             "scale",
             "scale-postgresql",
+            "mirror",
             "servers",
             "sizing",
         ],
@@ -264,7 +266,11 @@ def main() -> int:
     if arguments.only == "sizing":
         return sizing.report(arguments.json)
     is_scale = arguments.only in ("scale", "scale-postgresql")
-    if not DATA.is_dir() and not is_scale and arguments.only not in ("generate", "large", "derived", "servers"):
+    if (
+        not DATA.is_dir()
+        and not is_scale
+        and arguments.only not in ("generate", "large", "derived", "mirror", "servers")
+    ):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
@@ -278,6 +284,7 @@ def main() -> int:
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
     scale_rows = scale.rows(postgres=arguments.only == "scale-postgresql") if is_scale else []
+    mirror_rows = mirror.rows() if arguments.only in (None, "mirror") else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
         tables |= {
@@ -287,6 +294,7 @@ def main() -> int:
             "generate": generation_rows,
             "derived": huge,
             "scale": scale_rows,
+            "mirror": mirror_rows,
         }
         print(json.dumps(tables, indent=2))
     else:
@@ -314,6 +322,7 @@ def main() -> int:
             "generated": generation_rows,
             "several servers": server_rows,
             "many against few": scale_rows,
+            "mirror": mirror_rows,
         }
         for title, rows in ratios.items():
             if not rows:
@@ -364,6 +373,7 @@ def main() -> int:
                 huge,
                 ogc_rows,
                 scale_rows,
+                mirror_rows,
                 server_rows,
             )
             for r in rows

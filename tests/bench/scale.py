@@ -311,21 +311,21 @@ def growth() -> list[dict[str, Any]]:
             store = Store(f"sqlite:///{folder}/fleetmap.sqlite", Path(folder) / "blobs")
             store.migrate()
             store.environments.create("farm")
-            cells = _rooms(4000, 5000)
-            last = _commit_grid(store, cells, "", upload=True)
-            one = _stored_bytes(store)
+            cells = rooms(4000, 5000)
+            last = commit_grid(store, cells, "", upload=True)
+            one = stored_bytes(store)
             dice = np.random.default_rng(1)
             for k in range(100):
                 y, x = dice.integers(0, 3995), dice.integers(0, 4995)
                 cells[y : y + 5, x : x + 5] = 100 * (k % 2)
-                last = _commit_grid(store, cells, last, upload=again)
+                last = commit_grid(store, cells, last, upload=again)
             label = f"stored of a 20 MB grid, after 100 {what}"
-            out.append(_row(label, one / 1e6, _stored_bytes(store) / 1e6, unit="MB", bound=1.3))
+            out.append(_row(label, one / 1e6, stored_bytes(store) / 1e6, unit="MB", bound=1.3))
             store.close()
     return out
 
 
-def _rooms(height: int, width: int) -> NDArray[np.uint8]:
+def rooms(height: int, width: int) -> NDArray[np.uint8]:
     """Draw rooms with walls on unknown ground, with a sensor's noise on a fiftieth of the free cells."""
     dice = np.random.default_rng(4)
     cells = np.full((height, width), 255, np.uint8)
@@ -336,7 +336,7 @@ def _rooms(height: int, width: int) -> NDArray[np.uint8]:
     return cells
 
 
-def _commit_grid(store: Store, cells: NDArray[np.uint8], last: str, *, upload: bool) -> str:
+def commit_grid(store: Store, cells: NDArray[np.uint8], last: str, *, upload: bool) -> str:
     """Commit a grid, with its file as a source if it is uploaded; returns the file's hash."""
     sources: tuple[Source, ...] = ()
     if upload:
@@ -350,7 +350,7 @@ def _commit_grid(store: Store, cells: NDArray[np.uint8], last: str, *, upload: b
     return last
 
 
-def _stored_bytes(store: Store) -> int:
+def stored_bytes(store: Store) -> int:
     """Return the bytes of the chunks, files, versions and events."""
     columns = ("chunk", "data"), ("version", "manifest"), ("event", "body")
     with store._database.read() as connection:
