@@ -90,6 +90,7 @@ class _Housekeeping:
         store.tokens.store_uses()
         store.sessions.store_uses()
         services.access.share_failures()
+        services.jobs.store_progress()
         if is_beat:
             services.jobs.send_heartbeats()
 
@@ -121,6 +122,7 @@ class _Housekeeping:
                 last = store.garbage.last_run()
                 store.garbage.collect(COLLECT_GRACE)
                 self._thin(last)
+                store.search_index.merge()
         finally:
             self._content.release()
 

@@ -17,14 +17,16 @@ import resource
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+from app import progress
 from app.errors import FleetMapError, TooLarge, Unavailable
+from app.progress import Progress
 from app.sandbox import SandboxPolicy, confine
 
 log = logging.getLogger(__name__)
@@ -61,12 +63,14 @@ class _Worker:
 
 
 class CancelHandle:
-    """Cancels one job from another thread: kills its process, or prevents its start."""
+    """Cancels one job from another thread: kills its process, or prevents its start. progress: as last reported."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._process: BaseProcess | None = None
+        self._part = (0.0, 1.0)
         self.is_cancelled = False
+        self.progress = Progress()
 
     def __call__(self) -> None:
         """Cancel the job; it raises Cancelled unless it has just finished."""
@@ -79,6 +83,23 @@ class CancelHandle:
         """Raise Cancelled if the job was cancelled."""
         if self.is_cancelled:
             raise Cancelled("the conversion was cancelled: request it again")
+
+    @contextlib.contextmanager
+    def part(self, start: float, end: float) -> Iterator[None]:
+        """Have calls of workers inside be a part of the whole, from one fraction of it to another. Raises Cancelled."""
+        self.check()
+        outer = self._part
+        width = outer[1] - outer[0]
+        self._part = (outer[0] + width * start, outer[0] + width * end)
+        try:
+            yield
+        finally:
+            self._part = outer
+
+    def note(self, progress: Progress) -> None:
+        """Note the progress of the present call. It never decreases, though another way may have to be tried."""
+        start, end = self._part
+        self.progress = Progress(max(self.progress.fraction, start + (end - start) * progress.fraction), progress.step)
 
     def attach(self, process: BaseProcess | None) -> None:
         """Set the process that runs the job (None: none any more). Raises Cancelled if the job was cancelled."""
@@ -157,7 +178,8 @@ class Pool:
                 if stop is not None:
                     stop.attach(worker.process)
                 try:
-                    ok, value = _call_worker(worker, function, args, self._seconds if seconds is None else seconds)
+                    limit, note = self._seconds if seconds is None else seconds, None if stop is None else stop.note
+                    ok, value = _call_worker(worker, function, args, limit, note)
                 finally:
                     if stop is not None:
                         stop.attach(None)  # raise Cancelled rather than WorkerDied
@@ -253,14 +275,24 @@ def _kill(process: BaseProcess) -> None:
 
 
 def _call_worker(
-    worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], seconds: float
+    worker: _Worker,
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+    seconds: float,
+    note: Callable[[Progress], None] | None,
 ) -> tuple[bool, Any]:
-    """Run the function in a worker. Returns whether it returned, and its result or exception."""
+    """Run the function in a worker. Returns whether it returned, and its result or exception. note: gets progress."""
+    end = time.monotonic() + seconds
     try:
         worker.pipe.send((function.__module__, function.__qualname__, args))
-        if not worker.pipe.poll(seconds):
-            raise WorkerDied(f"the time limit of {seconds:g} seconds was exceeded")
-        ok, value = worker.pipe.recv()
+        while True:
+            if not worker.pipe.poll(max(0.0, end - time.monotonic())):
+                raise WorkerDied(f"the time limit of {seconds:g} seconds was exceeded")
+            ok, value = worker.pipe.recv()
+            if ok is not None:
+                break
+            if note is not None:
+                note(Progress(*value))
     except (EOFError, OSError) as error:
         worker.process.join(1.0)
         code = worker.process.exitcode
@@ -295,7 +327,8 @@ def _work(
             target: Any = importlib.import_module(module)
             for part in function.split("."):
                 target = getattr(target, part)
-            answer = (True, target(*args))
+            with progress.sent_to(lambda one: pipe.send((None, (one.fraction, one.step)))):
+                answer = (True, target(*args))
         except MemoryError:
             answer = (False, _no_memory())
         except FleetMapError as error:

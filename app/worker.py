@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 from collections.abc import AsyncIterator
 from functools import partial
@@ -24,6 +25,11 @@ from app.backends.shared_queue import QueueWorker, SharedQueue
 from app.config import Settings
 from app.errors import FleetMapError, Invalid, Unavailable
 from app.watch import disk_metrics
+
+log = logging.getLogger(__name__)
+
+PROGRESS_SECONDS = 1.0
+"""Interval at which the progress of tasks is stored, if it has changed."""
 
 
 def check(settings: Settings) -> None:
@@ -59,13 +65,27 @@ async def _lifespan(settings: Settings, app: Starlette) -> AsyncIterator[None]:
     app.state.services, app.state.worker, app.state.queue = services, worker, queue
     app.state.disks = disk_metrics(settings)
     running = asyncio.create_task(worker.run())
+    reporting = asyncio.create_task(_report_progress(performer))
     try:
         yield
     finally:
+        reporting.cancel()
         worker.stop()
         await running
         await run_in_threadpool(main.close_services, services)
         await run_in_threadpool(traces.stop)
+
+
+async def _report_progress(performer: TaskPerformer) -> None:
+    """Store the progress of tasks every second."""
+    while True:
+        await asyncio.sleep(PROGRESS_SECONDS)
+        try:
+            await run_in_threadpool(performer.store_progress)
+        except FleetMapError as error:
+            log.warning("worker: storing the progress of tasks failed, will retry: %s", error.detail)
+        except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
+            log.warning("worker: storing the progress of tasks failed, will retry: %s", problems.describe(error))
 
 
 async def _healthz(request: Request) -> Response:

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from app import sandbox
+from app import progress, sandbox
 from app.errors import NotFound, Problem, TooLarge, Unavailable
 from app.pool import CancelHandle, Cancelled, Pool, WorkerDied
+from app.progress import Progress
 from app.sandbox import SandboxPolicy
 
 
@@ -66,6 +67,17 @@ class _Unsendable:
 
     def __reduce__(self) -> tuple[type[bytes], tuple[bytes]]:
         return bytes, (bytes(64 * 2**30),)
+
+
+def work_steps() -> int:
+    progress.report(0.0, "reading")
+    with progress.within(0.2, 0.6):
+        progress.report(0.5, "first")
+        progress.report(0.6, "first")  # too soon after the report before
+        with progress.within(0.5, 1.0):
+            progress.report(0.5, "second")
+    progress.report(0.9, "storing")
+    return 7
 
 
 def work_unsendable() -> _Unsendable:
@@ -124,6 +136,25 @@ def test_timeout_kills_the_job_and_worker_is_replaced(pool: Pool) -> None:
         pool.run(work_sleep, 60.0, seconds=0.3)
     assert time.monotonic() - start < 60
     assert pool.run(work_double, 1) == 2
+
+
+def test_progress_of_a_worker_reaches_who_waits(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+    notes: list[Progress] = []
+    note = CancelHandle.note
+    monkeypatch.setattr(CancelHandle, "note", lambda self, one: (note(self, one), notes.append(self.progress))[0])
+    handle = CancelHandle()
+    assert pool.run(work_steps, stop=handle) == 7
+    assert [(round(one.fraction, 9), one.step) for one in notes] == [
+        (0.0, "reading"), (0.4, "first"), (0.5, "second"), (0.9, "storing"),
+    ]  # fmt: skip
+    notes.clear()
+    assert pool.run(work_steps, stop=handle) == 7
+    assert {one.fraction for one in notes} == {0.9}, "it does not go back when another way is tried"
+    other = CancelHandle()
+    with other.part(0.5, 1.0):
+        pool.run(work_steps, stop=other)
+    assert other.progress == Progress(0.95, "storing")
+    assert pool.run(work_steps) == 7, "without a handle nobody is told"
 
 
 def test_cancel_stops_running_and_waiting_jobs(pool: Pool) -> None:

@@ -76,7 +76,8 @@ async def readyz(
       where robots find the router (`connect`, `prefix`). Maps are served even if events are not published.
     - `mqtt`: the same for the MQTT broker, if there is one.
     - `mirror`: on a server that mirrors another one: `connected`, `starting` or `cut off`, the time of the last
-      contact, how many changes wait for the centre, and until when robots accept its manifests without contact.
+      contact, how many changes wait for the centre, until when robots accept its manifests without contact, and how
+      many statuses of robots the centre refused (`skipped`), by environment, if it did.
     - `ros2`: number of published topics, if the ROS 2 publisher is enabled; `standby`: another server publishes them.
     """
     services: Services = request.app.state.services
@@ -106,8 +107,8 @@ async def readyz(
         "cache": services.maps.cache.problem or "ok",
     }
     mirror = await run_in_threadpool(services.store.mirrors.describe)
-    shown = ("state", "contact", "waiting", "serves_until")
-    mirrored = {} if mirror is None else {"mirror": {name: mirror[name] for name in shown}}
+    shown = ("state", "contact", "waiting", "serves_until", "skipped")
+    mirrored = {} if mirror is None else {"mirror": {name: mirror[name] for name in shown if name in mirror}}
     return json_response({**state, "events": events, **broker, **topics, **mirrored})
 
 

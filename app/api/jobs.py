@@ -24,8 +24,12 @@ class JobOut(BaseModel):
 
     id: str
     state: Literal["queued", "running", "done", "failed", "cancelled"]
-    progress: float = Field(description="1 when the work is done, else 0: a conversion does not report its steps.")
+    progress: float = Field(
+        description="Part of the work that is done, from 0 to 1, by its steps; updated about once a second. A long "
+        "step may take most of the time."
+    )
     detail: str
+    step: str | None = Field(None, description="What a running job does now: a derivation, `reading`, `storing` …")
     result: dict[str, Any] | None = None
     problem: ProblemOut | None = None
     created: datetime

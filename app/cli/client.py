@@ -163,6 +163,17 @@ class Client:
                 return self._json(answer)
             self._wait(answer)
 
+    def post_work(self, path: str, body: Mapping[str, Any], description: str) -> Any:
+        """Post a derivation or generation, with a progress bar while the server works, or its workers do."""
+        key = {"Idempotency-Key": secrets.token_hex(16)}
+        prefer = {} if body.get("dry_run") else {"Prefer": "respond-async"}
+        with progress_bar(description):
+            answer = self._send("POST", path, content=_present(body), headers={**key, **prefer}, repeat=True)
+        if answer.status_code != httpx.codes.ACCEPTED:
+            return self._json(answer)
+        self._wait(answer)
+        return self._json(self._send("POST", path, content=_present(body), headers=key, repeat=True))  # its result
+
     def put(self, path: str, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Any:
         """Put JSON at a path below the API."""
         return self._json(self._send("PUT", path, content=_present(body), headers=headers, repeat=True))
@@ -347,9 +358,8 @@ class Client:
         with progress_bar("waiting", total=1.0) as bar:
             while True:
                 job: dict[str, Any] = self.get(location)
-                bar.update(
-                    completed=float(job.get("progress") or 0), description=str(job.get("detail") or job["state"])
-                )
+                description = ": ".join(str(text) for text in (job.get("detail"), job.get("step")) if text)
+                bar.update(completed=float(job.get("progress") or 0), description=description or job["state"])
                 if job["state"] == "done":
                     return job
                 if job["state"] in ("failed", "cancelled"):

@@ -95,10 +95,10 @@ def generate(
         body["dry_run"] = dry_run
         with (
             Client(server, token) as client,
-            output.progress_bar(f"generating {site}"),
             ensure_environment(client, name, datum=place, create=create if environment else True, dry_run=dry_run),
         ):
-            result = client.post(quote_path("environments", name, "generations"), body, repeat=True)
+            path = quote_path("environments", name, "generations")
+            result = client.post_work(path, body, f"generating {site}")
         show_commit(name, result, as_json=as_json)
         return
     if dry_run:

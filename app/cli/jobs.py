@@ -73,6 +73,7 @@ def show(
             "state": details["state"],
             "progress": f"{details['progress']:.0%}",
             "detail": details["detail"],
+            "step": details.get("step"),
             "problem": (details.get("problem") or {}).get("detail"),
             "result": (details.get("result") or {}).get("location"),
             "started (UTC)": output.minute(details["created"]),

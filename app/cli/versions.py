@@ -366,8 +366,9 @@ def derive(
         raise typer.BadParameter("missing derivation: list them with `fleetmap derive`")
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
     body["dry_run"] = dry_run
-    with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
-        result = client.post(quote_path("environments", environment, "derivations"), body, repeat=True)
+    with Client(server, token) as client:
+        path = quote_path("environments", environment, "derivations")
+        result = client.post_work(path, body, f"deriving by {method}")
     show_commit(environment, result, as_json=as_json)
 
 

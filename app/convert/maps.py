@@ -200,13 +200,15 @@ class Maps:
 
     def _find_losses(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
         """Convert a map, read it back and compare it with its version."""
-        cached_map = self.get_or_convert(recipe, stop)[1]
+        stop = stop or CancelHandle()
+        with stop.part(0.0, 0.5):
+            cached_map = self.get_or_convert(recipe, stop)[1]
         files = {file.name: file.read() for file in cached_map.files}
         store_location = (self._store.database_url, str(self._store.blob_dir))
-        cancel_arguments = {} if stop is None else {"stop": stop}
         arguments = (recipe.version, recipe.format.name, files, self._limits)
         try:
-            content: bytes = self._run(losses.find_losses, *store_location, *arguments, **cancel_arguments)
+            with stop.part(0.5, 1.0):
+                content: bytes = self._run(losses.find_losses, *store_location, *arguments, stop=stop)
         except WorkerDied as error:
             raise CannotConvert(f"the map in {recipe.format.name} could not be read back: {error.detail}") from error
         return ConvertedMap({"losses.json": (content, "application/json")}, None, cached_map.report)
@@ -229,9 +231,18 @@ class Maps:
         for _ in range(MAX_HOLD_ATTEMPTS):
             # A member with a damaged file is removed from the cache and converted again.
             with contextlib.suppress(LostMap), self.cache.hold_files() as hold:
-                cached_maps = [self._convert_and_hold(member.recipe, hold, stop) for member in recipe.members]
+                cached_maps = [
+                    self._convert_member(recipe, k, hold, stop or CancelHandle()) for k in range(len(recipe.members))
+                ]
                 return self.cache.get_or_make(recipe.key, partial(join_members, recipe, cached_maps))
         raise Unavailable("cached maps are damaged repeatedly: check the disk of the cache")
+
+    def _convert_member(
+        self, recipe: Recipe, k: int, hold: Callable[[CachedMap], CachedMap], stop: CancelHandle
+    ) -> CachedMap:
+        count = len(recipe.members)
+        with stop.part(k / count, (k + 1) / count):
+            return self._convert_and_hold(recipe.members[k].recipe, hold, stop)
 
     def _convert_and_hold(
         self, recipe: Recipe, hold: Callable[[CachedMap], CachedMap], stop: CancelHandle | None

@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app import derive, formats, parameters
+from app import derive, formats, parameters, progress
 from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert import site
@@ -32,6 +32,11 @@ from app.templates import resolve
 
 if TYPE_CHECKING:
     from app.store.store import Store
+
+
+READ_PART = 0.1
+DERIVED_PART = 0.1, 0.7
+"""Fraction of the work after which a map is read, and the part of it in which it is derived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +68,7 @@ def convert_version(
     """Convert a stored version (in a worker). Parts are addressed by content, so concurrent changes have no effect."""
     store = open_store(database_url, blob_dir)
     fmt = formats.get_format(name)
+    progress.report(0.0, "reading")
     layers = applied_closures.load(store, version, chain.keys)
     entries = {e.key: e for e in version.parts}
     templates, closures = version.templates, version.closures
@@ -137,17 +143,23 @@ def write(
     if entries is None:  # from files; stored versions are loaded without marks
         layers = applied_closures.drop_timed_marks(layers)
     source = _Source(layers, chain, entries, origin, credit, templates, closures, around or Layers(), title)
+    before, after = DERIVED_PART if chain.steps else (READ_PART, READ_PART)
     if spread is None:
-        return _write_one(fmt, derive.run(chain.steps, layers, notes), options, source, notes)
+        with progress.within(before, after):
+            derived_layers = derive.run(chain.steps, layers, notes)
+        progress.report(after, f"writing {fmt.name}")
+        return _write_one(fmt, derived_layers, options, source, notes)
     try:
-        derived_layers = derive.run(chain.steps, layers, notes)
+        with progress.within(before, after):
+            derived_layers = derive.run(chain.steps, layers, notes)
     except CannotDerive as error:
         if not spread.optional:
             raise
         if isinstance(error.__cause__, MissingLayer):
             return WrittenMap({}, Report(fmt.name))
         raise CannotConvert(error.detail, error.problems) from error
-    return _write_each(fmt, derived_layers, options, source, notes, spread)
+    with progress.within(after, 1.0):
+        return _write_each(fmt, derived_layers, options, source, notes, spread)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +193,8 @@ def _write_each(
     files: dict[str, bytes] = {}
     places: dict[str, tuple[str, str]] = {}
     reports: list[tuple[str, Report]] = []
-    for key in sorted(keys, key=lambda k: (k.level != spread.default, k)):
+    for index, key in enumerate(sorted(keys, key=lambda k: (k.level != spread.default, k))):
+        progress.report(index / len(keys), f"writing {fmt.name}")
         names = [k.name for k in keys if k.level == key.level]
         usual = not spread.names and key.name == site.default_name(parts, names)
         chosen = replace(options, **{parts.level: key.level, parts.name: None if usual else key.name})

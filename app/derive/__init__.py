@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from app import parameters, plugins
+from app import parameters, plugins, progress
 from app.errors import Ambiguous, CannotConvert, CannotDerive, MissingLayer, Problem
 from app.model.features import Features
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
@@ -275,8 +275,10 @@ def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = N
     Raises CannotDerive with the step that failed if it raises CannotConvert or its result is empty.
     """
     notes = notes or DerivationNotes()
-    for step in steps:
+    steps = tuple(steps)
+    for step, done in zip(steps, _shares(steps), strict=True):
         derivation = all_derivations()[step.name]
+        progress.report(done, step.name)
         with _as_derivation_error(step):
             derived_layers = derivation.function(layers, derivation.parameters(**dict(step.given)), notes)
         if (
@@ -289,6 +291,13 @@ def run(steps: Iterable[Step], layers: Layers, notes: DerivationNotes | None = N
             raise CannotDerive(f"{reason}, or {needs} with more content", [Problem(reason)], step=step.name)
         layers = Layers({**layers.parts, **derived_layers.parts}, layers.datum or derived_layers.datum, layers.levels)
     return layers
+
+
+def _shares(steps: Sequence[Step]) -> list[float]:
+    """Return the fraction of the whole cost that is spent before each step."""
+    costs = [all_derivations()[step.name].cost for step in steps]
+    total = sum(costs) or 1.0
+    return [sum(costs[:k]) / total for k in range(len(costs))]
 
 
 def try_steps(steps: Sequence[Step], layers: Layers) -> None:

@@ -274,9 +274,11 @@ class ReportQueue:
             has_robots = bool(self._present)
         if self._leads_since is not None:
             with self._lead.fenced():
-                arrived, departed = self._settle(arrived, departed)
-                if arrived or departed:
-                    self._store.robots.note_presence(arrived, departed, self._clock())
+                new, gone = self._settle(arrived, departed)
+                if new and not self._is_settled:  # a restarted server sees all robots again
+                    new -= self._store.robots.present_robots()
+                if new or gone:
+                    self._store.robots.note_presence(new, gone, self._clock())
                 if renew and self._is_settled and has_robots:
                     self._store.robots.renew_presence(self._clock())
         with self._lock:

@@ -105,12 +105,6 @@ class ChannelConvergence:
         }
 
 
-def is_ready(robot: Robot, root: str) -> bool:
-    """Whether a robot has fetched or runs a root, so that it can switch to it at once."""
-    loaded = robot.report.state in ("ready", "active") and robot.report.root == root
-    return loaded or (robot.active_map is not None and robot.active_map.root == root)
-
-
 def count_robots(counts: RobotCounts, environment: str, now: datetime) -> FleetCounts:
     """Count an environment's robots, those online by the rule of ``is_online``. Raises NotFound."""
     return counts.read(environment, on_bus_after=now - PRESENCE_FRESH, heard_after=now - REPORT_FRESH)

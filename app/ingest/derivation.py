@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app import derive, parameters
+from app import derive, parameters, progress
 from app.derive import ChainFailure, DerivationNotes, Step
 from app.errors import CannotDerive, Conflict, Invalid, MissingLayer, NotFound, Problem
-from app.ingest.prepare import open_store
+from app.ingest.prepare import READ, open_store
 from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
 from app.model.names import did_you_mean
 from app.store.changes import Changes, Prepared, Provenance, Replace
@@ -78,15 +78,19 @@ def prepare_derivation(
             if derivation.gives in needed or (derivation.part_names and k.name == MAP)
         }
         # Load more than the required layers: a derivation may use optional ones (a fence).
+        progress.report(0.0, "reading")
         loaded = store.content.load(base, sorted(used))
         notes = DerivationNotes()
         chain = derive.with_parameters(steps, request.values)
-        before = derive.run(chain[:-1], Layers(loaded.parts, base.datum, base.levels), notes)
+        with progress.within(READ, 1.0 - READ - _last_share(chain)):
+            before = derive.run(chain[:-1], Layers(loaded.parts, base.datum, base.levels), notes)
         return chain, used, before, notes
 
     # Outside of ``attempt``: if the method itself finds nothing, do not try another chain.
     chain, used, before, notes = derive.first_working(plan, attempt, _no_chain_error)
-    derived_layers = derive.run(chain[-1:], before, notes)
+    with progress.within(1.0 - READ - _last_share(chain), 1.0 - READ):
+        derived_layers = derive.run(chain[-1:], before, notes)
+    progress.report(1.0 - READ, "storing")
     _check_values(request, chain)
     fresh = {
         k: p for k, p in derived_layers.parts.items() if k.layer == derivation.gives and before.parts.get(k) is not p
@@ -106,6 +110,12 @@ def prepare_derivation(
     )
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
     return store.versions.prepare(base, Changes(operations)), notes.as_warnings()
+
+
+def _last_share(chain: Sequence[Step]) -> float:
+    """Return the fraction of the work that the last step is, beside reading and storing."""
+    costs = [derive.all_derivations()[step.name].cost for step in chain]
+    return (1.0 - 2 * READ) * costs[-1] / sum(costs)
 
 
 def _is_display_only(entry: PartEntry) -> bool:

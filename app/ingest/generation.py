@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from app import generate
+from app import generate, progress
 from app.derive import DerivationNotes
 from app.errors import Conflict, Problem
-from app.ingest.prepare import open_store
+from app.ingest.prepare import READ, open_store
 from app.model.layers import Layers, PartKey
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Replace
 from app.store.values import PartEntry, Version
@@ -39,10 +39,14 @@ def prepare_generation(
     used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in generator.reads}
     if not generator.editable_layers:
         used = {k: e for k, e in used.items() if not _is_generated(e)}
+    progress.report(0.0, "reading")
     loaded = store.content.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
     notes = DerivationNotes()
-    generated_layers = generate.run(order.generator, order.seed, order.values, given, notes)
+    progress.report(READ, order.generator)
+    with progress.within(READ, 1.0 - READ):
+        generated_layers = generate.run(order.generator, order.seed, order.values, given, notes)
+    progress.report(1.0 - READ, "storing")
     existing_parts = {e.key: e for e in base.parts if e.count > 0}
     _check_free(order, generator, generated_layers, existing_parts)
     credit = tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution))

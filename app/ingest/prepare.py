@@ -31,6 +31,9 @@ from app.upload_reader import Bundle, EnvironmentContext, UploadHints
 
 Mode = Literal["replace", "merge"]
 
+READ = 0.1
+"""Fraction of a derivation or generation that reading counts as, and likewise storing."""
+
 
 @dataclass(frozen=True, slots=True)
 class FileNote:

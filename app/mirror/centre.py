@@ -32,6 +32,7 @@ class CentreUnreachable(Unavailable):
 class Centre:
     """A centre, with the token of this mirror. Not thread-safe, but for ``wait_for_event``.
 
+    received, sent: bytes of bodies as transferred, without the stream of events.
     key: its trusted raw public key; None before the first contact, at which ``given`` (an id, or the key in base64) or
     else the first key is trusted.
     """
@@ -48,6 +49,7 @@ class Centre:
         self.url, self.key, self._given = url.rstrip("/"), key, given
         self._http = client or httpx.Client(timeout=TIMEOUT)
         self._headers = {"authorization": f"Bearer {token}"}
+        self.received = self.sent = 0
 
     def close(self) -> None:
         """Close the connections."""
@@ -112,7 +114,10 @@ class Centre:
             if answer.status_code != 200:
                 answer.read()
                 raise self._problem(answer)
-            yield answer.iter_bytes()
+            try:
+                yield answer.iter_bytes()
+            finally:
+                self._count(answer)
 
     # --- what the mirror hands on ---
 
@@ -164,9 +169,14 @@ class Centre:
                 data += piece
                 if len(data) > MAX_PAGE_BYTES:
                     raise Untrusted(f"{self.url} sent more than {MAX_PAGE_BYTES} bytes: this is no Fleet Map Server")
+            self._count(answer)
             if answer.status_code != 200:
                 raise self._problem(answer, bytes(data))
             return bytes(data), answer.headers
+
+    def _count(self, answer: httpx.Response) -> None:
+        self.received += answer.num_bytes_downloaded
+        self.sent += len(answer.request.content)
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:

@@ -78,6 +78,7 @@ class Mirror:
         self._fetcher = Fetcher(store, centre)
         self.position = 0
         self._complete: tuple[datetime, int] | None = None
+        self._counted = (0, 0)
 
     def run_once(self) -> MirrorState:
         """Run one pass; returns the state after it.
@@ -114,7 +115,7 @@ class Mirror:
             if (state.failures or {}).get(name) != problem:  # once, not for each pass
                 log.warning("mirror: skipped, will retry (environment=%s): %s", name, problem)
         changes |= {"contact": self._clock(), "problem": None, "failures": failures}
-        self._store.mirrors.save(**changes)
+        self._store.mirrors.save(**changes, **self._traffic(), centre_position=self.position)
         return self._store.mirrors.state() or state
 
     def _seen_position(self) -> int:
@@ -133,7 +134,12 @@ class Mirror:
 
     def _note_problem(self, error: FleetMapError) -> None:
         if self._store.mirrors.state() is not None:
-            self._store.mirrors.save(problem=error.detail)
+            self._store.mirrors.save(problem=error.detail, **self._traffic())
+
+    def _traffic(self) -> dict[str, int]:
+        """Return the bytes received and sent since the last call."""
+        before, self._counted = self._counted, (self._centre.received, self._centre.sent)
+        return {"received": self._counted[0] - before[0], "sent": self._counted[1] - before[1]}
 
     def _check(self, listing: Mapping[str, Any]) -> MirrorState:
         """Check that the centre is the one that this server follows. Raises Untrusted."""
@@ -242,14 +248,18 @@ class Mirror:
         for environment, group in groupby(waiting, key=lambda change: change.environment):
             with _NotedFailure(failures, environment):
                 self._hand_on_changes(environment, list(group))
+        skipped = {name: dict(one) for name, one in (state.skipped or {}).items()}
+        if skipped:
+            mirrored = {one.name for one in self._store.mirror_target.environments().values() if one.centre}
+            skipped = {name: one for name, one in skipped.items() if name in mirrored}
         while reports := self._store.edge_changes.reports_after(state.reported, REPORTS):
-            self._hand_on_reports([report for _, report in reports], failures)
+            self._hand_on_reports([report for _, report in reports], skipped, counted=True)
             state = replace(state, reported=reports[-1][0])
-            self._store.mirrors.save(reported=state.reported)
+            self._store.mirrors.save(reported=state.reported, skipped=skipped)
         while current := self._store.edge_changes.current_reports(state.seen, REPORTS):
-            self._hand_on_reports(current, failures)
+            self._hand_on_reports(current, skipped, counted=False)
             state = replace(state, seen=current[-1].time)
-            self._store.mirrors.save(seen=state.seen)
+            self._store.mirrors.save(seen=state.seen, skipped=skipped)
         return bool(waiting)
 
     def _hand_on_changes(self, environment: str, changes: Sequence[QueuedChange]) -> None:
@@ -259,11 +269,28 @@ class Mirror:
                 log.warning("mirror: refused by the centre (environment=%s): %s", environment, result["problem"])
             self._store.edge_changes.settle(change, result["problem"], result["overlay"])
 
-    def _hand_on_reports(self, reports: Sequence[ReceivedReport], failures: dict[str, str]) -> None:
+    def _hand_on_reports(
+        self, reports: Sequence[ReceivedReport], skipped: dict[str, dict[str, Any]], *, counted: bool
+    ) -> None:
+        """Hand on statuses of robots. Those that the centre refuses are skipped, which ``skipped`` says.
+
+        counted: whether these are changed statuses; the present ones, which follow them, count once.
+        """
         ordered = sorted(reports, key=lambda report: report.environment)  # stable: each robot's order stays
         for environment, group in groupby(ordered, key=lambda report: report.environment):
-            with _NotedFailure(failures, environment):
-                self._centre.report(environment, statuses=[_report_as_json(report) for report in group])
+            statuses = [_report_as_json(report) for report in group]
+            refusals: dict[str, str] = {}
+            with _NotedFailure(refusals, environment):
+                self._centre.report(environment, statuses=statuses)
+            if not refusals:
+                if skipped.pop(environment, None) is not None:
+                    log.info("mirror: the centre accepts statuses again (environment=%s)", environment)
+                continue
+            problem = refusals[environment]
+            if environment not in skipped:
+                log.warning("mirror: statuses of robots are skipped (environment=%s): %s", environment, problem)
+            before = skipped.get(environment, {"statuses": 0})["statuses"]
+            skipped[environment] = {"statuses": before + (len(statuses) if counted else 0), "problem": problem}
 
     # --- permissions ---
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final, Literal
@@ -19,7 +19,6 @@ from app.store.fleet_values import (
     Channel,
     ChannelMove,
     PlannedMove,
-    Robot,
     Rollout,
     RolloutState,
     RolloutStep,
@@ -27,7 +26,7 @@ from app.store.fleet_values import (
 from app.store.manifest import read_version
 from app.store.overlays import CHANGE_CLOSURES, read_closures
 from app.store.pending import check_committed
-from app.store.robots import channel_robots
+from app.store.rollout_robots import OnlineCache, RolloutRobots
 from app.store.values import LATEST, Position, Version, rfc3339
 
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
@@ -40,7 +39,7 @@ class Channels:
     """Service for the channels of environments."""
 
     def __init__(self, database: Database) -> None:
-        self._database = database
+        self._database, self._online = database, OnlineCache()
 
     def all(self, environment: str) -> list[Channel]:
         """List channels: ``latest`` first, then the others by name."""
@@ -214,7 +213,7 @@ class Channels:
         """Advance every open rollout by one step, each in its own transaction; returns (environment, channel) of those.
 
         decide: chooses the step of a rollout, given the robots of its channel. It is called again inside the
-        transaction, so that it decides on the current state.
+        transaction, so that it decides on the current state; before, counts of large channels may be some seconds old.
         """
         table, owner = tables.channel, tables.environment
         query = (
@@ -225,7 +224,7 @@ class Channels:
         )
         with self._database.read() as connection:
             rows = connection.execute(query).all()
-            due = [r for r in rows if _next(connection, r, now, decide) is not None]
+            due = [r for r in rows if _next(connection, r, now, decide, self._online) is not None]
         out = []
         for due_row in due:
             with self._database.write() as connection:
@@ -241,7 +240,7 @@ class Channels:
         return out
 
 
-Decide = Callable[[Rollout, Sequence[Robot], datetime], RolloutStep | None]
+Decide = Callable[[Rollout, RolloutRobots, datetime], RolloutStep | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,17 +283,19 @@ class _ChannelWrite:
             )
 
 
-def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> RolloutStep | None:
-    return decide(
-        Rollout.from_row(channel.rollout), channel_robots(connection, channel.environment_id, channel.name), now
-    )
+def _next(
+    connection: Connection, channel: Row[Any], now: datetime, decide: Decide, cache: OnlineCache | None = None
+) -> RolloutStep | None:
+    rollout = Rollout.from_row(channel.rollout)
+    robots = RolloutRobots(connection, channel.environment_id, channel.name, rollout.root, cache)
+    return decide(rollout, robots, now)
 
 
 def _with_prior_failures(write: _ChannelWrite, rollout: Rollout) -> Rollout:
     """Note the robots that had reported a failure of this version before the rollout's stage began."""
-    robots = channel_robots(write.connection, write.environment.id, write.name)
-    failed_robots = (r for r in robots if r.has_failed_with(rollout.root))
-    return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in failed_robots})
+    robots = RolloutRobots(write.connection, write.environment.id, write.name, rollout.root)
+    failed = robots.failed(on_bus_after=write.now, heard_after=write.now)
+    return replace(rollout, said_before={one.robot: rfc3339(one.time) for one in failed})
 
 
 def _apply_step(write: _ChannelWrite, channel: Row[Any], step: RolloutStep) -> None:

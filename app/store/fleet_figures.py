@@ -23,7 +23,7 @@ from app.store.column_types import UtcDateTime
 from app.store.database import Database
 from app.store.fleet_values import OPEN_ROLLOUTS, RobotGroup, Rollout
 from app.store.overlays import read_closures
-from app.store.robot_counts import robot_is_online
+from app.store.robot_counts import is_online
 from app.store.values import LATEST
 
 LATE: Final = timedelta(minutes=15)
@@ -257,7 +257,7 @@ def _late_query(root: str | None, overlays: str | None) -> Select[Any]:
             table.c.held_root.is_(None) if root is None else table.c.held_root == root,
             table.c.held_overlays.is_(None) if overlays is None else table.c.held_overlays == overlays,
             func.coalesce(table.c.held_since, table.c.since) <= bindparam("taken_before", type_=UtcDateTime),
-            robot_is_online(),
+            is_online(),
         )
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Boolean, Column, Index, Integer, String, Table, Text, true
+from sqlalchemy import JSON, BigInteger, Boolean, Column, Index, Integer, String, Table, Text, literal_column, true
 
 from app.store.column_types import UtcDateTime
 from app.store.table_base import environment_key, metadata
@@ -90,3 +90,13 @@ it; ``app.store.robot_counts`` joins the rows.
 
 Index("ix_robot_held", robot.c.environment_id, robot.c.channel, robot.c.held_since)
 Index("ix_robot_map", robot.c.environment_id, robot.c.channel, robot.c.held_root, robot.c.held_overlays)
+
+Index(
+    "ix_robot_failed",
+    robot.c.environment_id,
+    robot.c.channel,
+    robot.c.root,
+    sqlite_where=robot.c.state == literal_column("'failed'"),
+    postgresql_where=robot.c.state == literal_column("'failed'"),
+)
+"""Robots that report a failure, which open rollouts look for each second."""

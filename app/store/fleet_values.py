@@ -187,6 +187,23 @@ class Robot:
 
 
 @dataclass(frozen=True, slots=True)
+class FailedRobot:
+    """Robot that reports a failure of a version. time: of its report. online: whether it is."""
+
+    robot: str
+    time: datetime
+    online: bool
+
+
+@dataclass(frozen=True, slots=True)
+class OnlineCounts:
+    """Numbers of a channel's robots that are online, and of those of them that have or run a version."""
+
+    online: int
+    ready: int
+
+
+@dataclass(frozen=True, slots=True)
 class RobotGroup:
     """Robots of a channel with equal reports. held_root, held_overlays: of the active map, None without one."""
 

@@ -29,7 +29,7 @@ from app.store.database import Database
 from app.store.made_maps import MadeMaps
 from app.store.manifest import unpack_manifest
 from app.store.retention import EnvironmentPlan
-from app.store.robots import presence_seen
+from app.store.silent_robots import remove_silent
 
 CONTENT_LEAD: Final = "content"
 """Lead of who removes content, or needs it all to stay: garbage collection and backups exclude each other."""
@@ -226,12 +226,9 @@ class GarbageCollector:
     def _tidy(self, *, complete: bool) -> None:
         now = self._database.now()
         events, keys, jobs = tables.event, tables.idempotency, tables.job
+        remove_silent(self._database, now - timedelta(days=ROBOT_DAYS))
         with self._database.write(upkeep=True) as connection:
             connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))
-            silent = now - timedelta(days=ROBOT_DAYS)
-            for table in (tables.robot, tables.robot_history):
-                connection.execute(delete(table).where(table.c.time < silent))
-            connection.execute(delete(tables.presence).where(presence_seen() < silent))
             decided = tables.overlay.c.state.in_(("rejected", "expired", "ended"))
             old = tables.overlay.c.decided < now - timedelta(days=OVERLAY_DAYS)
             connection.execute(delete(tables.overlay).where(decided, old))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import timedelta
 from typing import Any
 
 from sqlalchemy import Row, bindparam, delete, insert, select, text, update
 
 from app.errors import NotFound
+from app.progress import Progress
 from app.store import tables
 from app.store.base import checked_text, storable_text
 from app.store.column_types import UtcDateTime
@@ -99,6 +100,20 @@ class Jobs:
                 connection.execute(update(table).where(table.c.id == id).values(updated=self._database.now(), **values))
             return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
 
+    def note_progress(self, ids: Collection[str], progress: Progress) -> set[str]:
+        """Store how far running jobs are; returns those that still run."""
+        table = tables.job
+        active = table.c.id.in_(ids), table.c.state.in_(ACTIVE)
+        values = {"progress": progress.fraction, "step": storable_text(progress.step), "updated": self._database.now()}
+        with self._database.write(notify=False, upkeep=True) as connection:
+            connection.execute(update(table).where(*active).values(values))
+            return set(connection.execute(select(table.c.id).where(*active)).scalars())
+
+    def note_task_progress(self, task: str, progress: Progress) -> bool:
+        """Store how far a task is for the jobs that wait for it. Returns False if none does."""
+        values = {"progress": progress.fraction, "step": storable_text(progress.step)}
+        return bool(self._update_task(task, values, notify=False))
+
     def claim(self, id: str, owner: str, location: str) -> bool:
         """Give a task's job that has no owner to a client. Returns False if another one has it."""
         table = tables.job
@@ -120,7 +135,7 @@ class Jobs:
 
     def release_task(self, task: str) -> None:
         """Mark the jobs that wait for a task as queued again: its worker stops."""
-        self._update_task(task, {"state": "queued", "progress": 0.0})
+        self._update_task(task, {"state": "queued", "progress": 0.0, "step": None})
 
     def finish_task(
         self,
@@ -135,10 +150,10 @@ class Jobs:
         values |= {"outcome": outcome, "problem": problem}
         self._update_task(task, values if location is None else {**values, "location": location})
 
-    def _update_task(self, task: str, values: Mapping[str, Any]) -> int:
+    def _update_task(self, task: str, values: Mapping[str, Any], *, notify: bool = True) -> int:
         table = tables.job
         change = update(table).where(table.c.task == task, table.c.state.in_(ACTIVE))
-        with self._database.write(upkeep=True) as connection:
+        with self._database.write(notify=notify, upkeep=True) as connection:
             return connection.execute(change.values(updated=self._database.now(), **values)).rowcount
 
     def is_awaited(self, task: str) -> bool:
@@ -199,4 +214,5 @@ def _as_job(row: Row[Any]) -> Job:
         row.owner,
         row.task,
         row.outcome,
+        row.step if row.state == "running" else None,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -25,7 +26,9 @@ class MirrorState:
 
     key: raw public key of the centre. epoch, position: of the centre, up to which all is mirrored. reported, seen: the
     newest report of a robot that the centre has: its row, and its time. centre_keys: public keys of the centre as JSON.
-    contact: of the last success. problem: why the last attempt failed. failures: reasons by environment.
+    contact: of the last success. problem: why the last attempt failed. failures: reasons by environment. skipped: by
+    environment ``{"statuses": number, "problem": why}``, of statuses that the centre refused. centre_position: the end
+    of its log at the last contact. received, sent: bytes of bodies.
     """
 
     url: str
@@ -38,6 +41,10 @@ class MirrorState:
     contact: datetime | None = None
     problem: str | None = None
     failures: Mapping[str, str] | None = None
+    skipped: Mapping[str, Mapping[str, Any]] | None = None
+    centre_position: int = 0
+    received: int = 0
+    sent: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +81,36 @@ class Mirrors:
         with self._database.write(notify=False, upkeep=True) as connection:
             upsert(connection, tables.mirror, {"id": 1}, values)
 
-    def save(self, **values: Any) -> None:
-        """Store members of the state."""
+    def save(self, *, received: int = 0, sent: int = 0, **values: Any) -> None:
+        """Store members of the state. received, sent: bytes since the last call."""
+        table = tables.mirror
+        traffic = {"received": table.c.received + received, "sent": table.c.sent + sent}
         with self._database.write(notify=False, upkeep=True) as connection:
-            connection.execute(update(tables.mirror).where(tables.mirror.c.id == 1).values(values))
+            connection.execute(update(table).where(table.c.id == 1).values({**values, **traffic}))
+
+    def figures(self) -> dict[str, Any] | None:
+        """Return what metrics show; None if this server mirrors no other. Times in seconds."""
+        state, now = self.state(), self._database.now()
+        if state is None:
+            return None
+        table, owner, queue = tables.delegation, tables.environment, tables.edge_change
+        ends = (
+            select(func.min(table.c.expires))
+            .join(owner, owner.c.id == table.c.environment_id)
+            .where(owner.c.centre.is_not(None), owner.c.deleted.is_(None))
+        )
+        with self._database.read() as connection:
+            waiting = connection.execute(select(func.count()).select_from(queue)).scalar_one()
+            until = connection.execute(ends).scalar()
+        return {
+            "contact_age": math.inf if state.contact is None else max(0.0, (now - state.contact).total_seconds()),
+            "behind": max(0, state.centre_position - state.position),
+            "waiting": waiting,
+            "permission": None if until is None else max(0.0, (until - now).total_seconds()),
+            "received": state.received,
+            "sent": state.sent,
+            "skipped": {name: one["statuses"] for name, one in (state.skipped or {}).items()},
+        }
 
     def delegations(self) -> list[StoredDelegation]:
         """List all statements."""
@@ -117,6 +150,7 @@ class Mirrors:
 
         ``state``: ``connected``, ``cut off``, or ``starting`` before the first complete pass. ``waiting``: number of
         changes that the centre does not have yet. ``serves_until``: the first end of a permission to sign manifests.
+        ``skipped``: numbers of statuses that the centre refused, by environment, if it refuses any.
         """
         state, now = self.state(), self._database.now()
         if state is None:
@@ -131,7 +165,9 @@ class Mirrors:
         with self._database.read() as connection:
             rows = connection.execute(query).all()
             waiting = connection.execute(select(func.count()).select_from(queue)).scalar_one()
-        failures = dict(state.failures or {})
+        skipped = {name: one["statuses"] for name, one in (state.skipped or {}).items()}
+        failures = {name: f"statuses are skipped: {one['problem']}" for name, one in (state.skipped or {}).items()}
+        failures |= dict(state.failures or {})
         environments = [
             {
                 "name": r.name,
@@ -156,4 +192,5 @@ class Mirrors:
             "waiting": waiting,
             "serves_until": rfc3339(min(ends)) if ends and len(ends) == len(rows) else None,
             "environments": environments,
+            **({"skipped": skipped} if skipped else {}),
         }

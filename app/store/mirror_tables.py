@@ -21,10 +21,16 @@ mirror = Table(
     Column("contact", UtcDateTime, nullable=True),
     Column("problem", Text, nullable=True),
     Column("failures", JSON, nullable=False),
+    Column("skipped", JSON(none_as_null=True), nullable=True),
+    Column("centre_position", BigInteger, nullable=False, server_default="0"),
+    Column("received", BigInteger, nullable=False, server_default="0"),
+    Column("sent", BigInteger, nullable=False, server_default="0"),
 )
 """One row on a server that mirrors another, its centre. key: the centre's public key that is trusted. position: of the
 centre's log, up to which everything is mirrored. reported: newest row of ``robot_history`` that the centre has; seen:
-newest time of a robot's status that it has. contact: of the last success. failures: problems by environment.
+newest time of a robot's status that it has. contact: of the last success. failures: problems by environment. skipped:
+number of statuses that the centre refused, and why, by environment. centre_position: the end of its log at the last
+contact. received, sent: bytes of bodies.
 """
 
 delegation = Table(

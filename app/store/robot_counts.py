@@ -141,8 +141,8 @@ def _groups_query() -> Select[Any]:
     return query.group_by(*_group_columns()).having(number != 0)
 
 
-def robot_is_online() -> ColumnElement[bool]:
-    """SQL condition for ``robot`` joined with ``presence``: the rule of ``app.fleet.is_online``.
+def is_online() -> ColumnElement[bool]:
+    """SQL expression on a robot and its presence: the rule of ``app.fleet.is_online``.
 
     Its parameters are ``on_bus_after`` and ``heard_after``, see ``RobotCounts.read``.
     """
@@ -159,7 +159,7 @@ def _online_query() -> Select[Any]:
         select(table.c.channel, func.count().label("number"))
         .select_from(table)
         .outerjoin(presence, presence.c.robot == table.c.robot)
-        .where(table.c.environment_id == bindparam("environment"), robot_is_online())
+        .where(table.c.environment_id == bindparam("environment"), is_online())
         .group_by(table.c.channel)
     )
 

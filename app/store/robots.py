@@ -308,13 +308,6 @@ def presence_seen() -> ColumnElement[datetime]:
     return case((presence.c.there & (checked > presence.c.time), checked), else_=presence.c.time)
 
 
-def channel_robots(connection: Connection, environment_id: str, channel: str) -> list[Robot]:
-    """List the robots of a channel, within a transaction."""
-    table = tables.robot
-    query = _robots().where(table.c.environment_id == environment_id, table.c.channel == channel)
-    return [_as_robot(row) for row in connection.execute(query.order_by(table.c.robot))]
-
-
 def _as_report(row: Row[Any]) -> RobotReport:
     return RobotReport(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said, row.overlays)
 

@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, Update, delete, insert, select, update
+from sqlalchemy import Connection, Row, Update, delete, func, insert, select, update
 
 from app.errors import Damaged, Unavailable
 from app.model.frame import Datum
@@ -58,6 +58,12 @@ TOGETHER: Final = 50
 
 AT_ONCE: Final = 200
 """Maximum number of environments that a search brings up to date; after a mass change further searches continue."""
+
+MERGE_PAGES: Final = 200
+"""Number of pages of an index of texts that are written in one transaction: about 15 ms."""
+
+MERGED_CHANGES: Final = 2
+"""Number of rows that a merge changes at least if it does anything (SQLite FTS5, section 6.8)."""
 
 MAX_BUILDERS: Final = 4
 """Maximum number of searches that wait for the index; further ones are refused, so that threads stay free."""
@@ -123,6 +129,22 @@ class SearchIndex:
         with self._database.write(upkeep=True) as connection:
             connection.execute(update(tables.environment).values(search_version=-1, search_sequence=-1))
         self._damaged.clear()
+
+    def merge(self) -> None:
+        """Join the segments of SQLite's indexes of texts, some pages in a transaction: queries read each segment."""
+        if not self._database.sqlite:
+            return
+        for name in (*(f"search_{kind}" for kind in ORDER), "environment_text"):
+            pages = -MERGE_PAGES  # begins to join all of them; further calls continue
+            while self._merge_some(name, pages):
+                pages = MERGE_PAGES
+
+    def _merge_some(self, name: str, pages: int) -> bool:
+        """Join segments of an index of texts; returns whether there was something to do."""
+        with self._database.write(notify=False, upkeep=True) as connection:
+            before = connection.execute(_CHANGES).scalar_one()
+            connection.exec_driver_sql(f"INSERT INTO {name}({name}, rank) VALUES ('merge', ?)", (pages,))  # noqa: S608
+            return int(connection.execute(_CHANGES).scalar_one() - before) >= MERGED_CHANGES
 
     def _stale(self, limit: int) -> list[str]:
         """Return up to ``limit`` environments that are behind, without those that are known to be damaged."""
@@ -210,6 +232,9 @@ class SearchIndex:
                 else:
                     current = -2 - secrets.randbelow(2**30)
                     connection.execute(_of(plan.row).values(search_version=current))
+
+
+_CHANGES: Final = select(func.total_changes())
 
 
 def _begin(connection: Connection, plan: _Plan) -> None:

@@ -427,11 +427,13 @@ job = Table(
     Column("location", Text, nullable=True),
     Column("outcome", JSON(none_as_null=True), nullable=True),
     Column("followed", Boolean, nullable=False, server_default=true()),
+    Column("step", Text, nullable=True),
     Index("ix_job_task", "task"),
 )
 """Jobs. task: key of the task in the queue of all servers, which sets the state of all jobs that wait for it.
 
 location: address of what the task makes. outcome: of the task, for servers. followed: whether a client was told of it.
+step: what a running job does now.
 """
 
 

@@ -483,6 +483,7 @@ class Idempotency:
 class Job:
     """Long-running work. progress: 0 to 1. problem: the reason of a failure, as an RFC 9457 object.
 
+    step: what a running one does now, None if unknown.
     task: key of the task that it waits for, if that is in the queue of all servers. outcome: of that task.
     """
 
@@ -497,6 +498,7 @@ class Job:
     owner: str
     task: str | None = None
     outcome: Mapping[str, Any] | None = None
+    step: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

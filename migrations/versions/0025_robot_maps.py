@@ -1,7 +1,7 @@
 """An index of robots by the map that they run, so that those behind their channel are counted without the others.
 
 Revision ID: 0025
-Revises: 0021
+Revises: 0024
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from alembic import op
 
 revision = "0025"
-down_revision = "0021"
+down_revision = "0024"
 branch_labels = None
 depends_on = None
 min_compatible = "0019"

@@ -16,9 +16,12 @@ import pytest
 import yaml
 from lxml import etree
 
+from app.convert.recipe import Recipe
 from app.pool import CancelHandle, Cancelled, Pool
+from app.progress import Progress
 from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
+from tests.events.conftest import eventually
 
 
 def test_map_with_one_file_is_served_as_file(api: Api, farm: str) -> None:
@@ -350,9 +353,10 @@ def test_long_conversion_becomes_a_job(tmp_path: Path, monkeypatch: pytest.Monke
 
     quick, gate = Maps.get_or_convert, threading.Event()
 
-    def slow(self: Maps, recipe: object, stop: object) -> object:
-        assert gate.wait(30)
-        return quick(self, recipe, stop)  # type: ignore[arg-type]
+    def slow(self: Maps, recipe: Recipe, stop: CancelHandle) -> object:
+        stop.note(Progress(0.4, "objects_to_topology"))
+        assert gate.wait(60)
+        return quick(self, recipe, stop)
 
     monkeypatch.setattr(Maps, "get_or_convert", slow)
     with running(settings_for(tmp_path, job_seconds=0.2)) as api:
@@ -375,12 +379,14 @@ def test_long_conversion_becomes_a_job(tmp_path: Path, monkeypatch: pytest.Monke
         assert api.token_for("admin", environments="farm").get("jobs").json() == []
         assert [job["id"] for job in api.get("jobs?state=running&limit=1").json()] == [others]
         assert api.get("jobs?state=done").json() == []
+        shown = eventually(lambda: (job := api.get(location).json())["progress"] and job)
+        assert (shown["state"], shown["progress"], shown["step"]) == ("running", 0.4, "objects_to_topology")
         gate.set()
         deadline = time.monotonic() + 30
         while (job := api.get(location).json())["state"] == "running":
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        assert (job["state"], job["progress"]) == ("done", 1.0)
+        assert (job["state"], job["progress"], job.get("step")) == ("done", 1.0, None)
         assert api.get(job["result"]["location"]).content == api.get("/maps/farm/tmap2").content
         api("DELETE", location, 204)
         api.problem("GET", location, 404)

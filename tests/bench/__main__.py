@@ -30,6 +30,7 @@ from tests.bench import (
     generate,
     http,
     large,
+    mirror,
     networks,
     ogc,
     scale,
@@ -254,17 +255,21 @@ def main() -> int:
             "derived",
             "ogc",
             "scale",
+            "scale-postgresql",
+            "mirror",
             "servers",
             "sizing",
             "backup",
         ],
-        help="one of the tables; scale (half an hour), servers and sizing (with PostgreSQL), and backup only if they "
-        "are named",
+        help="one of the tables; scale and scale-postgresql (half an hour each), servers and sizing (with PostgreSQL), "
+        "and backup only if they are named",
     )
     arguments = parser.parse_args()
     if arguments.only == "sizing":
         return sizing.report(arguments.json)
-    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived", "scale", "servers", "backup"):
+    is_scale = arguments.only in ("scale", "scale-postgresql")
+    without_maps = ("generate", "large", "derived", "mirror", "servers", "backup")
+    if not DATA.is_dir() and not is_scale and arguments.only not in without_maps:
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
@@ -277,7 +282,8 @@ def main() -> int:
     server_rows = servers.rows() if arguments.only == "servers" else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
-    scale_rows = scale.rows() if arguments.only == "scale" else []
+    scale_rows = scale.rows(postgres=arguments.only == "scale-postgresql") if is_scale else []
+    mirror_rows = mirror.rows() if arguments.only in (None, "mirror") else []
     backup_rows = backup.rows() if arguments.only == "backup" else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
@@ -289,6 +295,7 @@ def main() -> int:
             "derived": huge,
             "scale": scale_rows,
             "backup": backup_rows,
+            "mirror": mirror_rows,
         }
         print(json.dumps(tables, indent=2))
     else:
@@ -317,6 +324,7 @@ def main() -> int:
             "several servers": server_rows,
             "many against few": scale_rows,
             "backup": backup_rows,
+            "mirror": mirror_rows,
         }
         for title, rows in ratios.items():
             if not rows:
@@ -367,6 +375,7 @@ def main() -> int:
                 huge,
                 ogc_rows,
                 scale_rows,
+                mirror_rows,
                 server_rows,
                 backup_rows,
             )

@@ -1,168 +1,136 @@
 """What grows with the number of environments, versions, robots and edits: each against few of them.
 
-Both databases are filled by the store's own code, which prepares and commits each version; only the transactions are
-joined, a thousand commits in one, so that they do not wait for the disk. The servers are ordinary ones.
+The databases are filled by ``scale_site``; the servers are ordinary ones. A request counts by the CPU time of its
+server's threads and of the database's processes that serve it, since on a busy machine the time on the clock says
+little; that is shown beside it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
+import psycopg
 from numpy.typing import NDArray
-from sqlalchemy import Connection, insert, update
+from sqlalchemy import insert, update
 
 from app.api.channels import as_dict
 from app.api.http.responses import json_bytes
 from app.fleet import count_robots
-from app.model.features import Features, from_columns, points
-from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
-from app.model.layers import NETWORK, PartKey
+from app.model.layers import PartKey
 from app.store import tables
-from app.store.changes import Changes, Put, Replace
+from app.store.changes import Changes, Replace
 from app.store.store import Store
 from app.store.values import Source
 from tests.bench import http
+from tests.bench.scale_site import TOPOLOGY, datum_of, fill, name_of, network
+from tests.postgres import running_cluster
 
-TOPOLOGY = PartKey("topology", "ground", NETWORK)
-NODES = 20
-ROUNDS = 60
+ROUNDS = 100
+WARM_UP = 10
+COLLECTIONS = 5
 BOUND = 1.2
 TOKEN = "bench-" + "0" * 40
-JOINED = 1000
-"""Number of commits in one transaction while a database is filled."""
 
 
-def rows(
-    environments: int = 10_000, versions: int = 10, url: Callable[[str], str] | None = None
-) -> list[dict[str, Any]]:
-    """Measure everything; url: of an empty database with a name, else SQLite."""
-    return [*requests(environments, versions, url), *channels(url), *growth()]
+def rows(environments: int = 10_000, versions: int = 100, *, postgres: bool = False) -> list[dict[str, Any]]:
+    """Measure everything on SQLite, or on a PostgreSQL cluster of its own; growth in bytes only on SQLite."""
+    if not postgres:
+        return [*requests(environments, versions), *channels(), *growth()]
+    with running_cluster() as cluster:
+
+        def url() -> str:
+            return cluster.url(cluster.create_database())
+
+        return [*requests(environments, versions, url), *channels(url)]
 
 
-def requests(environments: int, versions: int, url: Callable[[str], str] | None = None) -> list[dict[str, Any]]:
+def requests(environments: int, versions: int, url: Callable[[], str] | None = None) -> list[dict[str, Any]]:
     """Measure requests on a small and a large database in turns, and a garbage collection on both."""
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
-        clients, databases = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        databases = []
         for name, sizes in (("small", (10, 10)), ("large", (environments, versions))):
             place = Path(folder) / name
-            database = url(name) if url is not None else f"sqlite:///{place / 'fleetmap.sqlite'}"
-            databases.append((database, place))
+            database = url() if url is not None else f"sqlite:///{place / 'fleetmap.sqlite'}"
             fill(database, place, *sizes)
-            clients.append((stack.enter_context(_server(database, place)), sizes[0]))
-        label = f"{environments} × {versions}"
-        measured = [_compare(f"{what}, {label}", request, clients) for what, request in REQUESTS.items()]
-        times = [_collection(database, place) for database, place in databases]
-        return [*measured, _row(f"garbage collection, {label}", *times, unit="ms")]
+            databases.append((database, place, sizes[0]))
+        return compare(databases, f"{environments} × {versions}")
+
+
+def compare(databases: list[tuple[str, Path, int]], label: str) -> list[dict[str, Any]]:
+    """Compare the costs of two filled databases: URL, data folder and number of environments of each."""
+    with contextlib.ExitStack() as stack:
+        sites = [stack.enter_context(_server(*database)) for database in databases]
+        measured = [row for what, request in REQUESTS.items() for row in _compare(f"{what}, {label}", request, sites)]
+    collections = _row(f"garbage collection, {label}", *_collections(databases), unit="ms CPU")
+    return [*measured, collections]
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """Running server with the number of its environments."""
+
+    client: httpx.Client
+    environments: int
+    cpu: Callable[[], float]
 
 
 @contextlib.contextmanager
-def _server(database: str, folder: Path) -> Iterator[httpx.Client]:
+def _cpu_clock(process: int, database: str) -> Iterator[Callable[[], float]]:
+    """Yield a function for the CPU milliseconds of a process's threads and of all connections to a database."""
+    query = "SELECT pid FROM pg_stat_activity WHERE datname = current_database() AND pid <> pg_backend_pid()"
+    with contextlib.ExitStack() as stack:
+        connection: psycopg.Connection[tuple[Any, ...]] | None = None
+        if not database.startswith("sqlite"):
+            connection = stack.enter_context(psycopg.connect(database.replace("+psycopg", ""), autocommit=True))
+
+        def read() -> float:
+            files = list(Path(f"/proc/{process}/task").glob("*/schedstat"))
+            if connection is not None:
+                files += [Path(f"/proc/{row[0]}/schedstat") for row in connection.execute(query)]
+            total = 0
+            for file in files:
+                with contextlib.suppress(OSError):  # ended meanwhile
+                    total += int(file.read_text().split()[0])
+            return total / 1e6
+
+        yield read
+
+
+@contextlib.contextmanager
+def _server(database: str, folder: Path, environments: int) -> Iterator[_Site]:
     port = http.free_port()
     env = {"FLEETMAP_DATA_DIR": str(folder), "FLEETMAP_DATABASE_URL": database, "FLEETMAP_ADMIN_TOKEN": TOKEN}
-    env["FLEETMAP_ZENOH_MODE"] = "off"
+    env |= {
+        "FLEETMAP_LOG_LEVEL": "warning",
+        "FLEETMAP_ZENOH_MODE": "off",
+        "FLEETMAP_SCRUB_HOURS": "0",
+        "FLEETMAP_CONVERSION_WORKERS": "1",
+    }
     command = [sys.executable, "-m", "app.cli", "serve", "--host", "127.0.0.1", "--port", str(port)]
     auth = {"Authorization": f"Bearer {TOKEN}"}
     with (
-        http.serving(command, port, env),
+        http.serving(command, port, env) as process,
         httpx.Client(base_url=f"http://127.0.0.1:{port}", headers=auth, timeout=120) as client,
+        _cpu_clock(process.pid, database) as cpu,
     ):
         for _ in range(600):
             if client.get("/api/v1/search", params={"q": "dock"}).status_code != 503:
                 break
             time.sleep(0.5)
-        yield client
-
-
-# --- content ---
-
-
-def name_of(environment: int) -> str:
-    """Return an environment's name: none begins with another."""
-    return f"site-{environment:05}"
-
-
-def datum_of(environment: int) -> Datum:
-    """Return an environment's place on earth: a lattice whose points are a kilometre apart."""
-    row, column = divmod(environment, 100)
-    return Datum(50.0 + row * 0.01, 5.0 + column * 0.015)
-
-
-def _network(environment: int) -> Features:
-    xy = np.random.default_rng(environment).random((NODES, 2)) * 100
-    names = [f"Dock {environment}-{k}" for k in range(NODES)]
-    properties = [{"kind": "node", "name": name} for name in names]
-    return from_columns([f"n{k}" for k in range(NODES)], points(xy), properties, "local")
-
-
-def fill(url: str, folder: Path, environments: int, versions: int) -> float:
-    """Create environments, each with this many versions of distinct content; returns the seconds."""
-    started = time.perf_counter()
-    store = Store(url, folder / "blobs")
-    store.migrate()
-    number = 0
-    with contextlib.ExitStack() as stack:
-        for environment in range(environments):
-            if number >= JOINED or not environment:
-                stack.close()
-                stack.enter_context(_joined(store))
-                number = 0
-            _fill_environment(store, environment, versions)
-            number += versions
-    store.search_index.refresh(environments)
-    if not url.startswith("sqlite"):
-        with store._database.engine.connect() as connection:
-            connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("ANALYZE")
-    store.close()
-    return time.perf_counter() - started
-
-
-def _fill_environment(store: Store, environment: int, versions: int) -> None:
-    name = name_of(environment)
-    store.environments.create(name, title=f"Site {environment}", datum=datum_of(environment))
-    head = store.versions.get(name)
-    dice = random.Random(environment)
-    for version in range(2, versions + 1):
-        if version == 2:
-            changes = Changes((Replace(TOPOLOGY, _network(environment)),))
-        else:
-            k = dice.randrange(NODES)
-            moved = points(np.array([[dice.random() * 100, dice.random() * 100]]))
-            properties = [{"kind": "node", "name": f"Dock {environment}-{k}"}]
-            changes = Changes((Put(TOPOLOGY, from_columns([f"n{k}"], moved, properties, "local")),))
-        head = store.versions.commit(name, store.versions.prepare(head, changes), author="bench", message="")
-
-
-@contextlib.contextmanager
-def _joined(store: Store) -> Iterator[None]:
-    """Have all transactions of the store be one."""
-    database = store._database
-    methods = {name: getattr(database, name) for name in ("read", "snapshot", "write")}
-    with database.connection() as connection:
-        connection.execution_options(write=True)
-        with connection.begin():
-
-            @contextlib.contextmanager
-            def joined(**options: Any) -> Iterator[Connection]:
-                yield connection
-
-            for name in methods:
-                setattr(database, name, joined)
-            try:
-                yield
-            finally:
-                for name, method in methods.items():
-                    setattr(database, name, method)
+        yield _Site(client, environments, cpu)
 
 
 # --- requests ---
@@ -218,18 +186,21 @@ REQUESTS: dict[str, Request] = {
 }
 
 
-def _compare(what: str, request: Request, clients: list[tuple[httpx.Client, int]]) -> dict[str, Any]:
-    """Measure the median time of a request on both servers, alternately."""
+def _compare(what: str, request: Request, sites: list[_Site]) -> list[dict[str, Any]]:
+    """Measure the median cost of a request on both servers, in turns: CPU time, which is bounded, and time."""
+    spent: list[list[float]] = [[], []]
     times: list[list[float]] = [[], []]
     dice = random.Random(what)
-    for number in range(ROUNDS + 10):
-        for k, (client, environments) in enumerate(clients):
-            started = time.perf_counter()
-            request(client, dice, environments)
-            if number >= 10:
-                times[k].append((time.perf_counter() - started) * 1e3)
-    small, large = (sorted(some)[len(some) // 2] for some in times)
-    return _row(what, small, large, unit="ms")
+    for number in range(ROUNDS + WARM_UP):
+        for k, site in enumerate(sites):
+            before, started = site.cpu(), time.perf_counter()
+            request(site.client, dice, site.environments)
+            elapsed = (time.perf_counter() - started) * 1e3
+            if number >= WARM_UP:
+                times[k].append(elapsed)
+                spent[k].append(site.cpu() - before)
+    cpu, clock = ([sorted(some)[len(some) // 2] for some in both] for both in (spent, times))
+    return [_row(what, *cpu, unit="ms CPU"), {**_row(what, *clock, unit="ms"), "bound": "–", "holds": True}]
 
 
 def _row(what: str, small: float, large: float, *, unit: str, bound: float = BOUND) -> dict[str, Any]:
@@ -244,33 +215,43 @@ def _row(what: str, small: float, large: float, *, unit: str, bound: float = BOU
     }
 
 
-def _collection(url: str, folder: Path) -> float:
-    """Measure a garbage collection after ten commits: the second one, since the first looks at everything."""
-    store = Store(url, folder / "blobs")
-    store.garbage.collect(timedelta(hours=6))
-    with store._database.write() as connection:  # the overlap of an hour would cover all versions
-        connection.execute(update(tables.version).values(time=datetime.now(UTC) - timedelta(days=1)))
+def _collections(databases: list[tuple[str, Path, int]]) -> list[float]:
+    """Measure garbage collections after ten commits each, in turns: median CPU milliseconds on each database."""
+    spent: list[list[float]] = [[] for _ in databases]
+    with contextlib.ExitStack() as stack:
+        stores = [Store(url, folder / "blobs") for url, folder, _ in databases]
+        clocks = [stack.enter_context(_cpu_clock(os.getpid(), url)) for url, _, _ in databases]
+        for store in stores:
+            stack.callback(store.close)
+            store.garbage.collect(timedelta(hours=6))  # the first one looks at everything
+            with store._database.write() as connection:  # the overlap of an hour would cover all versions
+                connection.execute(update(tables.version).values(time=datetime.now(UTC) - timedelta(days=1)))
+        for turn in range(COLLECTIONS):
+            for store, clock, times in zip(stores, clocks, spent, strict=True):
+                _commit_ten(store, 10**6 * (turn + 1))
+                before = clock()
+                store.garbage.collect(timedelta(hours=6))
+                times.append(clock() - before)
+    return [sorted(times)[COLLECTIONS // 2] for times in spent]
+
+
+def _commit_ten(store: Store, seed: int) -> None:
     for environment in range(10):
         head = store.versions.get(name_of(environment))
-        changes = Changes((Replace(TOPOLOGY, _network(environment + 10**6)),))
+        changes = Changes((Replace(TOPOLOGY, network(environment + seed)),))
         store.versions.commit(head.environment, store.versions.prepare(head, changes), author="bench", message="")
-    started = time.perf_counter()
-    store.garbage.collect(timedelta(hours=6))
-    spent = (time.perf_counter() - started) * 1e3
-    store.close()
-    return spent
 
 
 # --- robots ---
 
 
-def channels(url: Callable[[str], str] | None = None) -> list[dict[str, Any]]:
+def channels(url: Callable[[], str] | None = None) -> list[dict[str, Any]]:
     """Measure the body of ``GET /channels`` in an environment with 100 and 100 000 robots, half of them on the bus."""
     with tempfile.TemporaryDirectory() as folder:
         times = []
         for number in (100, 100_000):
             place = Path(folder) / str(number)
-            database = url(f"robots_{number}") if url is not None else f"sqlite:///{place / 'fleetmap.sqlite'}"
+            database = url() if url is not None else f"sqlite:///{place / 'fleetmap.sqlite'}"
             store = Store(database, place / "blobs")
             store.migrate()
             _add_robots(store, number)
@@ -330,21 +311,21 @@ def growth() -> list[dict[str, Any]]:
             store = Store(f"sqlite:///{folder}/fleetmap.sqlite", Path(folder) / "blobs")
             store.migrate()
             store.environments.create("farm")
-            cells = _rooms(4000, 5000)
-            last = _commit_grid(store, cells, "", upload=True)
-            one = _stored_bytes(store)
+            cells = rooms(4000, 5000)
+            last = commit_grid(store, cells, "", upload=True)
+            one = stored_bytes(store)
             dice = np.random.default_rng(1)
             for k in range(100):
                 y, x = dice.integers(0, 3995), dice.integers(0, 4995)
                 cells[y : y + 5, x : x + 5] = 100 * (k % 2)
-                last = _commit_grid(store, cells, last, upload=again)
+                last = commit_grid(store, cells, last, upload=again)
             label = f"stored of a 20 MB grid, after 100 {what}"
-            out.append(_row(label, one / 1e6, _stored_bytes(store) / 1e6, unit="MB", bound=1.3))
+            out.append(_row(label, one / 1e6, stored_bytes(store) / 1e6, unit="MB", bound=1.3))
             store.close()
     return out
 
 
-def _rooms(height: int, width: int) -> NDArray[np.uint8]:
+def rooms(height: int, width: int) -> NDArray[np.uint8]:
     """Draw rooms with walls on unknown ground, with a sensor's noise on a fiftieth of the free cells."""
     dice = np.random.default_rng(4)
     cells = np.full((height, width), 255, np.uint8)
@@ -355,7 +336,7 @@ def _rooms(height: int, width: int) -> NDArray[np.uint8]:
     return cells
 
 
-def _commit_grid(store: Store, cells: NDArray[np.uint8], last: str, *, upload: bool) -> str:
+def commit_grid(store: Store, cells: NDArray[np.uint8], last: str, *, upload: bool) -> str:
     """Commit a grid, with its file as a source if it is uploaded; returns the file's hash."""
     sources: tuple[Source, ...] = ()
     if upload:
@@ -369,7 +350,7 @@ def _commit_grid(store: Store, cells: NDArray[np.uint8], last: str, *, upload: b
     return last
 
 
-def _stored_bytes(store: Store) -> int:
+def stored_bytes(store: Store) -> int:
     """Return the bytes of the chunks, files, versions and events."""
     columns = ("chunk", "data"), ("version", "manifest"), ("event", "body")
     with store._database.read() as connection:

@@ -147,6 +147,22 @@ def test_client_waits_for_job_and_requests_map_again(talk: Talk) -> None:
     assert not got.path.exists()
 
 
+def test_client_waits_for_work_and_returns_its_result(talk: Talk) -> None:
+    done = {"id": "7", "state": "done", "progress": 1, "detail": "derive: e"}
+    running = {**done, "state": "running", "progress": 0.5, "step": "objects_to_topology"}
+    client, script = talk(
+        reply(202, {"id": "7"}, Location="/api/v1/jobs/7"), reply(200, running), reply(200, done),
+        reply(200, {"version": 3}),
+    )  # fmt: skip
+    assert client.post_work("/environments/e/derivations", {"method": "m"}, "deriving") == {"version": 3}
+    first, *_, last = script.asked
+    assert (first[2]["Prefer"], "Prefer" in last[2]) == ("respond-async", False)
+    assert first[2]["Idempotency-Key"] == last[2]["Idempotency-Key"], "the result of the same work"
+    client, script = talk(reply(201, {"version": None}))
+    client.post_work("/environments/e/derivations", {"method": "m", "dry_run": True}, "deriving")
+    assert "Prefer" not in script.asked[-1][2], "a dry run would be made twice"
+
+
 def test_client_raises_problem_of_failed_job(talk: Talk) -> None:
     problem = {"title": "Missing layer", "status": 422, "detail": "there is no network"}
     client, _ = talk(

@@ -129,6 +129,33 @@ def test_statuses_reach_the_centre_in_order(centre: Api, site: Api, farm: str, f
     assert len(again["history"]) == 4, "nothing is stored twice"
 
 
+def test_statuses_that_the_centre_refuses_are_reported(centre: Api, site: Api, farm: str, follower: Make) -> None:
+    edge = follower(farm)
+    edge.follow()
+    rights = edge.centre._headers
+    edge.centre._headers = {"authorization": f"Bearer {mirror_token(centre, 'another-*')}"}
+    for version in (1, 2):
+        site("PUT", "robots/mower-9/status", 200, json=status(farm, version, "active"))
+    edge.mirror.run_once()
+    assert site.get("/readyz").json()["mirror"]["skipped"] == {farm: 2}
+    text = site.get("/metrics").text
+    assert f'fleetmap_mirror_skipped_statuses{{environment="{farm}"}} 2.0' in text
+    listed = site.app.state.services.store.mirrors.describe()["environments"]
+    assert "statuses are skipped" in next(one["problem"] for one in listed if one["name"] == farm)
+    edge.centre._headers = rights
+    site("PUT", "robots/mower-9/status", 200, json=status(farm, 3, "active"))
+    edge.follow()
+    assert "skipped" not in site.get("/readyz").json()["mirror"]
+    there = centre.get(f"robots/mower-9?environment={farm}").json()
+    assert [line["version"] for line in there["history"]] == [3], "the others are lost to the centre"
+    values = dict(line.rsplit(" ", 1) for line in site.get("/metrics").text.splitlines() if "fleetmap_mirror" in line)
+    assert float(values["fleetmap_mirror_events_behind"]) == 0
+    assert 0 <= float(values["fleetmap_mirror_contact_age_seconds"]) < 3600
+    assert float(values['fleetmap_mirror_bytes_total{direction="received"}']) >= edge.centre.received > 0
+    assert float(values['fleetmap_mirror_bytes_total{direction="sent"}']) >= edge.centre.sent > 0
+    assert float(values["fleetmap_mirror_permission_seconds"]) > 3600
+
+
 def test_late_status_is_history(centre: Api, site: Api, farm: str, follower: Make) -> None:
     edge = follower(farm)
     edge.follow()

@@ -136,6 +136,8 @@ def test_job_is_cancelled_from_the_other_server(site: Site) -> None:
     site.ready(site.add_worker())
     job = site.start_generation(one, "cancelled")
     site.wait(one, job, "running")
+    shown = eventually(lambda: (job_now := site.job(other, job)).get("step") and job_now)
+    assert (shown["step"], shown["progress"]) in (("reading", 0.0), ("cave", 0.1))
     assert other.http.delete(f"/api/v1/jobs/{job}").status_code == 204
     assert site.job(one, job)["state"] == "cancelled"
     eventually(lambda: queue(one)["running"] == 0)

@@ -13,7 +13,7 @@ import pytest
 
 from app.errors import Conflict, NotFound
 from app.fleet import channel_convergence, count_robots, is_online, robot_lag
-from app.store import robot_counts, robots
+from app.store import robot_counts, robots, silent_robots
 from app.store.changes import Replace
 from app.store.fleet_values import NO_ROOT, ActiveMap, ChannelMove, ReceivedReport, RobotReport
 from app.store.store import Store
@@ -197,14 +197,20 @@ def test_presence_is_stored_and_bounded(farm: Store, monkeypatch: pytest.MonkeyP
     assert [(r.robot, r.on_bus) for r in farm.robots.all()] == [("r1", False), ("r2", True), ("r3", None)]
 
 
-def test_silent_robots_are_removed(farm: Store):
-    old = datetime.now(UTC) - timedelta(days=91)
-    farm.robots.note_reports([ReceivedReport("farm", "old", RobotReport("latest", 0, A, "active"), old)])
-    farm.robots.note_reports([ReceivedReport("farm", "new", RobotReport("latest", 0, A, "active"), datetime.now(UTC))])
-    farm.robots.note_presence({"old"}, set(), old)
+def test_silent_robots_are_removed(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(silent_robots, "PAGE", 2)
+    old, now = datetime.now(UTC) - timedelta(days=91), datetime.now(UTC)
+    names = ("old", "older", "oldest")
+    for version, state in enumerate(("failed", "active")):
+        reports = [ReceivedReport("farm", r, RobotReport("latest", version, A, state), old) for r in names]
+        farm.robots.note_reports(reports)
+    farm.robots.note_reports([ReceivedReport("farm", "new", RobotReport("latest", 0, A, "active"), now)])
+    farm.robots.note_presence({"new", "old"}, set(), old)
+    farm.robots.note_presence({"new"}, set(), now)
     farm.garbage.collect(timedelta(hours=6))
     assert [r.robot for r in farm.robots.all()] == ["new"]
-    assert farm.robots.history("farm", "old") == []
+    assert farm.robots.present_robots() == {"new"}
+    assert [len(farm.robots.history("farm", name)) for name in (*names, "new")] == [0, 0, 0, 1]
 
 
 def test_channel_moves_are_listed_oldest_first(farm: Store):

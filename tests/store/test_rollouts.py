@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+from sqlalchemy import event
 
 from app.fleet import next_step
+from app.store import rollout_robots
 from app.store.changes import Replace
-from app.store.fleet_values import Channel, ReceivedReport, Robot, RobotReport, Rollout
+from app.store.fleet_values import Channel, FailedRobot, OnlineCounts, ReceivedReport, RobotReport, Rollout
 from app.store.store import Store
 from tests.store.samples import GRID, grid, save
 
@@ -103,23 +106,35 @@ def test_rollout_moves_when_enough_robots_are_ready(fleet: Fleet):
     assert fleet.channel().planned is None
 
 
+@dataclass(frozen=True)
+class Census:
+    """Robots of a channel, all online."""
+
+    count: int
+    ready_count: int
+    failed_count: int
+    time: datetime
+
+    def failed(self, **_: datetime) -> list[FailedRobot]:
+        return [FailedRobot(f"r{k}", self.time, online=True) for k in range(self.failed_count)]
+
+    def online(self, **_: datetime) -> OnlineCounts:
+        return OnlineCounts(self.count, self.ready_count)
+
+
 @pytest.mark.parametrize(("count", "share", "enough"), [(25, 0.28, 7), (25, 0.56, 14), (1, 1.0, 1), (3, 0.001, 1)])
 def test_rollout_moves_at_exact_ready_share(count: int, share: float, enough: int):
     """In binary, 0.28 of 25 is slightly more than 7."""
     now = datetime.now(UTC)
 
-    def step(state: Any, version: str, those: int) -> Any:
+    def step(state: Any, those: int) -> Any:
         rollout = Rollout(2, "b", now, ready=share, failed=share, state=state, moved=now, before=1)
-        reports = [(version, "b") if k < those else ("active", "a") for k in range(count)]
-        robots = [
-            Robot(f"r{k}", "farm", RobotReport("production", 1, r, s), now, now, None)
-            for k, (s, r) in enumerate(reports)
-        ]
-        return next_step(rollout, robots, now)
+        ready, failed = (those, 0) if state == "waiting" else (0, those)
+        return next_step(rollout, Census(count, ready, failed, now), now)
 
-    for stage, state, then in (("waiting", "ready", "move"), ("watching", "failed", "move_back")):
-        assert step(stage, state, enough).do == then
-        assert step(stage, state, enough - 1) is None
+    for stage, then in (("waiting", "move"), ("watching", "move_back")):
+        assert step(stage, enough).do == then
+        assert step(stage, enough - 1) is None
 
 
 @pytest.mark.parametrize("shift", [-60, 60])
@@ -266,3 +281,38 @@ def test_rollout_decision_is_repeated_in_transaction(fleet: Fleet):
     assert fleet.store.channels.advance_rollouts(fleet.at(2), changes_its_mind) == []
     assert len(calls) == 2
     assert fleet.channel().version == 1
+
+
+def test_open_rollout_of_large_channel_reads_few_rows_each_second(fleet: Fleet, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(rollout_robots, "LARGE", 3)
+    fleet.report("abcde", 1, "active")
+    fleet.report("a", 2, "failed", 2)
+    fleet.roll(ready=1.0, failed=0.9)
+    with fleet.store.transaction() as connection:
+        engine = connection.engine
+    rows = []
+
+    def count(*about: Any) -> None:
+        rows.append(about[2])
+
+    event.listen(engine, "after_cursor_execute", count)
+    try:
+        for seconds in range(3, 10):
+            fleet.tick(seconds)
+    finally:
+        event.remove(engine, "after_cursor_execute", count)
+    counted = [statement for statement in rows if "AS ready" in statement]
+    assert len(counted) == 1, "the other robots are counted at most every few seconds"
+    assert not [statement for statement in rows if "robot_history" in statement or "robot.detail" in statement]
+    fleet.report("bcde", 2, "ready", 11)
+    assert fleet.tick(12) == (1, "waiting")
+
+
+def test_failed_robots_are_read_from_their_index(fleet: Fleet):
+    if not fleet.store.database_url.startswith("sqlite"):
+        pytest.skip("the planner of PostgreSQL reads a small table as a whole")
+    query = rollout_robots._failed_query().compile(compile_kwargs={"literal_binds": False})
+    values = dict.fromkeys(query.params, "")
+    with fleet.store.transaction() as connection:
+        plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {query}", values).all()
+    assert any("ix_robot_failed" in row[3] for row in plan), plan

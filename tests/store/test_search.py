@@ -236,6 +236,22 @@ def test_rebuild_gives_the_same(site: Store) -> None:
     assert site.search.find("dock", limit=50) == before
 
 
+def test_merged_index_of_texts_gives_the_same(site: Store) -> None:
+    for version in range(8):
+        samples.save(site, "farm", Put(samples.TOPOLOGY, features([node("n9", 1.0, f"Shed {version}")], "local")))
+        site.search.find("shed", limit=5)
+    queries = ("shed", "hed 7", "e", "zone", "arm")
+    before = [summary(site.search.find(query, limit=20)[0]) for query in queries]
+    assert before[0]
+    assert before[1]
+    site.search_index.merge()
+    assert [summary(site.search.find(query, limit=20)[0]) for query in queries] == before
+    if site.database_url.startswith("sqlite"):
+        with site.transaction() as connection:
+            segments = "SELECT count(DISTINCT segid) FROM search_node_idx"
+            assert connection.exec_driver_sql(segments).scalar() == 1
+
+
 def test_damaged_environment_is_skipped(site: Store) -> None:
     site.search.find("dock", limit=5)
     samples.save(site, "farm", Replace(samples.TOPOLOGY, features([node("n9", 1.0, "New dock")], "local")))

@@ -28,6 +28,7 @@ from app.convert.recipe import Recipe
 from app.errors import FleetMapError, NoRoom, Unavailable
 from app.ingest import CommitResult
 from app.pool import CancelHandle, Cancelled
+from app.progress import Progress
 from app.store.store import Store
 from app.store.values import Job, rfc3339
 
@@ -54,7 +55,7 @@ class JobStarted:
 class _RunningConversion:
     """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id.
 
-    shared: job that waits for a worker of all servers, if one makes the map.
+    shared: job that waits for a worker of all servers, if one makes the map. noted: the progress that its jobs show.
     """
 
     recipe: Recipe
@@ -65,6 +66,7 @@ class _RunningConversion:
     waiters: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
     shared: Job | None = None
+    noted: Progress = field(default_factory=Progress)
 
 
 class ConversionJobs:
@@ -233,6 +235,24 @@ class ConversionJobs:
         for job in jobs:
             self._touch(job)
 
+    def store_progress(self) -> None:
+        """Store how far this process's conversions are, if that has changed, and stop cancelled ones. Blocks."""
+        with self._lock:
+            changed = [
+                running
+                for running in self._running.values()
+                if running.jobs and running.shared is None and running.noted != running.stop.progress
+            ]
+        for running in changed:
+            running.noted, jobs = running.stop.progress, list(running.jobs.values())
+            try:
+                active = self._store.jobs.note_progress(jobs, running.noted)
+                for job in jobs:
+                    if job not in active and self._store.jobs.get(job).state == "cancelled":
+                        self.cancel(job)  # by another process of the server
+            except FleetMapError as error:
+                log.warning("conversions: storing the progress of a job failed: %s", error.detail)
+
     def sweep(self) -> None:
         """Fail jobs of all servers whose task is lost, and delete old ones. For one server of all. Blocks."""
         if self._work is not None:
@@ -326,6 +346,8 @@ def job_as_json(job: Job) -> dict[str, Any]:
         state, detail = "failed", "the server was restarted"
         problem = problems.document(503, "the server restarted during the conversion: repeat the request")
     out: dict[str, Any] = {"id": job.id, "state": state, "progress": job.progress, "detail": detail}
+    if job.step and state == "running":
+        out["step"] = job.step
     if job.result is not None:
         out["result"] = dict(job.result)
     if problem is not None:

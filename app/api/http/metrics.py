@@ -18,6 +18,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from app.api.http.mirror_metrics import MirrorCollector
 from app.api.http.operation_metrics import OperationCollector
 from app.backends.lead import Leads
 from app.backends.queue import QueueFigures
@@ -88,6 +89,7 @@ class Metrics:
         heads.register(_Leaders(leads))
         if self.operation is not None:
             heads.register(self.operation)
+        heads.register(MirrorCollector(store))
         return generate_latest(registry) + generate_latest(heads)
 
 

@@ -18,6 +18,7 @@ from app.derive import ChainFailure
 from app.errors import FleetMapError, NoRoom, Unavailable
 from app.ingest import CommitRequest, CommitResult, DerivationRequest, GenerationRequest, Ingest
 from app.pool import CancelHandle, Cancelled
+from app.progress import Progress
 from app.store.audit import CALLER, Caller
 from app.store.store import Store
 from app.store.values import Version
@@ -34,6 +35,7 @@ class TaskPerformer:
     def __init__(self, store: Store, maps: Maps, ingest: Ingest, count: Callable[[str, str], None]) -> None:
         self._store, self._maps, self._ingest, self._count = store, maps, ingest, count
         self._stops: dict[str, CancelHandle] = {}
+        self._noted: dict[str, Progress] = {}
         self._lock = threading.Lock()
         self._kinds: Mapping[str, Callable[[Task, CancelHandle], Done]] = {
             "convert": self._convert,
@@ -53,6 +55,16 @@ class TaskPerformer:
         finally:
             with self._lock:
                 self._stops.pop(task.key, None)
+                self._noted.pop(task.key, None)
+
+    def store_progress(self) -> None:
+        """Store how far the running tasks are, if that has changed, and end those whose jobs were all cancelled."""
+        with self._lock:
+            stops = {key: stop for key, stop in self._stops.items() if self._noted.get(key) != stop.progress}
+            self._noted |= {key: stop.progress for key, stop in stops.items()}
+        for key, stop in stops.items():
+            if stop.progress != Progress() and not self._store.jobs.note_task_progress(key, stop.progress):
+                stop()
 
     def stop(self, task: Task) -> None:
         """End ``perform`` of this task."""

@@ -9,7 +9,7 @@ export function JobProgress({ job, title, onCancel }: { job: Job | null; title: 
     <div class="job" role="status">
       <span>
         {title}
-        <small>{job ? ` ${sentence(job.detail || job.state)}` : ""}</small>
+        <small>{job ? ` ${sentence([job.detail || job.state, job.step].filter(Boolean).join(": "))}` : ""}</small>
       </span>
       <progress aria-label={title} value={job && job.progress > 0 ? job.progress : undefined} />
       <Button onClick={onCancel}>Cancel</Button>
