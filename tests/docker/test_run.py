@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -156,6 +157,31 @@ def test_sqlite_service_has_no_database_and_the_same_settings(tmp_path: Path, mo
     assert settings.database_url is None
     assert settings.zenoh_password is not None
     assert settings.admin_token is not None
+
+
+def test_prometheus_accepts_its_command(tmp_path: Path) -> None:
+    """With a configuration of the test: that of ``docker/monitoring`` takes half a minute to scrape."""
+    if shutil.which("prometheus") is None:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)("prometheus is not installed (Debian: prometheus)")
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / "secrets" / "metrics_token").write_text("-\n")
+    compose = Compose("compose.yaml", tmp_path, "", variables=VARIABLES, secrets=tmp_path / "secrets")
+    prometheus = Container(compose, "prometheus")
+    configuration = prometheus.folder / "etc" / "prometheus" / "prometheus.yml"
+    configuration.parent.mkdir(parents=True, exist_ok=True)
+    configuration.write_text("scrape_configs: []\n")
+    with prometheus.running():
+        ready = f"http://{compose.address('prometheus')}/-/ready"
+        eventually(lambda: is_ready(ready) or prometheus.process.poll() is not None)
+        assert is_ready(ready), prometheus.log
+
+
+def is_ready(url: str) -> bool:
+    """Whether an address returns 200."""
+    try:
+        return httpx.get(url, timeout=60).status_code == 200
+    except httpx.TransportError:
+        return False
 
 
 def test_image_needs_no_shell() -> None:
