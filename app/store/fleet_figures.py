@@ -227,20 +227,20 @@ def _as_group(row: Row[Any]) -> RobotGroup:
 
 def _groups_query() -> Select[Any]:
     table, owner, channel, version = tables.robot_tally, tables.environment, tables.channel, tables.version
-    root: ColumnElement[str] = case((table.c.channel == LATEST, owner.c.root), else_=version.c.root)
     columns = [table.c.environment_id, table.c.channel, table.c.state, table.c.held_root, table.c.held_overlays]
     number = func.sum(table.c.number)
-    named = (channel.c.environment_id == table.c.environment_id) & (channel.c.name == table.c.channel)
-    pointed = (version.c.environment_id == table.c.environment_id) & (version.c.number == channel.c.version)
+    # grouped before the joins: there are up to 200 rows of an environment with equal values
+    groups = select(*columns, number.label("number")).group_by(*columns).having(number != 0).subquery()
+    root: ColumnElement[str] = case((groups.c.channel == LATEST, owner.c.root), else_=version.c.root)
+    named = (channel.c.environment_id == groups.c.environment_id) & (channel.c.name == groups.c.channel)
+    pointed = (version.c.environment_id == groups.c.environment_id) & (version.c.number == channel.c.version)
     return (
-        select(*columns, owner.c.name.label("environment"), root.label("channel_root"), number.label("number"))
-        .join(owner, owner.c.id == table.c.environment_id)
+        select(groups, owner.c.name.label("environment"), root.label("channel_root"))
+        .join(owner, owner.c.id == groups.c.environment_id)
         .outerjoin(channel, named)
         .outerjoin(version, pointed)
         .where(owner.c.deleted.is_(None), root.is_not(None))
-        .group_by(*columns, owner.c.name, root)
-        .having(number != 0)
-        .order_by(owner.c.name, table.c.channel)
+        .order_by(owner.c.name, groups.c.channel)
     )
 
 
