@@ -24,12 +24,17 @@ FOLDER: Final = re.compile(r"[0-9a-f]{2}|packs|made")
 
 
 class FolderFiles:
-    """Files below a folder. tops: pattern of the names of its folders; others belong to other uses."""
+    """Files below a folder.
+
+    Args:
+        tops: pattern of the names of its folders; others belong to other uses.
+        gentle: whether bytes are synced piece by piece, so that the commits of a database on the same disk wait less.
+    """
 
     remote = False
 
-    def __init__(self, folder: Path, tops: re.Pattern[str] = FOLDER) -> None:
-        self._folder, self._tops = folder, tops
+    def __init__(self, folder: Path, tops: re.Pattern[str] = FOLDER, *, gentle: bool = False) -> None:
+        self._folder, self._tops, self._gentle = folder, tops, gentle
         self._workspaces = Workspaces(folder / "tmp")
 
     def prepare(self) -> None:
@@ -55,7 +60,7 @@ class FolderFiles:
     def _write(self, files: Mapping[str, bytes | Path]) -> None:
         folders: set[Path] = set()
         with self._workspaces.create() as workspace:
-            ready = {key: _synced(data, workspace) for key, data in files.items()}
+            ready = {key: _synced(data, workspace, gentle=self._gentle) for key, data in files.items()}
             for key, temporary in ready.items():
                 path = self._folder / key
                 for parent in (path.parent.parent, path.parent):
@@ -133,14 +138,23 @@ def _converted(error: OSError) -> Exception:
     return unreadable_error(error)
 
 
-def _synced(data: bytes | Path, workspace: Path) -> Path:
-    """Write bytes to a temporary file, or take one over, and flush it to the disk."""
+def _synced(data: bytes | Path, workspace: Path, *, gentle: bool) -> Path:
+    """Write bytes to a temporary file, or take one over, and flush it to the disk.
+
+    gentle: each BLOCK by itself. The sync of another file waits for what the file system has begun to write of this
+    one: with 32 MB at once, syncs of SQLite's log took a third longer, and up to 130 ms; with pieces as long as ever.
+    """
     path = data if isinstance(data, Path) else workspace / secrets.token_hex(16)
     if isinstance(data, Path):
         _sync(path)
         return path
     with path.open("wb") as out:
-        out.write(data)
+        for start in range(0, len(data), BLOCK) if gentle else ():
+            out.write(data[start : start + BLOCK])
+            out.flush()
+            os.fdatasync(out.fileno())
+        if not gentle:
+            out.write(data)
         out.flush()
         os.fsync(out.fileno())
     return path

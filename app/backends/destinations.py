@@ -44,7 +44,7 @@ def open_destination(place: str, scratch: Path, *, new: bool) -> BlobFiles:
         (path / "tmp").mkdir(exist_ok=True)
     except OSError as error:
         raise Unavailable(f"{place}: the folder cannot be created ({system_reason(error)})") from error
-    return FolderFiles(path, _FOLDERS)
+    return FolderFiles(path, _FOLDERS, gentle=True)
 
 
 def is_foreign(place: str) -> bool:

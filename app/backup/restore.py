@@ -36,7 +36,7 @@ MAX_SHOWN: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class RestoreResult:
-    """What was restored. documents: keys by name, which the caller puts in their place. findings: known damage."""
+    """What was restored. rows: number of those of tables. verification: of the place; it has only known damage."""
 
     snapshot: Snapshot
     epoch: int

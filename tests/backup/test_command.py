@@ -131,3 +131,15 @@ def test_epoch_is_raised_after_a_restore_by_other_means(tmp_path: Path, capfd: O
         answer = api.get("environments/farm/versions/production/manifest?formats=tmap2").json()
         assert answer["epoch"] == epoch
         assert sync(api, tmp_path / "robot")[0] == 1
+
+
+def test_nightly_unit_runs_the_command(site: tuple[Api, Path], tmp_path: Path, capfd: Output) -> None:
+    docker = Path(__file__).parents[2] / "docker"
+    unit = (docker / "fleetmap-backup.service").read_text()
+    words = unit.partition("ExecStart=")[2].partition("\n")[0].split()
+    assert words[0].endswith("/fleetmap")
+    values = {"${DESTINATION}": [str(tmp_path / "backup")], "${KEEP}": ["7d/90d/2y"], "$OPTIONS": ["--keys"]}
+    arguments = [value for word in words[1:] for value in values.get(word, [word])]
+    assert command(capfd, *arguments, "--data-dir", site[1] / "data")["keys"]
+    assert "EnvironmentFile=/etc/fleetmap/backup.env" in unit
+    assert "OnCalendar=" in (docker / "fleetmap-backup.timer").read_text()

@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -18,7 +19,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -46,8 +46,9 @@ WRITERS = 5
 PAUSE_SECONDS = 0.1
 """Pause of a writer after a commit: so many writers would otherwise measure the server's processor."""
 
-PHASE_SECONDS = 30.0
-CYCLES = 3
+PHASE_SECONDS = 10.0
+WINDOW_SECONDS = 4.0
+CYCLES = 2
 ROBOTS = 20
 MAX_SLOWER, MAX_WRITTEN, MIN_VERIFY_MB, MIN_OF_SHA256SUM = 1.1, 1.1, 500.0, 0.8
 ENVIRONMENT = "filled"
@@ -151,66 +152,58 @@ class Writers:
 
 def fleetmap(*arguments: str) -> Any:
     """Run a command; returns its JSON."""
+    return finish_fleetmap(start_fleetmap(*arguments))
+
+
+def start_fleetmap(*arguments: str) -> subprocess.Popen[str]:
+    """Start a command in a process of its own."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
     command = [sys.executable, "-m", "app.cli", *arguments, "--json"]
-    done = subprocess.run(command, env=clean, cwd=ROOT, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"fleetmap {' '.join(arguments)}: {done.stdout}{done.stderr}")
-    return json.loads(done.stdout)
+    return subprocess.Popen(command, env=clean, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish_fleetmap(process: subprocess.Popen[str]) -> Any:
+    """Wait for the end of a command; returns its JSON."""
+    out, error = process.communicate()
+    if process.returncode:
+        raise RuntimeError(f"fleetmap failed: {out}{error}")
+    return json.loads(out)
 
 
 def _during(
     client: httpx.Client, data: Path, place: Path
 ) -> tuple[list[dict[str, Any]], dict[str, dict[tuple[str, int], str]]]:
-    """Measure commits without and during backups; returns what was acknowledged before and after the first one."""
+    """Measure commits during backups; returns what was acknowledged before and after the first one.
+
+    The backup is stopped and continued every WINDOW_SECONDS, so that other work on the machine slows both sides alike.
+    """
     writers = Writers(client)
-    time.sleep(PHASE_SECONDS / 3)
+    time.sleep(PHASE_SECONDS)
     acknowledged: dict[str, dict[tuple[str, int], str]] = {}
-    quiet, busy = _Phase(), _Phase()
-    size = 0
+    windows: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
     for cycle in range(CYCLES):
-        quiet.measure(writers, lambda: time.sleep(PHASE_SECONDS))
         acknowledged.setdefault("before", dict(writers.versions))
         into = place if cycle == 0 else place.with_name(f"backup{cycle}")
-        size = busy.measure(writers, partial(_back_up, into, data))["bytes"]
+        process = start_fleetmap("backup", str(into), "--keys", "--data-dir", str(data))
+        while process.poll() is None:
+            for is_running in (True, False):
+                process.send_signal(signal.SIGCONT if is_running else signal.SIGSTOP)
+                begin = time.monotonic()
+                time.sleep(WINDOW_SECONDS)
+                windows[is_running].append((begin, time.monotonic()))
+            process.send_signal(signal.SIGCONT)
+        size = finish_fleetmap(process)["bytes"]
         acknowledged.setdefault("after", dict(writers.versions))
     writers.stop()
-    label = f"{CYCLES} backups of {size / 1e9:.1f} GB, {busy.seconds / CYCLES:.0f} s each, {WRITERS} writers"
+    times = {kind: [s for begin, end in spans for s in writers.times(begin, end)] for kind, spans in windows.items()}
+    seconds = {kind: sum(end - begin for begin, end in spans) for kind, spans in windows.items()}
+    busy, quiet = times[True], times[False]
+    label = f"{CYCLES} backups of {size / 1e9:.1f} GB, {seconds[True] / CYCLES:.0f} s each, {WRITERS} writers"
+    rates = len(quiet) / seconds[False], len(busy) / seconds[True]
     return [
-        row(f"{label}: commit (peer: without)", busy.median, MAX_SLOWER, "ms", quiet.median),
-        row("commits a second without a backup (peer: during)", quiet.rate, MAX_SLOWER, "1/s", busy.rate),
+        row(f"{label}: commit (peer: while it is stopped)", median(busy) * 1e3, MAX_SLOWER, "ms", median(quiet) * 1e3),
+        row("commits a second while it is stopped (peer: during)", rates[0], MAX_SLOWER, "1/s", rates[1]),
     ], acknowledged
-
-
-def _back_up(place: Path, data: Path) -> Any:
-    return fleetmap("backup", str(place), "--keys", "--data-dir", str(data))
-
-
-class _Phase:
-    """Commits of a kind of time, which comes several times."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self.times: list[float] = []
-
-    def measure(self, writers: Writers, work: Callable[[], Any]) -> Any:
-        """Do work, and take the commits meanwhile; returns its result."""
-        begin = time.monotonic()
-        result = work()
-        end = time.monotonic()
-        self.seconds += end - begin
-        self.times += writers.times(begin, end)
-        return result
-
-    @property
-    def rate(self) -> float:
-        """Commits a second."""
-        return len(self.times) / self.seconds
-
-    @property
-    def median(self) -> float:
-        """Median duration of a commit in milliseconds."""
-        return median(self.times) * 1e3
 
 
 def _incremental(client: httpx.Client, data: Path, place: Path) -> list[dict[str, Any]]:
@@ -221,7 +214,7 @@ def _incremental(client: httpx.Client, data: Path, place: Path) -> list[dict[str
         for number in range(max(1, int(GIGABYTES * 2**30 * SHARE_CHANGED) // STEP_BYTES)):
             _commit_noise(store, dice, number)
     writers = Writers(client)
-    time.sleep(PHASE_SECONDS / 3)
+    time.sleep(PHASE_SECONDS)
     writers.stop()
     change = _content_bytes(data) - former
     before = _folder_bytes(place)

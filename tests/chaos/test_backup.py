@@ -126,7 +126,7 @@ def test_killed_backups_and_restores_lose_nothing(data: tuple[Store, Path], tmp_
         for _ in range(ROUNDS):
             shutil.rmtree(place / "packs", ignore_errors=True)  # so that there is something to write
             store.blobs.put_many([os.urandom(BLOB_BYTES) for _ in range(4)])
-            killed += kill_at(start(*backup), place / "packs", dice.uniform(0, 0.3))
+            killed += kill_at(start(*backup), place / "tmp", dice.uniform(0, 0.5))
         while not writer.roots:
             time.sleep(0.01)
         before = max(writer.roots)
