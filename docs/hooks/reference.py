@@ -36,6 +36,7 @@ from app import derive, generate
 from app.api.http import problems
 from app.api.http.auth import RequireRole
 from app.api.http.metrics import Metrics, QueueCollector, _HeadVersionCollector, _Leaders, _Scrubs
+from app.api.http.mirror_metrics import MirrorCollector
 from app.api.http.responses import API
 from app.backends.lead import LocalLeads
 from app.backends.queue import QueueFigures
@@ -406,12 +407,14 @@ def metrics() -> str:
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
-        empty: Any = SimpleNamespace(environments=environments, blob_dir=Path(folder), is_shared=False)
+        mirrors = SimpleNamespace(figures=lambda: None)
+        empty: Any = SimpleNamespace(environments=environments, mirrors=mirrors, blob_dir=Path(folder), is_shared=False)
         leaders, queue = _Leaders(LocalLeads(Path(folder))), QueueCollector(_no_tasks)
-        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), leaders, queue):
+        for collector in (_HeadVersionCollector(empty), _Scrubs(empty), leaders, queue, MirrorCollector(empty)):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
-                rows.append((code(family.name), family.type, codes(labels), family.documentation))
+                name = family.name + ("_total" if family.type == "counter" else "")
+                rows.append((code(name), family.type, codes(labels), family.documentation))
     return table(("metric", "type", "labels", "meaning"), sorted(rows))
 
 
