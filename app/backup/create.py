@@ -101,7 +101,7 @@ class BackupWriter:
         places: dict[bytes, tuple[int, int]] = {}
         with self._source.snapshot() as connection:
             state = self._source.state(connection)
-            for table in dumped_tables():
+            for table in dumped_tables(keys=bool(self._keys.documents)):
                 count, names = 0, list[str]()
                 for number, segment in self._source.segments(connection, table):
                     count += number

@@ -32,6 +32,9 @@ LEFT_OUT: Final = frozenset(
 )
 """Tables that a backup does not contain."""
 
+WITH_KEYS: Final = frozenset({"webhook", "webhook_lag"})
+"""Tables with secrets: a backup contains them only if it contains keys."""
+
 OWN_DOCUMENTS: Final = frozenset({"keys", "links", "scrub", "backup"})
 """Documents that are no rows of a backup: keys are in it only by choice, the others are of this server alone."""
 
@@ -51,9 +54,10 @@ SEGMENT_BYTES: Final = 2**20
 """Size at which a segment ends in any case."""
 
 
-def dumped_tables() -> list[Table]:
-    """Return the tables whose rows a backup contains, referenced ones first."""
-    return [table for table in tables.metadata.sorted_tables if table.name not in CONTENT | LEFT_OUT]
+def dumped_tables(*, keys: bool = True) -> list[Table]:
+    """Return the tables whose rows a backup contains, referenced ones first. keys: also those with secrets."""
+    omitted = CONTENT | LEFT_OUT | (frozenset() if keys else WITH_KEYS)
+    return [table for table in tables.metadata.sorted_tables if table.name not in omitted]
 
 
 def stored_columns(table: Table) -> list[Column[Any]]:

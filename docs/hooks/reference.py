@@ -44,6 +44,7 @@ from app.api.http.metrics import (
     _Scrubs,
     _Webhooks,
 )
+from app.api.http.mirror_metrics import MirrorCollector
 from app.api.http.operation_metrics import GAUGES
 from app.api.http.responses import API
 from app.backends.documents import FileDocument
@@ -417,22 +418,20 @@ def metrics() -> str:
     rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
     with tempfile.TemporaryDirectory() as folder:
         environments = SimpleNamespace(page=lambda **_: ([], None))
-        backups, webhooks = Backups(FileDocument(Path(folder) / "backup")), SimpleNamespace(all=list)
         empty: Any = SimpleNamespace(
-            environments=environments, webhooks=webhooks, blob_dir=Path(folder), is_shared=False, backups=backups
+            environments=environments,
+            webhooks=SimpleNamespace(all=list),
+            mirrors=SimpleNamespace(figures=lambda: None),
+            backups=Backups(FileDocument(Path(folder) / "backup")),
+            blob_dir=Path(folder),
+            is_shared=False,
         )
-        leaders, queue = _Leaders(LocalLeads(Path(folder))), QueueCollector(_no_tasks)
-        for collector in (
-            _HeadVersionCollector(empty),
-            _Scrubs(empty),
-            _Backups(empty),
-            _Webhooks(empty),
-            leaders,
-            queue,
-        ):
+        of_store = (one(empty) for one in (_HeadVersionCollector, _Scrubs, _Backups, _Webhooks, MirrorCollector))
+        for collector in (*of_store, _Leaders(LocalLeads(Path(folder))), QueueCollector(_no_tasks)):
             for family in collector.collect():
                 labels = getattr(family, "_labelnames", ())
-                rows.append((code(family.name), family.type, codes(labels), family.documentation))
+                name = family.name + ("_total" if family.type == "counter" else "")
+                rows.append((code(name), family.type, codes(labels), family.documentation))
     rows += [(code(gauge.name), "gauge", codes(gauge.labels), gauge.meaning) for gauge in GAUGES]
     return table(("metric", "type", "labels", "meaning"), sorted(rows))
 

@@ -53,7 +53,7 @@ def serving(command: list[str], port: int, env: dict[str, str] | None = None) ->
         yield process
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(120)
 
 
 def bare(port: int) -> list[str]:
