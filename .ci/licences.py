@@ -38,8 +38,8 @@ def main() -> int:
 
 
 def is_accepted(text: str) -> bool:
-    """Return whether one of several alternatives is accepted."""
-    alternatives = re.split(r"\s+OR\s+", text)
+    """Return whether one of several alternatives is accepted. Of a nested expression, all parts must be."""
+    alternatives = [text] if " AND " in text and "(" in text else re.split(r"\s+OR\s+", text)
     return any(ACCEPTED.search(part) and not REFUSED.search(part) for part in alternatives)
 
 
