@@ -38,8 +38,8 @@ def main() -> int:
 
 
 def is_accepted(text: str) -> bool:
-    """Return whether one of several alternatives is accepted."""
-    alternatives = re.split(r"\s+OR\s+", text)
+    """Return whether one of several alternatives is accepted. Of a nested expression, all parts must be."""
+    alternatives = [text] if " AND " in text and "(" in text else re.split(r"\s+OR\s+", text)
     return any(ACCEPTED.search(part) and not REFUSED.search(part) for part in alternatives)
 
 
@@ -68,13 +68,17 @@ def installed(root: str) -> dict[str, str]:
 
 
 def licence(package: Distribution) -> str:
-    """Return what a package states: an SPDX expression, else its classifiers, else the first line of its text."""
+    """Return what a package states: an SPDX expression, else classifiers, else the first line of a text of its own."""
     metadata = package.metadata
     if expression := metadata.get("License-Expression"):
         return str(expression)
     classifiers = [c.rpartition(" :: ")[2] for c in metadata.get_all("Classifier", []) if c.startswith("License :: ")]
     named = [c for c in classifiers if c != "OSI Approved"]
-    return " OR ".join(named) or str(metadata.get("License") or "").strip().partition("\n")[0]
+    texts = [str(metadata.get("License") or "")]
+    for name in metadata.get_all("License-File", []):
+        texts += [package.read_text(f"licenses/{name}") or package.read_text(name) or ""]
+    lines = [text.strip().partition("\n")[0] for text in texts if text.strip()]
+    return " OR ".join(named) or next(iter(lines), "")
 
 
 if __name__ == "__main__":

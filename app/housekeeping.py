@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
 
 from starlette.concurrency import run_in_threadpool
@@ -36,6 +37,9 @@ COLLECT_EVERY = timedelta(hours=24)
 MAX_PAUSE = timedelta(days=3)
 """Maximum time between two daily runs; if it was longer, the clock may be wrong, and retention waits for the next."""
 
+THIN_SECONDS = 0.5
+"""Maximum time of a run that is spent on thinning versions."""
+
 COLLECT_GRACE = timedelta(hours=6)
 """Minimum age of unreferenced data that the daily garbage collection removes; uploads may still use younger data."""
 
@@ -61,6 +65,7 @@ class _Housekeeping:
         self._content = services.leads.lead(CONTENT_LEAD)
         self._newest = datetime.now(UTC)
         self._collect_at = self._newest + COLLECT_EVERY
+        self._thinning: Iterator[None] = iter(())
 
     async def run(self) -> None:
         """Run the tasks every TICK_SECONDS, until cancelled."""
@@ -111,6 +116,7 @@ class _Housekeeping:
                 self._services.jobs.sweep()
             if datetime.now(UTC) >= self._collect_at and self._content.try_acquire():
                 self._collect()
+            self._continue_thinning()
 
     def _collect(self) -> None:
         """Collect garbage, while no backup runs."""
@@ -121,13 +127,13 @@ class _Housekeeping:
             with self._content.fenced():
                 last = store.garbage.last_run()
                 store.garbage.collect(COLLECT_GRACE)
-                self._thin(last)
+                self._thinning = self._thin(last)
                 store.search_index.merge()
         finally:
             self._content.release()
 
-    def _thin(self, last: datetime | None) -> None:
-        """Apply the rule of retention; its content goes with the next collection.
+    def _thin(self, last: datetime | None) -> Iterator[None]:
+        """Apply the rule of retention, in small steps; the content goes with the next collection.
 
         last: time of the collection before. After a long pause, or a leap of the clock, versions stay for another day:
         so a clock that is wrong for hours thins nothing.
@@ -139,10 +145,20 @@ class _Housekeeping:
             log.warning("retention: no daily run within %d days before: versions stay for now", MAX_PAUSE.days)
             return
         for plan in store.retention.plan(rule, writable_formats()):
-            removed = list(store.retention.apply(plan, rule))
-            versions, files = sum(len(r.versions) for r in removed), sum(r.files for r in removed)
+            versions = files = 0
+            for removed in store.retention.apply(plan, rule):
+                versions += len(removed.versions)
+                files += removed.files
+                yield
             if versions or files:
                 log.info("retention: environment=%s versions=%d files=%d", plan.environment, versions, files)
+
+    def _continue_thinning(self) -> None:
+        """Thin for a short time, so that planned moves of channels are not late."""
+        end = time.monotonic() + THIN_SECONDS
+        for _ in self._thinning:
+            if time.monotonic() > end:
+                break
 
 
 def _note_time(newest: datetime) -> datetime:

@@ -75,6 +75,8 @@ def test_licences_of_all_packages_are_accepted() -> None:
         ("GPL-3.0-only OR MIT", True),
         ("GNU General Public License v3 (GPLv3)", False),
         ("MIT AND GPL-3.0-or-later", False),
+        ("GPL-3.0-only AND (Apache-2.0 OR MIT)", False),
+        ("MPL-2.0 AND (Apache-2.0 OR MIT)", True),
         ("AGPL-3.0-only", False),
         ("Proprietary", False),
         ("", False),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -22,6 +23,7 @@ from app.api.http.schemas import EnvironmentPath, RequestModel, VersionPath, pro
 from app.api.http.signed import Grant
 from app.convert.cache import CachedFile
 from app.convert.maps import select_file
+from app.errors import Unavailable
 from app.store.audit import set_audit_target
 from app.store.values import Version, rfc3339
 
@@ -151,7 +153,8 @@ async def link_to(
     def sign() -> Grant:
         environment = services.store.environments.get(version.environment)
         grant = services.links.create(environment, path, values, seconds or services.links.max_seconds, principal)
-        services.store.retention.note_link(version.environment, version.number, grant.expires)
+        with contextlib.suppress(Unavailable):  # a full disk: nothing can be thinned either
+            services.store.retention.note_link(version.environment, version.number, grant.expires)
         return grant
 
     grant = await run_in_threadpool(sign)

@@ -79,8 +79,9 @@ class Retention:
         for environment_id in names:
             with self._database.snapshot() as connection:
                 row = connection.execute(select(table).where(table.c.id == environment_id, *is_own)).one_or_none()
-                if row is not None:
-                    yield self._plan(connection, row, rule, writable)
+                plan = None if row is None else self._plan(connection, row, rule, writable)
+            if plan is not None:
+                yield plan
 
     def apply(self, plan: EnvironmentPlan, rule: Rule) -> Iterator[Removed]:
         """Carry out a plan in small transactions; yields what each has removed.
@@ -94,14 +95,16 @@ class Retention:
                 row = _lock_environment(connection, plan.id)
                 if row is None:
                     return
-                yield Removed(thin(connection, row, numbers, rule.text, self._database.now(), plan.sequence))
+                removed = thin(connection, row, numbers, rule.text, self._database.now(), plan.sequence)
+            yield Removed(removed)
         for start in range(0, len(plan.files), SOURCE_BATCH):
             with self._database.write(upkeep=True) as connection:
                 row = _lock_environment(connection, plan.id)
                 if row is None:
                     return
                 some = plan.files[start : start + SOURCE_BATCH]
-                yield Removed(files=self._remove_files(connection, row, some, plan.sequence))
+                count = self._remove_files(connection, row, some, plan.sequence)
+            yield Removed(files=count)
 
     def note_link(self, environment: str, number: int, expires: datetime) -> None:
         """Note that a signed link names a version until then, so that it stays. At most one write an hour a version.

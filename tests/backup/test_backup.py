@@ -141,6 +141,7 @@ def with_keys(store: Store, folder: Path) -> str:
 def test_keys_are_in_a_backup_by_choice(store: Store, tmp_path: Path, empty_store: NewStore) -> None:
     data = tmp_path / "data"
     id_ = with_keys(store, data)
+    webhook = store.webhooks.create("https://receiver.example/hook")
     assert not back_up(store, tmp_path / "without", data).snapshot.keys
     bundle = collect_keys(store, data / "keys", None, include=True)
     assert back_up(store, tmp_path / "with", data, keys=bundle).snapshot.keys
@@ -150,12 +151,13 @@ def test_keys_are_in_a_backup_by_choice(store: Store, tmp_path: Path, empty_stor
         documents = key_documents(target, folder / "keys")
         assert sorted(documents) == (["keys", "links"] if expected else [])
         assert (signing_keys(target, folder).public()[0].id == id_) == expected
+        assert [one.secret for one in target.webhooks.all()] == ([webhook.secret] if expected else [])
         if not target.is_shared and expected:
             assert {path.stat().st_mode & 0o77 for path in (folder / "keys").iterdir()} == {0}
     with opened_place(str(tmp_path / "without"), tmp_path, key=lambda _: None) as repository:
         entries = [e for p in repository.snapshots().intact[0].packs for e in repository.read_pack(p)]
-    secret = key_documents(store, data / "keys")["keys"]
-    assert not any(secret in entry.data for entry in entries)
+    for secret in (key_documents(store, data / "keys")["keys"], webhook.secret.encode()):
+        assert not any(secret in entry.data for entry in entries)
 
 
 def test_place_with_keys_of_another_server_is_refused(

@@ -80,6 +80,7 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
   const here = site.channels.value.filter((one) => one.version === number && one.channel !== "latest");
   const planned = site.channels.value.filter((one) => one.planned?.version === number);
   const changes = changesInWords(version.changes);
+  const thinned = version.thinned;
   const row = useRef<HTMLLIElement>(null);
   useEffect(() => {
     if (isShown && param("version")) row.current?.firstElementChild?.scrollIntoView({ block: "nearest" });
@@ -90,7 +91,8 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
         type="button"
         class="version-main"
         aria-pressed={isShown}
-        title="Show on the map"
+        title={thinned ? `Its content was removed by the rule: ${thinned.rule}` : "Show on the map"}
+        disabled={Boolean(thinned)}
         onClick={() => go({ version: number })}
       >
         <span class="version-title">
@@ -104,6 +106,11 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
               {channel}: planned
             </span>
           ))}
+          {(version.tags ?? []).map((tag) => (
+            <span key={tag} class="flag">
+              {tag}
+            </span>
+          ))}
         </span>
         <span class="version-message">{message || (number === 0 ? "Created, still empty" : "No message")}</span>
         {changes.slice(0, isShown ? undefined : SHOWN_CHANGES).map((text) => (
@@ -112,6 +119,7 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
         {!isShown && changes.length > SHOWN_CHANGES && <small>and {changes.length - SHOWN_CHANGES} more</small>}
         <small>
           {author} · <Time at={time} />
+          {thinned && " · thinned"}
           {marksOf(
             version,
             others.find((one) => one.version === parent),
@@ -137,7 +145,7 @@ function VersionRow({ site, version, isShown, isHead, others, onRestore }: Versi
                 Promote…
               </Button>
             )}
-            {parent !== null && (
+            {parent !== null && !others.find((one) => one.version === parent)?.thinned && (
               <Button onClick={() => go({ from: parent, to: number })}>Compare with v{parent}</Button>
             )}
           </div>
@@ -184,7 +192,7 @@ function CompareWith({ number, others }: { number: number; others: Version[] }) 
           Compare with …
         </option>
         {others
-          .filter(({ version }) => version !== number)
+          .filter(({ version, thinned }) => version !== number && !thinned)
           .map(({ version, message }) => (
             <option key={version} value={version}>
               v{version} {message.slice(0, 60)}
