@@ -119,7 +119,7 @@ def test_refused_event_delays_only_its_environment(store: Store, receiver: Recei
     lag = eventually(lambda: store.webhooks.lags(webhook.id))[0]
     assert lag.environment == "farm"
     assert lag.attempts.error == "the receiver answered 422"
-    assert store.webhooks.count_waiting(store.webhooks.get(webhook.id)) == 61
+    eventually(lambda: store.webhooks.count_waiting(store.webhooks.get(webhook.id)) == 61)
     refuses = False
     eventually(lambda: len(receiver.sequences("farm")) == 61)
     promote(store, "farm", 1)
