@@ -1,15 +1,15 @@
 """An index of robots by the map that they run, so that those behind their channel are counted without the others.
 
-Revision ID: 0025
-Revises: 0024
+Revision ID: 0024
+Revises: 0023
 """
 
 from __future__ import annotations
 
 from alembic import op
 
-revision = "0025"
-down_revision = "0024"
+revision = "0024"
+down_revision = "0023"
 branch_labels = None
 depends_on = None
 min_compatible = "0019"

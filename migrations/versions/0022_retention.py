@@ -1,6 +1,6 @@
 """Retention: versions and files that a rule has removed, tags, and how long links name a version.
 
-Revision ID: 0023
+Revision ID: 0022
 Revises: 0021
 """
 
@@ -11,7 +11,7 @@ from alembic import op
 
 from app.store.column_types import UtcDateTime
 
-revision = "0023"
+revision = "0022"
 down_revision = "0021"
 branch_labels = None
 depends_on = None
