@@ -256,7 +256,6 @@ Case = tuple[str, str, str, Callable[[Place], Site]]
 
 CASES: list[Case] = [
     ("backup", "ok", "last backup", lambda p: with_backup(p, timedelta(hours=3))),
-    ("backup", "ok", "keeps no record", lambda p: p.site()),
     ("backup", "warning", "3 days old", lambda p: with_backup(p, timedelta(days=3, hours=1))),
     ("backup", "warning", "no backup", lambda p: with_backup(p, None)),
     ("backup", "warning", "1 backups failed since: disk full", with_failed_backup),
