@@ -114,6 +114,11 @@ CASES: Mapping[str, tuple[int, Series, Series]] = {
         {server("fleetmap_scrub_age_seconds"): "+Inf " * 361},
         {server("fleetmap_scrub_age_seconds"): "+Inf " * 312 + "60x48"},
     ),
+    "FleetmapWebhookFailing warning": (
+        10,
+        {server("fleetmap_webhook_failing_seconds", webhook="a"): constant(7200, 30)},
+        {server("fleetmap_webhook_failing_seconds", webhook="a"): constant(600, 30)},
+    ),
     "FleetmapBackupOld warning": (
         70,
         {server("fleetmap_backup_age_seconds"): constant(3 * DAY, 90)},
