@@ -17,7 +17,7 @@ from typing import Any
 
 from tests.api.conftest import Api
 
-FOLDER = Path(__file__).resolve().parents[1] / "samples" / "releases"
+FOLDER = Path(__file__).with_name("published")
 MAX_BYTES = 200_000
 FORMATS = ("tmap2", "geojson", "nav2_route", "occupancy_grid?level=*&grid=*", "kml", "datum", "openrmf", "lif")
 FILES = ("fleetmap.sqlite3", "blobs", "keys", "links.json")
