@@ -26,15 +26,17 @@ def show(server: options.Server = None, token: options.Token = None, as_json: op
     if as_json:
         output.show_json(rows)
         return
-    members = ("id", "url", "environments", "delivered", "waiting", "next_try", "error")
-    output.show_table(members, ([_cell(row.get(member)) for member in members] for row in rows))
+    members = ("id", "url", "environments", "waiting", "delivered")
+    shown = [
+        {**row, "environments": row["environments"] or "all", "delivered": output.minute(row["delivered"])}
+        for row in rows
+    ]
+    output.show_table(members, ([row[member] for member in members] for row in shown))
     for row in rows:
+        if row["error"]:
+            output.print_status(f"{row['id']}: next try {output.minute(row['next_try'])}: {row['error']}")
         for waiting in row["refused"]:
             output.print_status(f"{row['id']}: {waiting['environment']} waits: {waiting['error']}")
-
-
-def _cell(value: object) -> object:
-    return "" if value is None else value
 
 
 @commands.command("add")

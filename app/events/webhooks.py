@@ -198,7 +198,8 @@ class Courier:
         if not _is_time(self._attempts):
             return False
         self._lags = {lag.environment_id: lag for lag in self._store.webhooks.lags(webhook.id)}
-        return last > self._position or any(_is_time(lag.attempts) for lag in self._lags.values())
+        is_stored = self._delivered is None
+        return not is_stored or last > self._position or any(_is_time(lag.attempts) for lag in self._lags.values())
 
     def run(self, is_ending: Callable[[], bool]) -> None:
         """Send what there is, until ``is_ending()``. Logs errors: the next call continues."""

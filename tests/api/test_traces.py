@@ -152,7 +152,7 @@ def test_tasks_of_the_queue_and_events_have_spans(receiver: Receiver) -> None:
     queue.close()
     event = SimpleNamespace(environment="farm", body={"type": "version.created"}, sequence=7)
     published: list[Any] = []
-    Relay._publish(SimpleNamespace(_bus=SimpleNamespace(publish=lambda *one: published.append(one))), event)  # type: ignore[arg-type]
+    Relay._publish(SimpleNamespace(_outlet=SimpleNamespace(publish=lambda *one: published.append(one))), event)  # type: ignore[arg-type]
     queue._threads.shutdown(wait=True)
     traces.stop(60)
     assert seen == [trace], "the thread goes on with the trace of the request"

@@ -21,7 +21,7 @@ def test_upload_creates_a_version(api: Api, bare: str) -> None:
     assert answer.headers["etag"] == '"1"'
     assert set(body) == {
         "environment", "version", "root", "parent", "author", "message", "time", "changes", "sources", "warnings",
-        "information", "stale",
+        "information", "stale", "tags",
     }  # fmt: skip
     assert (body["environment"], body["version"], body["parent"]) == (bare, 1, 0)
     assert (body["author"], body["message"]) == ("administrator", "driven today")

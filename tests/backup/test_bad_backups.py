@@ -158,8 +158,13 @@ def test_backup_of_an_older_release_is_migrated(
 ) -> None:
     """Columns and tables that the newer release added are absent in the backup."""
     older = "0020"
-    added = {"mirror", "delegation", "edge_change"}
-    columns = {"centre", "centre_epoch", "edge_sequence"}
+    added = {"mirror", "delegation", "edge_change", "version_tag", "webhook", "webhook_lag"}
+    columns = {
+        "environment": {"centre", "centre_epoch", "edge_sequence"},
+        "version": {"thinned", "thinned_rule", "linked"},
+        "source": {"removed"},
+        "collection": {"thinned"},
+    }
     snapshot = back_up(store, tmp_path / "backup", tmp_path / "data").snapshot
     expected = rows_of(store)
     target = empty_store()
@@ -182,28 +187,31 @@ def test_backup_of_an_older_release_is_migrated(
 
 
 def older_snapshot(
-    repository: Repository, snapshot: Snapshot, revision: str, tables: set[str], columns: set[str]
+    repository: Repository, snapshot: Snapshot, revision: str, tables: set[str], columns: dict[str, set[str]]
 ) -> Snapshot:
-    """Write a manifest as the release before would have, with the rows of environments without the new columns."""
-    wanted = {t.name: t for t in snapshot.tables}["environment"]
+    """Write a manifest as an older release would have, with rows without the new columns, by table."""
     entries = {
         object_name(repository.key, Kind.SEGMENT, e.name).hex(): e.data
         for pack in snapshot.packs
         for e in repository.read_pack(pack)
         if e.kind is Kind.SEGMENT
     }
-    kept = [k for k, name in enumerate(wanted.columns) if name not in columns]
-    rows = [row for name in wanted.segments for row in ormsgpack.unpackb(decompress(entries[name]))]
-    segment = ormsgpack.packb([[row[k] for k in kept] for row in rows])
     writer = repository.writer()
-    writer.add(Kind.SEGMENT, digest(segment), compress(segment))
+    older = []
+    for table in snapshot.tables:
+        if table.name in tables:
+            continue
+        kept = [k for k, name in enumerate(table.columns) if name not in columns.get(table.name, ())]
+        rows = [row for name in table.segments for row in ormsgpack.unpackb(decompress(entries[name]))]
+        if table.name in columns and rows:
+            segment = ormsgpack.packb([[row[k] for k in kept] for row in rows])
+            writer.add(Kind.SEGMENT, digest(segment), compress(segment))
+            segments = (object_name(repository.key, Kind.SEGMENT, digest(segment)).hex(),)
+            table = dataclasses.replace(table, segments=segments)
+        older.append(dataclasses.replace(table, columns=tuple(table.columns[k] for k in kept)))
     writer.flush()
-    name = object_name(repository.key, Kind.SEGMENT, digest(segment)).hex()
-    names = tuple(wanted.columns[k] for k in kept)
-    environment = dataclasses.replace(wanted, columns=names, segments=(name,))
-    rest = [environment if t.name == "environment" else t for t in snapshot.tables if t.name not in tables]
     packs = (*snapshot.packs, *writer.packs)
-    return dataclasses.replace(snapshot, revision=revision, tables=tuple(rest), packs=packs)
+    return dataclasses.replace(snapshot, revision=revision, tables=tuple(older), packs=packs)
 
 
 def test_forged_pack_writes_nothing_elsewhere(

@@ -246,7 +246,7 @@ class Container:
         """Start the service; its output is appended to ``log``."""
         program, *arguments = self._program(self.command), *self.command[1:]
         with (self.folder / "log").open("ab") as log:
-            if Path(program).name == "fleetmap":
+            if Path(program).name == "fleetmap" and arguments[0] != "agent":
                 self.process = PreloadedProcess(arguments, env=self.environment, cwd=Path(self.workdir), output=log)
                 return self.process
             self.process = subprocess.Popen(

@@ -95,7 +95,8 @@ def test_robot_of_the_compose_file_syncs_with_tls_and_user(site: PostgresSite, t
     agent = Container(compose, "agent")
     with agent.running():
         maps = agent.folder / "var/lib/fleetmap/maps/current/tmap2/network.tmap2.yaml"
-        eventually(maps.is_file)
+        eventually(lambda: maps.is_file() or agent.process.poll() is not None)
+        assert maps.is_file(), agent.log
         state = eventually(lambda: next((r for r in site.call(site.https, "GET", "robots") if r["online"]), None))
         assert (state["robot"], state["version"]) == (ROBOT, 1), "its presence is announced over Zenoh"
         before = maps.read_text()
