@@ -58,7 +58,7 @@ def test_image_serves_maps_from_postgis_over_https(
     site: PostgresSite, offline: Fleetmap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = site.containers["server"]
-    assert server.run(server.healthcheck).returncode == 0
+    eventually(lambda: server.run(server.healthcheck).returncode == 0)  # its database may answer late for a moment
     assert site.https.get("/readyz").status_code == 200
     assert site.https.get("/api/v1/environments", headers={"Authorization": ""}).status_code == 401
     with pytest.raises(httpx.ConnectError, match="CERTIFICATE_VERIFY_FAILED"):
