@@ -17,7 +17,7 @@ from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
 from tests.certificates import Authority
-from tests.events.conftest import free_port
+from tests.ports import free_port
 
 USER, PASSWORD = "fleet", "correct horse: battery@staple/ü"
 

@@ -10,7 +10,6 @@ import os
 import pwd
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import time
@@ -24,6 +23,8 @@ import psycopg
 import pytest
 import yaml
 from psycopg import sql
+
+from tests.ports import free_port
 
 FOLDERS = ("/usr/local/bin", *(f"/usr/lib/postgresql/{n}/bin" for n in range(20, 12, -1)))
 
@@ -127,12 +128,6 @@ def _as_user() -> tuple[list[str], int | None]:
     return [], None
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture(scope="session")
 def postgres_cluster() -> Iterator[Cluster]:
     """Cluster; skips if PostgreSQL or PostGIS is not installed, and fails if CI is set."""
@@ -172,7 +167,7 @@ def running_cluster() -> Iterator[Cluster]:
         if process.returncode:
             pytest.fail(f"initdb failed: {process.stderr}")
         for _ in range(5):
-            cluster = Cluster(_free_port(), folder, data, run)
+            cluster = Cluster(free_port(), folder, data, run)
             started = cluster.start()
             if started.returncode == 0:
                 break

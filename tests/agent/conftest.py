@@ -22,7 +22,8 @@ import pytest
 
 from tests.agent.fake import Fake
 from tests.api import samples
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import eventually
+from tests.ports import free_port
 
 if sys.version_info >= (3, 11):  # the server's
     from tests.api.conftest import ADMIN, Api, running, settings_for

@@ -21,7 +21,8 @@ from app.agent.zenoh_client import ZenohClient
 from app.events import messages
 from tests.agent.conftest import whole
 from tests.agent.fake import PLACE, Fake, One, run, send
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import eventually
+from tests.ports import free_port
 
 A, B = {"kml/map.kml": b"a" * 5000}, {"kml/map.kml": b"b" * 6000}
 

@@ -17,7 +17,8 @@ from app.events.router import Router
 from tests.agent.conftest import ROOT, Gate, Robot, Start, network, whole
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.cli.conftest import ServerProcess
-from tests.events.conftest import client_config, eventually, free_port
+from tests.events.conftest import client_config, eventually
+from tests.ports import free_port
 
 
 def test_interrupted_download_is_resumed(api: Api, place: str, robot: Start, gate: Gate) -> None:

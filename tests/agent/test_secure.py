@@ -18,8 +18,9 @@ from app.events.credentials import ZenohCredentials
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import eventually
 from tests.events.test_fleet import robot_of
+from tests.ports import free_port
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from app.agent.options import AgentOptions
 from app.cli import run
 from tests.api import samples
 from tests.api.conftest import ADMIN, Api, running, settings_for
-from tests.events.conftest import free_port
+from tests.ports import free_port
 
 Output = pytest.CaptureFixture[str]
 

@@ -37,6 +37,7 @@ from tests.bench import (
     servers,
     sizing,
 )
+from tests.ports import free_port
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -124,7 +125,7 @@ def conversions(tries: int) -> list[dict[str, Any]]:
 def serving(tries: int) -> list[dict[str, Any]]:
     """Measure a server: first GET against the bare conversion, repeated GETs against a bare Starlette route."""
     rows: list[dict[str, Any]] = []
-    port, peer = http.free_port(), http.free_port()
+    port, peer = free_port(), free_port()
     token = "bench-" + "0" * 40
     with tempfile.TemporaryDirectory() as folder:
         env = {"FLEETMAP_DATA_DIR": folder, "FLEETMAP_ADMIN_TOKEN": token, "FLEETMAP_MAX_UPLOADS_WAITING": "64"}

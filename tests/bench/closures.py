@@ -20,8 +20,8 @@ import httpx
 from app.agent.agent import Agent
 from app.agent.options import AgentOptions
 from app.events import messages
-from tests.bench import http
 from tests.bench.events import ENVIRONMENT, TOKEN, serve_network
+from tests.ports import free_port
 
 ROBOTS = 100
 PROCESSES = 10
@@ -32,7 +32,7 @@ CHANNEL = "production"
 
 def rows() -> list[dict[str, Any]]:
     """Measure the median, the 99th of 100 and the slowest agent; every closure is accepted and ended again."""
-    port, zenoh_port = http.free_port(), http.free_port()
+    port, zenoh_port = free_port(), free_port()
     # 100 robots have 100 disks: put their folders into memory if possible.
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with (

@@ -32,6 +32,7 @@ from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
 from tests.bench import changes, http
+from tests.ports import free_port
 
 SESSIONS = 100
 COMMITS = 30
@@ -124,7 +125,7 @@ def latency() -> list[dict[str, Any]]:
     The reference is a bare session that puts the same bytes to plain subscribers of the same sessions. The time of the
     commit is the last change of the store's commit counter (``app.backends.notify``) before the first delivery.
     """
-    port, zenoh_port = http.free_port(), http.free_port()
+    port, zenoh_port = free_port(), free_port()
     with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:
         sessions = [open_session(zenoh_port) for _ in range(SESSIONS)]
         arrived: list[tuple[float, bytes]] = []
@@ -311,7 +312,7 @@ class _Robots:
 
 def convergence() -> list[dict[str, Any]]:
     """Measure the time from a router's restart until all 500 agents run a change committed meanwhile."""
-    port, zenoh_port = http.free_port(), http.free_port()
+    port, zenoh_port = free_port(), free_port()
     endpoint = f"tcp/127.0.0.1:{zenoh_port}"
     options = router_configuration(BusOptions(listen=endpoint))
     router = Router(options)
@@ -386,7 +387,7 @@ def conversions(client: httpx.Client) -> int:
 
 def costs() -> list[dict[str, Any]]:
     """Measure the bytes for small changes of a real site."""
-    port, zenoh_port = http.free_port(), http.free_port()
+    port, zenoh_port = free_port(), free_port()
     with tempfile.TemporaryDirectory() as folder, serve_network(Path(folder), port, zenoh_port) as client:
 
         def upload(env: str, files: dict[str, bytes]) -> None:

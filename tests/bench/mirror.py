@@ -20,6 +20,7 @@ from app.store.store import Store
 from tests.bench import http
 from tests.bench.scale import commit_grid, rooms, stored_bytes
 from tests.bench.scale_site import NODES, TOPOLOGY, joined, name_of, network
+from tests.ports import free_port
 
 TOKEN = "bench-" + "0" * 40
 BOUND = 1.1
@@ -42,7 +43,7 @@ def rows() -> list[dict[str, Any]]:
         dice = np.random.default_rng(7)
         cells = rooms(2000, 2500)
         last = _begin(there, cells)
-        port = http.free_port()
+        port = free_port()
         env = {"FLEETMAP_DATA_DIR": str(place), "FLEETMAP_DATABASE_URL": url, "FLEETMAP_ADMIN_TOKEN": TOKEN}
         env |= {"FLEETMAP_ZENOH_MODE": "off", "FLEETMAP_SCRUB_HOURS": "0", "FLEETMAP_LOG_LEVEL": "warning"}
         command = [sys.executable, "-m", "app.cli", "serve", "--host", "127.0.0.1", "--port", str(port)]

@@ -36,6 +36,7 @@ from app.store.store import Store
 from app.store.values import Source
 from tests.bench import http
 from tests.bench.scale_site import TOPOLOGY, datum_of, fill, name_of, network
+from tests.ports import free_port
 from tests.postgres import running_cluster
 
 ROUNDS = 100
@@ -111,7 +112,7 @@ def _cpu_clock(process: int, database: str) -> Iterator[Callable[[], float]]:
 
 @contextlib.contextmanager
 def _server(database: str, folder: Path, environments: int) -> Iterator[_Site]:
-    port = http.free_port()
+    port = free_port()
     env = {"FLEETMAP_DATA_DIR": str(folder), "FLEETMAP_DATABASE_URL": database, "FLEETMAP_ADMIN_TOKEN": TOKEN}
     env |= {
         "FLEETMAP_LOG_LEVEL": "warning",

@@ -30,6 +30,7 @@ from rich.table import Table
 from app import native
 from tests.bench import http
 from tests.bench.events import TOKEN, network
+from tests.ports import free_port
 from tests.postgres import Cluster, running_cluster
 
 ENVIRONMENT = "field"
@@ -169,7 +170,7 @@ def serving(folder: Path, stored: Callable[[], int], **settings: str) -> Iterato
     """Run a server."""
     compiled = Path(tempfile.gettempdir()) / f"fleetmap-bench-native-{os.getuid()}"
     native.fill(compiled)  # else its workers compile during the measurement
-    port = http.free_port()
+    port = free_port()
     env = {
         "NUMBA_CACHE_DIR": str(compiled),
         "FLEETMAP_DATA_DIR": str(folder),
@@ -267,7 +268,7 @@ def measure_event(folder: Path) -> float:
     """Measure an event: moves of a channel on a server with a Zenoh router, against one without."""
     costs = []
     for mode in ("off", "router"):
-        listen = f"tcp/127.0.0.1:{http.free_port()}"
+        listen = f"tcp/127.0.0.1:{free_port()}"
         (folder / mode).mkdir()
         with serving(folder / mode, lambda: 0, zenoh_mode=mode, zenoh_listen=listen) as server:
             prepare(server)

@@ -20,7 +20,7 @@ import pytest
 
 from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess
-from tests.events.conftest import free_port
+from tests.ports import free_port
 
 ROUNDS = max(1, int(os.environ.get("FLEETMAP_CHAOS", "4")) // 8)
 SEED = int(os.environ.get("FLEETMAP_CHAOS_SEED", "5"))

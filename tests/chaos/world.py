@@ -26,8 +26,9 @@ from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN
 from tests.chaos import collector
 from tests.cli.conftest import ServerProcess, seconds_until_healthy
-from tests.events.conftest import Listener, client_config, eventually, free_port
+from tests.events.conftest import Listener, client_config, eventually
 from tests.events.receiver import Receiver
+from tests.ports import free_port
 from tests.postgres import Cluster
 
 ENVIRONMENT = "farm"

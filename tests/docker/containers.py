@@ -12,7 +12,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -21,6 +20,7 @@ from typing import Any
 
 import yaml
 
+from tests.ports import free_port
 from tests.preloaded import PreloadedProcess
 
 TOP = Path(__file__).resolve().parents[2]
@@ -56,13 +56,6 @@ def image(file: str = "Dockerfile") -> dict[str, Any]:
         elif word == "HEALTHCHECK":
             configuration["healthcheck"] = json.loads(argument[argument.index("CMD") + 3 :])
     return configuration
-
-
-def free_ports(count: int) -> list[int]:
-    """Return different unused loopback ports."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [int(one.getsockname()[1]) for one in sockets]
 
 
 def with_defaults(text: str, values: Mapping[str, str] | None = None) -> str:
@@ -114,7 +107,7 @@ class Compose:
         networks = [network or {} for network in described.get("networks", {}).values()]
         self.subnets = [one["subnet"] for network in networks for one in network.get("ipam", {}).get("config", ())]
         keys = [(name, port) for name, service in self.services.items() for port in _container_ports(service)]
-        self.ports = dict(zip(keys, free_ports(len(keys)), strict=True))
+        self.ports = {key: free_port() for key in keys}
         self.published = {
             host: self.ports[name, port]
             for name, service in self.services.items()
@@ -171,7 +164,7 @@ class Container:
         command = (*entrypoint, *(service.get("command") or configuration["cmd"]))
         self.command = [self.translate(word) for word in command]
         if "seaweedfs" in service["image"]:
-            self.command += [f"-{option}={port}" for option, port in zip(STORE_PORTS, free_ports(6), strict=True)]
+            self.command += [f"-{option}={free_port()}" for option in STORE_PORTS]
         self.healthcheck = configuration.get("healthcheck", [])
         self.workdir = self.translate(configuration["workdir"])
         self._mount(service, volumes)

@@ -177,6 +177,8 @@ def test_events_go_on_when_a_router_stops_and_comes_back(site: Site) -> None:
         eventually(lambda: all(site.is_connected(name) for name in SERVERS))
         site.start_router("router-1")
         with site.robot_session("router-1") as other:
+            publishers = "fleetmap/mesh/events/@adv/pub/**"
+            eventually(lambda: list(other.liveliness().get(publishers)))  # the routers have joined again
             late = Listener(other, "fleetmap/mesh/events")
             site.upload(site.https, "mesh", 0.5)
             late.wait(lambda e: sorted(e.sequences()) == [1, 2, 3])

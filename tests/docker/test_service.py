@@ -19,8 +19,9 @@ import pytest
 
 from app.events.credentials import ca_ssl_context
 from tests.agent.conftest import network
-from tests.docker.containers import DOCKER, TOP, free_ports
+from tests.docker.containers import DOCKER, TOP
 from tests.events.conftest import eventually
+from tests.ports import free_port
 
 UNITS = ("fleetmap-server.service", "fleetmap-agent.service")
 EXPOSURE = {"fleetmap-server.service": 2.5, "fleetmap-agent.service": 5.5}
@@ -124,7 +125,7 @@ def test_systemd_accepts_the_unit(name: str, tmp_path: Path) -> None:
 
 
 def test_services_of_the_docs_run_with_tls_and_users(machine: Path) -> None:
-    port, zenoh_port = free_ports(2)
+    port, zenoh_port = free_port(), free_port()
     text = (machine / "etc/systemd/system/fleetmap-server.service").read_text()
     changes = {
         "FLEETMAP_HOST": "127.0.0.1",

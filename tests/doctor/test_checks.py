@@ -28,7 +28,7 @@ from app.pool import Pool
 from app.store.backups import BackupRecord
 from tests.api.conftest import Api, empty_database, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import free_port
+from tests.ports import free_port
 from tests.postgres import Cluster
 
 NOW = datetime.now(UTC)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import sys
 import threading
 import time
@@ -15,14 +14,10 @@ import pytest
 import zenoh
 from zenoh import ext
 
+from tests.ports import free_port
+
 if sys.version_info >= (3, 11):  # the server's; the agent's tests run on 3.10, too
     from tests.api.conftest import Api, running, settings_for
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 def client_config(port: int, **more: Any) -> zenoh.Config:

@@ -17,8 +17,9 @@ from app.events.relay import Relay
 from app.store.store import Store
 from tests.api.conftest import Api, empty_database, running, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import eventually
 from tests.mosquitto import PASSWORD, USER, Broker, Subscriber
+from tests.ports import free_port
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ from app.errors import Damaged
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.api.conftest import problem as problem_of
-from tests.events.conftest import client_config, eventually, free_port, status_payload
+from tests.events.conftest import client_config, eventually, status_payload
+from tests.ports import free_port
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,8 @@ from app.events.router import Router
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
-from tests.events.conftest import Listener, client_config, eventually, free_port, nothing
+from tests.events.conftest import Listener, client_config, eventually, nothing
+from tests.ports import free_port
 
 
 def network(k: int) -> bytes:

@@ -32,8 +32,9 @@ from app.events.ros_names import EnvironmentSelector
 from app.events.router import Router
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
-from tests.events.conftest import client_config, eventually, free_port
+from tests.events.conftest import client_config, eventually
 from tests.events.test_relay import router_of
+from tests.ports import free_port
 
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 UPDATE = (
@@ -438,6 +439,7 @@ def test_ros2_publishes_derived_content_when_enabled(tmp_path: Path) -> None:
             ros2_keys="ros2dds",
         )
     ) as api:
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"network.tmap2.yaml": samples.tmap2()})
         with zenoh.open(client_config(port)) as session:

@@ -27,9 +27,10 @@ from app.main import check_bus as check_settings
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import Listener, client_config, eventually, free_port, nothing, status_payload
+from tests.events.conftest import Listener, client_config, eventually, nothing, status_payload
 from tests.events.test_fleet import robot_of
 from tests.events.test_ros2 import GRID, STRING, Heard, grid_of, tokens
+from tests.ports import free_port
 
 REFUSED_SECONDS = 1.0
 """A client that is refused tries so long: Zenoh does not tell it why, it goes on trying."""

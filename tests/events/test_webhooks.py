@@ -23,8 +23,9 @@ from app.store.store import Store
 from app.store.webhooks import Webhook
 from tests.api.conftest import empty_database
 from tests.certificates import Authority
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import eventually
 from tests.events.receiver import Answer, Receiver, drip, flood
+from tests.ports import free_port
 
 CHANNELS = itertools.count()
 LOOPBACK = OutgoingRules(networks=(ipaddress.ip_network("127.0.0.0/8"),))

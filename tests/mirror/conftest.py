@@ -15,7 +15,7 @@ from app.mirror.follow import Mirror
 from app.signing import Keys
 from app.store.store import Store
 from tests.api.conftest import Api, empty_database, running, settings_for
-from tests.events.conftest import free_port
+from tests.ports import free_port
 
 
 class Wire(httpx.BaseTransport):

@@ -18,7 +18,8 @@ from app.events.router import Router
 from tests.agent.conftest import ROOT
 from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import eventually
+from tests.ports import free_port
 from tests.postgres import Cluster
 
 
