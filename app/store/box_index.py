@@ -1,14 +1,15 @@
-"""Indexes of SQLite that find environments by box and by text, and areas by position; triggers keep them.
+"""Indexes that find environments by text, and SQLite's by box and areas by position; triggers keep them.
 
 PostgreSQL has GiST for boxes. An index is used where it leaves few rows: a list of environments in the order of their
-names is faster if most of them match.
+names is faster if most of them match. PostgreSQL decides that itself.
 """
 
 from __future__ import annotations
 
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Select, and_, column, func, or_, select, table, tuple_
+from sqlalchemy import ColumnElement, Connection, Select, and_, cast, column, func, literal, or_, select, table, tuple_
+from sqlalchemy.dialects.postgresql import TSQUERY
 
 from app.store import tables
 from app.store.grams import GRAM, wanted_grams
@@ -21,6 +22,8 @@ MANY: Final = 500
 _NUMBER: Final = table("box_number", column("number"), column("environment_id"), column("piece"))
 _TREE: Final = table("box_tree", *(column(name) for name in ("number", "west", "east", "south", "north")))
 _TEXT: Final = table("environment_text", column("rowid"), column("environment_text"))
+_GRAMS: Final = table("environment_text", column("environment_id"), column("grams"))
+"""PostgreSQL's index of the same texts."""
 
 _WHOLE: Final = -1
 """Piece that stands for an environment's extent."""
@@ -31,6 +34,8 @@ def few_environments(connection: Connection, q: str | None, box: Box | None) -> 
 
     q: text in name, title, description or tags. box: west, south, east, north; west > east: antimeridian.
     """
+    if connection.dialect.name == "postgresql":
+        return [tables.environment.c.id.in_(_with_text(q.lower()))] if q else []
     choices: list[Select[Any]] = []
     if q is not None and len(q) >= GRAM:
         text = _TEXT.c.environment_text.op("MATCH")(wanted_grams(q.lower(), sqlite=True))
@@ -43,6 +48,11 @@ def few_environments(connection: Connection, q: str | None, box: Box | None) -> 
         if connection.execute(select(func.count()).select_from(some)).scalar_one() <= MANY:
             out.append(tables.environment.c.id.in_(chosen))
     return out
+
+
+def _with_text(needle: str) -> Select[Any]:
+    wanted = cast(literal(wanted_grams(needle, sqlite=False)), TSQUERY)
+    return select(_GRAMS.c.environment_id).where(_GRAMS.c.grams.op("@@")(wanted))
 
 
 def pieces_around(longitude: float, latitude: float) -> ColumnElement[bool]:

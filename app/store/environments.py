@@ -142,7 +142,7 @@ class Environments:
         out: list[Environment] = []
         after = cursor
         with self._database.read() as connection:
-            if self._database.sqlite and not deleted:
+            if not deleted:
                 query = query.where(*few_environments(connection, q, bbox))
             while len(out) <= limit:
                 page = query if after is None else query.where(table.c.name > after)

@@ -1,15 +1,16 @@
-"""Indexes of SQLite for boxes and texts of environments: the same results as without them."""
+"""Indexes for boxes and texts of environments: the same results as without them."""
 
 from __future__ import annotations
 
 import random
 
 import pytest
-from sqlalchemy import true
+from sqlalchemy import text, true
 
 from app.model.frame import Datum
-from app.store import box_index
+from app.store import environments
 from app.store import position as position_module
+from app.store.base import MAX_TEXT
 from app.store.changes import Changes, Replace
 from app.store.store import Store
 from tests.store.conftest import count
@@ -18,8 +19,8 @@ from tests.store.samples import TOPOLOGY, network, save
 PLACES = [(0.0, 10.0), (0.5, 10.5), (52.0, 179.9995), (52.0, -179.9995), (-40.0, -70.0)]
 
 
-def test_indexes_change_no_result(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    store, dice = sqlite_store, random.Random(2)
+def test_indexes_change_no_result(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    dice = random.Random(2)
     for k in range(15):
         latitude, longitude = PLACES[k % 5]
         datum = Datum(latitude, longitude, 0.0, 0.0)
@@ -41,18 +42,33 @@ def test_indexes_change_no_result(sqlite_store: Store, monkeypatch: pytest.Monke
     boxes += [(179.0, 51.0, -179.0, 53.0), (-180.0, -90.0, 180.0, 90.0), (10.5001, 0.5, 10.6, 0.6)]
     for q in queries:
         for box in (None, *dice.sample(boxes, 3)):
-            names = []
-            for many in (500, -1):
-                monkeypatch.setattr(box_index, "MANY", many)
-                names.append([e.name for e in store.environments.page(q=q, bbox=box)[0]])
-            assert names[0] == names[1], (q, box)
+            names = [e.name for e in store.environments.page(q=q, bbox=box)[0]]
+            with monkeypatch.context() as without:
+                without.setattr(environments, "few_environments", lambda *_: [])
+                assert names == [e.name for e in store.environments.page(q=q, bbox=box)[0]], (q, box)
     positions = [(latitude + d, longitude) for latitude, longitude in PLACES for d in (0.0, 0.0004, 0.003)]
     by_index = [store.areas.locate(*position)[0] for position in positions]
-    monkeypatch.setattr(position_module, "pieces_around", lambda x, y: true())
-    assert by_index == [store.areas.locate(*position)[0] for position in positions]
+    with monkeypatch.context() as without:
+        without.setattr(position_module, "pieces_around", lambda x, y: true())
+        assert by_index == [store.areas.locate(*position)[0] for position in positions]
     assert sum(map(len, by_index)) > 10
     for environment in store.environments.page()[0]:
         store.environments.delete(environment.name)
         store.environments.purge(environment.name)
-    remains = ("box_number", "box_tree", "environment_text WHERE environment_text MATCH 'sit OR yar OR fie'")
-    assert [count(store, rows) for rows in remains] == [0, 0, 0]
+    remains = ["environment_text"]
+    if store._database.sqlite:
+        remains = ["box_number", "box_tree", "environment_text WHERE environment_text MATCH 'sit OR yar OR fie'"]
+    assert [count(store, rows) for rows in remains] == [0] * len(remains)
+
+
+@pytest.mark.postgres
+@pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
+def test_postgresql_finds_texts_by_their_groups_of_characters(store: Store) -> None:
+    """The groups that the database computes are those that a query asks for, also of the longest text."""
+    description = "Grüße\n" + "ab" * (MAX_TEXT // 3)
+    store.environments.create("a", title="x" * 7, description=description)
+    assert [e.name for q in ("üße\nab", "ba", "x" * 8) for e in store.environments.page(q=q)[0]] == ["a", "a"]
+    with store._database.read() as connection:
+        stored = connection.execute(text("SELECT tsvector_to_array(grams) FROM environment_text")).scalar_one()
+    characters = f"a\n{'x' * 7}\n{description.lower()}\n[]"
+    assert set(stored) == {characters[k : k + 3] for k in range(len(characters))}
