@@ -61,8 +61,8 @@ def list_jobs(
     Administrators with a token for all environments see all jobs.
     """
     every = principal.role == "admin" and principal.environments is None
-    visible_jobs = (job for job in reversed(services.store.jobs.all()) if every or job.owner == principal.id)
-    bodies = (body for body in map(job_as_json, visible_jobs) if state in (None, body["state"]))
+    jobs = services.store.jobs.newest(None if every else principal.id)
+    bodies = (body for body in map(job_as_json, jobs) if state in (None, body["state"]))
     return json_response(list(itertools.islice(bodies, limit)))
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from datetime import timedelta
-from typing import Any
+from typing import Any, Final
 
-from sqlalchemy import Row, bindparam, delete, insert, select, text, update
+from sqlalchemy import Row, bindparam, delete, insert, select, text, tuple_, update
 
 from app.errors import NotFound
 from app.progress import Progress
@@ -23,6 +23,9 @@ KEPT = timedelta(days=7)
 """How long a finished job of a task is kept for its client; one that no client was told of: FORGOTTEN."""
 
 FORGOTTEN = timedelta(minutes=1)
+
+PAGE: Final = 200
+"""Number of jobs that a list reads at a time."""
 
 _LOST = text(
     "SELECT task FROM job WHERE task IS NOT NULL AND state IN ('queued', 'running') AND updated < :before"
@@ -184,14 +187,20 @@ class Jobs:
             raise NotFound(f"unknown job {id[:80]!r}")
         return _as_job(row)
 
-    def all(self, *, state: State | None = None) -> list[Job]:
-        """List jobs, oldest first."""
+    def newest(self, owner: str | None = None) -> Iterator[Job]:
+        """Read the jobs of an owner (None: of all), newest first, some at a time."""
         table = tables.job
-        query = select(table).order_by(table.c.created, table.c.id)
-        if state is not None:
-            query = query.where(table.c.state == state)
-        with self._database.read() as connection:
-            return [_as_job(r) for r in connection.execute(query)]
+        query = select(table).order_by(table.c.created.desc(), table.c.id.desc()).limit(PAGE)
+        query = query if owner is None else query.where(table.c.owner == owner)
+        page = query
+        while True:
+            with self._database.read() as connection:
+                rows = connection.execute(page).all()
+            yield from map(_as_job, rows)
+            if len(rows) < PAGE:
+                return
+            last = rows[-1]
+            page = query.where(tuple_(table.c.created, table.c.id) < (last.created, last.id))
 
     def delete(self, id: str) -> None:
         """Delete a job. Raises NotFound."""

@@ -476,15 +476,24 @@ def test_jobs_are_stored_updated_and_deleted(store: Store):
     assert (job.state, job.progress, job.owner, job.detail) == ("queued", 0.0, "ann", "waiting")
     job = store.jobs.update(job.id, state="running", progress=0.5, detail="half")
     assert (job.state, job.progress, job.detail) == ("running", 0.5, "half")
-    assert [j.id for j in store.jobs.all(state="running")] == [job.id]
     job = store.jobs.update(job.id, state="done", progress=7.0, result={"url": "/x", "n": 1.0})
     assert (job.progress, job.result) == (1.0, {"url": "/x", "n": 1.0})
     assert store.jobs.update(job.id, state="cancelled").state == "done"
-    assert store.jobs.get(job.id) == store.jobs.all()[0]
+    assert store.jobs.get(job.id) == next(store.jobs.newest())
     store.jobs.delete(job.id)
     for call in (store.jobs.get, store.jobs.delete, store.jobs.update):
         with pytest.raises(NotFound):
             call(job.id)
+
+
+def test_jobs_are_read_newest_first_some_at_a_time(store: Store, monkeypatch: pytest.MonkeyPatch):
+    created = [store.jobs.create(owner=f"ann-{k % 2}", detail="").id for k in range(7)]
+    expected = [job.id for job in sorted(map(store.jobs.get, created), key=lambda j: (j.created, j.id), reverse=True)]
+    own = [job_id for job_id in expected if created.index(job_id) % 2]
+    for page in (200, 3, 1):
+        monkeypatch.setattr("app.store.jobs.PAGE", page)
+        assert [job.id for job in store.jobs.newest()] == expected
+        assert [job.id for job in store.jobs.newest("ann-1")] == own
 
 
 def test_version_changes_name_level_of_parts_with_equal_names(store: Store):
