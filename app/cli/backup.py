@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from app.signing import SigningKeys
     from app.store.store import Store
 
-NICENESS = 19
+NICENESS = 10
 """How much a backup stands back behind the server for processors."""
 
 DatabaseUrl = Annotated[str | None, typer.Option("--database-url", help="Database [default: FLEETMAP_DATABASE_URL].")]
