@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -136,9 +136,11 @@ def finish_site(site: Site, options: SiteOptions, notes: DerivationNotes, *, gro
 def free_space_network(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
     """Return the network of a grid's free space, in one piece; None, with a warning, if a robot finds no path."""
     network_notes = DerivationNotes()
-    spacing = max(1.5, 25 * grid.resolution)
+    parameters = Parameters(robot_radius=radius)
+    coarse = max(1.0, 20 * grid.resolution / parameters.reach)  # a node each few cells would be a mesh
+    parameters = replace(parameters, reach=coarse * parameters.reach, spacing=coarse * parameters.spacing)
     try:
-        topology = network(grid, Parameters(robot_radius=radius, spacing=spacing), network_notes, "the grid")
+        topology = network(grid, parameters, network_notes, "the grid")
     except CannotConvert as error:
         notes.warn(f"the site has no network; {error.detail}")
         return None
