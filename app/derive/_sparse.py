@@ -51,7 +51,9 @@ def thin_out(graph: Graph, free_space: FreeSpace, *, share: float, radius: float
     which a robot of this radius can move there, and ``tolerance``.
     """
     merging = _Merging(graph, free_space)
-    near = lengths(graph.nodes, graph.edges) < share * merging.clearance[graph.edges].max(axis=1)
+    # rounded: values that are equal by their integers decide alike on every machine
+    radii = np.round(share * merging.clearance[graph.edges].max(axis=1), 9)
+    near = np.round(lengths(graph.nodes, graph.edges), 9) < radii
     for a, b in _shortest_first(graph, graph.edges[near]):
         if merging.is_junction(a) and merging.is_junction(b):
             merging.join(a, b)
@@ -132,7 +134,7 @@ class _Merging:
             return
         (y, x), (a, b) = self._at[node], (self._at[k] for k in sorted(self._near[node]))
         length = math.dist(a, b)
-        if not length or abs((b[0] - a[0]) * (x - a[1]) - (b[1] - a[1]) * (y - a[0])) <= leeway * length:
+        if not length or abs((b[0] - a[0]) * (x - a[1]) - (b[1] - a[1]) * (y - a[0])) <= leeway * length + 1e-9:
             self._bypass(node)
 
     def _ranked(self, a: int, b: int) -> list[int]:

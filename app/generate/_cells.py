@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -136,9 +136,9 @@ def finish_site(site: Site, options: SiteOptions, notes: DerivationNotes, *, gro
 def free_space_network(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
     """Return the network of a grid's free space, in one piece; None, with a warning, if a robot finds no path."""
     network_notes = DerivationNotes()
-    parameters = Parameters(robot_radius=radius)
-    coarse = max(1.0, 20 * grid.resolution / parameters.reach)  # a node each few cells would be a mesh
-    parameters = replace(parameters, reach=coarse * parameters.reach, spacing=coarse * parameters.spacing)
+    # woods, caves and yards are wide: half as dense as in buildings, and no denser than their coarse cells
+    reach = max(4.0, 20 * grid.resolution)
+    parameters = Parameters(robot_radius=radius, reach=reach, spacing=2 * reach, detour=1.5)
     try:
         topology = network(grid, parameters, network_notes, "the grid")
     except CannotConvert as error:
