@@ -1,4 +1,4 @@
-"""Greedy spanner: select the straight edges that shorten a network's detours, as native code."""
+"""Choose nodes and edges for open ground, as native code: a greedy cover, and a greedy spanner of short detours."""
 
 # numba has its own number types: 64-bit integers and floats, whatever mypy infers from NumPy's.
 # mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
@@ -7,8 +7,75 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.derive._kernels_space import F64, I64, U8
+from app.derive._kernels_space import F64, I64, U8, clear
 from app.native import native
+
+
+@native
+def cover(mask: U8, rows: I64, columns: I64, state: U8, reach: float, gain: int) -> int:
+    """Choose points of a lattice until no other one would cover ``gain`` or more points; return their number.
+
+    A point covers those at most ``reach`` cells away on a straight line within the mask. Those that cover most are
+    chosen first (the greedy set cover), by row and column if equal. rows, columns: cells of the lattice. state:
+    [len(rows), len(columns)], 0 outside the mask, 1 not covered, 2 covered; chosen ones become 3.
+    """
+    height, width = state.shape
+    up, right = 0, 0
+    while up + 1 < height and rows[up + 1] - rows[0] <= reach:
+        up += 1
+    while right + 1 < width and columns[right + 1] - columns[0] <= reach:
+        right += 1
+    seen = np.empty(((2 * up + 3) * (2 * right + 3), 2), np.int64)
+    best = np.full(state.shape, np.int64((2 * up + 3) * (2 * right + 3)))
+    chosen = 0
+    for wanted in range((2 * up + 3) * (2 * right + 3), gain - 1, -1):
+        for i in range(height):
+            for j in range(width):
+                if state[i, j] == 0 or best[i, j] < wanted:
+                    continue
+                count = 0
+                for v in range(max(0, i - up - 1), min(height, i + up + 2)):
+                    for u in range(max(0, j - right - 1), min(width, j + right + 2)):
+                        dy, dx = rows[v] - rows[i], columns[u] - columns[j]
+                        if state[v, u] != 1 or dy * dy + dx * dx > reach * reach:
+                            continue
+                        if clear(mask, rows[i], columns[j], rows[v], columns[u]):
+                            seen[count, 0], seen[count, 1] = v, u
+                            count += 1
+                best[i, j] = count  # it only falls
+                if count >= wanted:
+                    for k in range(count):
+                        state[seen[k, 0], seen[k, 1]] = 2
+                    state[i, j] = 3
+                    best[i, j] = 0
+                    chosen += 1
+    return chosen
+
+
+@native
+def meeting(mask: U8, y: int, x: int, near: float, far: float, cells: I64) -> tuple[int, int]:
+    """Return the cell nearest to (y, x), from ``near`` up to ``far`` cells away, that sees all of ``cells`` ([n, 2]).
+
+    It sees a cell if the straight line there stays in the mask. Returns (-1, -1) if there is none.
+    """
+    height, width = mask.shape
+    reach = np.int64(far)
+    top, bottom = np.int64(max(0, y - reach)), np.int64(min(height, y + reach + 1))
+    left, right = np.int64(max(0, x - reach)), np.int64(min(width, x + reach + 1))
+    best, row, column = far * far + 1.0, np.int64(-1), np.int64(-1)
+    for v in range(top, bottom):
+        for u in range(left, right):
+            away = np.float64((v - y) ** 2 + (u - x) ** 2)
+            if mask[v, u] == 0 or away < near * near or away > far * far or away >= best:
+                continue
+            good = True
+            for k in range(len(cells)):
+                if not clear(mask, v, u, cells[k, 0], cells[k, 1]):
+                    good = False
+                    break
+            if good:
+                best, row, column = away, v, u
+    return row, column
 
 
 @native
@@ -77,3 +144,6 @@ def compile_all() -> None:
     """Compile all kernels: call each one once on a tiny graph."""
     pairs, lengths = np.array([[0, 1]], np.int64), np.ones(1)
     spanner(2, pairs, lengths, pairs, lengths, 1.5, np.zeros(1, np.uint8))
+    mask, at = np.ones((3, 3), np.uint8), np.arange(3)
+    meeting(mask, 1, 1, 0.0, 1.0, pairs)
+    cover(mask, at, at, np.ones((3, 3), np.uint8), 1.0, 1)

@@ -161,8 +161,8 @@ def _lengths(cells: I32, begin: I64, path: I64) -> F64:
 
 
 @native
-def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> tuple[I64, I64, F64]:
-    """Cluster junctions that are close together: (head, via, away).
+def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, share: float, length: F64) -> tuple[I64, I64, F64]:
+    """Cluster junctions that are close together, as ``contract`` describes: (head, via, away).
 
     head: [nodes], the junction that each node is merged into, itself if it stays. via: the edge towards it, or -1.
     away: its distance along the skeleton, in cells.
@@ -183,6 +183,7 @@ def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> 
         head[v] = v
         queue[0] = v
         size, i = 1, 0
+        bound = max(radius, share * np.sqrt(clearance[v]))
         while i < size and first[v + 1] - first[v] > 2:
             current = queue[i]
             i += 1
@@ -190,7 +191,7 @@ def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> 
                 e = at[k]
                 u = end[e] if start[e] == current else start[e]
                 far = away[current] + length[e]
-                if head[u] < 0 and far <= radius and first[u + 1] - first[u] > 2:
+                if head[u] < 0 and far <= bound and first[u + 1] - first[u] > 2:
                     head[u], via[u], away[u] = v, e, far
                     queue[size] = u
                     size += 1
@@ -198,16 +199,18 @@ def _cluster(graph: Graph, gap: U16, cells: I32, radius: float, length: F64) -> 
 
 
 @native
-def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
+def contract(graph: Graph, gap: U16, cells: I32, radius: float, share: float = 0.0) -> Graph:
     """Merge junctions within ``radius`` cells of each other along the skeleton.
 
-    The junction farthest from obstacles stays, and edges of the others are extended to it along the cells between.
-    Resulting loops of at most four times the radius are removed, since they lead nowhere.
+    The junction farthest from obstacles stays, and edges of the others are extended to it along the cells between. If
+    ``share`` of its distance to obstacles is more, that is its radius: in open ground, junctions that are near each
+    other in proportion are one place. Resulting loops of at most four times the radius are removed, since they lead
+    nowhere.
     """
     nodes, start, end, begin, path = graph
     count, edges = len(nodes), len(start)
     length = _lengths(cells, begin, path)
-    head, via, away = _cluster(graph, gap, cells, radius, length)
+    head, via, away = _cluster(graph, gap, cells, radius, share, length)
     remaining = np.zeros(edges, np.uint8)
     room = m = 0
     for e in range(edges):
@@ -361,11 +364,23 @@ def chains(graph: Graph, alive: U8) -> tuple[I64, I64, I64]:
 
 
 @native
-def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep: U8) -> None:
+def leeway(gap: U16, cells: I32, path: I64, radius: float, tolerance: float, out: F64) -> None:
+    """Compute how far, in cells, a straight edge may be from each cell of the lines.
+
+    It is half the distance by which a robot of this radius can move there, at least one cell and at most the tolerance:
+    lines stay in the middle of aisles and are straight in wide space.
+    """
+    for i in range(len(path)):
+        distance = np.sqrt(distance2(gap, cells[path[i], 0], cells[path[i], 1]))
+        out[i] = min(tolerance, max(1.0, (distance - radius) / 2.0))
+
+
+@native
+def simplify(mask: U8, cells: I32, begin: I64, path: I64, leeways: F64, keep: U8) -> None:
     """Simplify lines: mark in ``keep`` (one value per element of ``path``) the corners of their straight segments.
 
-    Like Douglas-Peucker, but each segment must also stay within the mask; it deviates by ``tolerance`` cells at most.
-    Steps between neighbouring cells are always allowed, so this terminates.
+    Like Douglas-Peucker, but each segment must also stay within the mask; it deviates from each cell by its ``leeways``
+    at most. Steps between neighbouring cells are always allowed, so this terminates.
     """
     stack = np.empty((len(path) + 2, 2), np.int64)
     for c in range(len(begin) - 1):
@@ -388,10 +403,10 @@ def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep
                 t = 0.0
                 if along > 0:
                     t = min(1.0, max(0.0, (v * dy + u * dx) / along))
-                away = (v - t * dy) ** 2 + (u - t * dx) ** 2
+                away = ((v - t * dy) ** 2 + (u - t * dx) ** 2) / max(leeways[k] ** 2, 1e-12)
                 if away > worst:
                     worst, farthest = away, k
-            if along > 0 and worst <= tolerance * tolerance and clear(mask, y0, x0, y1, x1):
+            if along > 0 and worst <= 1.0 and clear(mask, y0, x0, y1, x1):
                 continue
             keep[farthest] = 1
             stack[size, 0], stack[size, 1] = i, farthest
@@ -408,6 +423,8 @@ def compile_all() -> None:
     thinned = mask.copy()
     cells, rows = np.empty((thin(thinned), 2), np.int32), np.empty(len(mask) + 1, np.int64)
     list_cells(thinned, cells, rows)
-    graph = contract(trace(thinned, cells, rows), gap, cells, 1.0)
+    graph = contract(trace(thinned, cells, rows), gap, cells, 1.0, 0.0)
     _, begin, path = chains(graph, prune(graph, gap, cells, 1.0))
-    simplify(mask, cells, begin, path, 1.0, np.zeros(len(path), np.uint8))
+    leeways = np.empty(len(path))
+    leeway(gap, cells, path, 0.0, 1.0, leeways)
+    simplify(mask, cells, begin, path, leeways, np.zeros(len(path), np.uint8))

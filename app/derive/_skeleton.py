@@ -80,14 +80,24 @@ def widest(free_space: FreeSpace) -> float:
 
 
 def skeleton(
-    free_space: FreeSpace, *, merge: float, spur: float, tolerance: float, island: float, voronoi: bool = False
+    free_space: FreeSpace,
+    *,
+    merge: float,
+    spur: float,
+    tolerance: float,
+    island: float,
+    radius: float = 0.0,
+    share: float = 0.0,
+    voronoi: bool = False,
 ) -> tuple[Graph, int]:
     """Return the skeleton of a space as a graph of straight, collision-free edges. Lengths are in cells.
 
     Args:
         merge: junctions closer than this along the skeleton are merged.
+        share: so are those closer than this share of their distance to obstacles.
         spur: dead ends that reach less than this beyond the free circle of their junction are cut.
-        tolerance: maximum distance of a straight edge from the skeleton.
+        tolerance: maximum distance of a straight edge from the skeleton; less where there is little space (``leeway``).
+        radius: the robot's, for that.
         island: pieces smaller than this across are dropped (the largest always stays).
         voronoi: use the generalised Voronoi diagram, farthest from obstacles everywhere, instead of Zhang and Suen's
             skeleton.
@@ -103,10 +113,12 @@ def skeleton(
     kernels.list_cells(thinned, cells, rows)
     raw = kernels.trace(thinned, cells, rows)
     del thinned
-    merged = kernels.contract(raw, free_space.gap, cells, merge)
+    merged = kernels.contract(raw, free_space.gap, cells, merge, share)
     lone, begin, path = kernels.chains(merged, kernels.prune(merged, free_space.gap, cells, spur))
     keep = np.zeros(len(path), np.uint8)
-    kernels.simplify(free_space.mask, cells, begin, path, tolerance, keep)
+    leeways = np.empty(len(path))
+    kernels.leeway(free_space.gap, cells, path, radius, tolerance, leeways)
+    kernels.simplify(free_space.mask, cells, begin, path, leeways, keep)
     corner = path[keep == 1]
     line = np.repeat(np.arange(len(begin) - 1), np.diff(begin))[keep == 1]
     along = line[1:] == line[:-1]
@@ -201,22 +213,18 @@ def subgraph(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
     return Graph(graph.nodes[mask], place[graph.edges[mask[graph.edges[:, 0]]]])
 
 
-def add_open_edges(
-    graph: Graph, free_space: FreeSpace, *, spacing: float, detour: float, phase: tuple[float, float] = (0.0, 0.0)
-) -> Graph:
-    """Add nodes ``spacing`` cells apart, also in the open, and the straight edges that avoid a detour.
+def add_edges(graph: Graph, free_space: FreeSpace, cells: NDArray[np.int64], detour: float, longest: float) -> Graph:
+    """Add nodes at these cells, and straight edges up to ``longest`` cells that avoid a detour.
 
-    Nodes are added along edges and on a lattice that begins at ``phase`` (row, column), so that it stays in place when
-    the map grows. Of the collision-free lines of their Delaunay triangulation, those are added without which the path
-    between their ends would be more than ``detour`` times as long.
+    Of the collision-free lines of a Delaunay triangulation of all nodes, those are added without which the path between
+    their ends would be more than ``detour`` times as long. Nodes that no line joins to the graph are left out.
     """
     from app.derive import _kernels_roadmap as kernels
 
-    graph = divide_edges(graph, free_space, spacing)
     node_count = len(graph.nodes)
-    nodes = np.concatenate([graph.nodes, _lattice(graph, free_space, spacing, phase)])
+    nodes = np.concatenate([graph.nodes, cells])
     pairs = _triangulate(nodes)
-    pairs = pairs[lengths(nodes, pairs) <= 4.0 * spacing]
+    pairs = pairs[lengths(nodes, pairs) <= longest]
     pairs = drop_blocked(pairs, nodes, free_space)
     straight = lengths(nodes, pairs)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], straight))
@@ -224,7 +232,6 @@ def add_open_edges(
     taken = np.zeros(len(pairs), np.uint8)
     kernels.spanner(len(nodes), graph.edges, lengths(nodes, graph.edges), pairs, straight, detour, taken)
     full = Graph(nodes, np.concatenate([graph.edges, pairs[taken == 1]]))
-    # drop lattice nodes in pieces that the graph omits
     count, piece = pieces(full)
     connected = np.zeros(count, bool)
     connected[piece[:node_count]] = True
@@ -275,22 +282,6 @@ def divide_edges(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
     cells = ends.reshape(-1, 2, 2)[~undivided[edge]].reshape(-1, 2)
     divided = np.arange(len(cells), dtype=np.int64).reshape(-1, 2) + len(graph.nodes)
     return tidy(np.concatenate([graph.nodes, cells]), np.concatenate([graph.edges[undivided], divided]))
-
-
-def _lattice(graph: Graph, free_space: FreeSpace, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
-    """Return the cells of the space on a square lattice that are not near an existing node."""
-    from scipy.spatial import cKDTree
-
-    rows, columns = (
-        np.unique(np.rint(np.arange(begin % spacing, size - 1, spacing)).astype(np.int64))
-        for begin, size in zip(phase, free_space.mask.shape, strict=True)
-    )
-    at = np.argwhere(free_space.mask[np.ix_(rows, columns)])
-    cells = np.stack([rows[at[:, 0]], columns[at[:, 1]]], axis=1)
-    if not len(cells):
-        return cells
-    away, _ = cKDTree(graph.nodes).query(cells, distance_upper_bound=0.75 * spacing)
-    return np.asarray(cells[np.isinf(away)])
 
 
 def _triangulate(nodes: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -5,6 +5,9 @@ cell centres, as Nav2's inflation layer detects collisions (InflationLayer::comp
 beyond the grid are obstacles. Every edge is a straight line that crosses only such cells, so it is collision-free in
 any format; its ``width`` is the free width at its narrowest cell. Connected free space gives a connected network. Ids
 are derived from positions on a coarse raster, so that most ids stay if that part of the map does not change.
+
+By default a network is as sparse as those that people draw: junctions that are one place, bends within the robot's play
+and dead ends that lead nowhere are left out, and open ground gets nodes only where the lines are far (``_sparse``).
 """
 
 from __future__ import annotations
@@ -32,8 +35,13 @@ if TYPE_CHECKING:
 RASTERS = (0.5, 0.1, 0.01)
 """Raster sizes in metres: a node is named after its position on the first one that makes the name unique."""
 
+ONE_PLACE = 0.5
+"""Junctions closer than this share of their distance to obstacles are one place."""
+
 METHOD_PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "spacing": ("skeleton", "voronoi"),
+    "merge": ("skeleton", "voronoi"),
+    "reach": ("skeleton",),
     "detour": ("skeleton",),
     "samples": ("roadmap",),
     "neighbours": ("roadmap",),
@@ -49,9 +57,9 @@ class Parameters:
 
     method: Literal["skeleton", "roadmap", "voronoi"] = parameter(
         "skeleton",
-        "method; skeleton: centrelines of free space, with straight edges across open space; roadmap: "
-        "random samples joined by collision-free lines; voronoi: lines farthest from all obstacles, also in open space "
-        "(generalised Voronoi diagram)",
+        "method; skeleton: centrelines of free space, with a few nodes and straight edges in open ground, as people "
+        "draw networks; voronoi: only the lines farthest from all obstacles (generalised Voronoi diagram); roadmap: a "
+        "graph for planners, random samples joined by collision-free lines, too dense for people to name or edit",
     )
     grid: str | None = parameter(
         None, "name of the grid; default: map, else the only one on a level that is not a filter mask"
@@ -65,33 +73,53 @@ class Parameters:
         "meaning of cells with grey 205: map_saver writes it for unknown, but a free_thresh of 0.25 reads it as free",
     )
     tolerance: float = parameter(
-        0.1, "maximum distance of straight edges from the skeleton or diagram", minimum=0.0, maximum=100.0, unit="m"
+        0.5,
+        "maximum distance of straight edges from the skeleton or diagram, at most half the distance by which the robot "
+        "can move aside there",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m",
     )
     spur: float = parameter(
-        0.5,
+        1.5,
         "length below which dead ends are cut, measured beyond the free circle around their junction",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
     )
     island: float = parameter(
-        2.0,
+        4.0,
         "diameter below which isolated pieces of free space are dropped, except the largest one",
         minimum=0.0,
         maximum=1e6,
         unit="m",
     )
+    merge: float = parameter(
+        0.5,
+        "skeleton, voronoi: distance below which nodes become one (junctions in wide space: below half their distance "
+        "to obstacles), at most half of spacing; 0: no nodes are merged",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m",
+    )
     spacing: float = parameter(
-        1.5,
-        "skeleton, voronoi: maximum distance of nodes along the lines (skeleton: and in open space); 0: nodes at "
-        "corners only",
+        4.0,
+        "skeleton, voronoi: maximum distance of nodes along the lines; 0: nodes at corners and crossings only",
+        minimum=0.0,
+        maximum=1000.0,
+        unit="m",
+    )
+    reach: float = parameter(
+        2.0,
+        "skeleton: distance from the network beyond which ground gets nodes of its own; 0: nothing is added to the "
+        "centrelines",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
     )
     detour: float = parameter(
-        1.2,
-        "skeleton with spacing: ratio of path length to straight line above which a straight edge is added",
+        1.25,
+        "skeleton: ratio of path length to straight line above which a straight edge is added in open ground",
         minimum=1.0,
         maximum=100.0,
     )
@@ -101,7 +129,7 @@ class Parameters:
     seed: int = parameter(0, "roadmap: seed of the samples", minimum=0, maximum=2**31 - 1)
 
 
-@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0)
+@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0, version=2)
 def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of nodes and directed edges along the paths through a grid's free space.
 
@@ -117,44 +145,13 @@ def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: Derivat
 
 def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> Features:
     """Derive the network of one grid. called: name of the grid for messages."""
-    from app.derive import _roadmap, _skeleton
-
     grid = _drop_unseen(grid, parameters, notes, called)
     space = _space(grid, parameters, called)
-    cell = grid.resolution
-    graph, islands = _skeleton.skeleton(
-        space,
-        merge=max(parameters.robot_radius / cell, 2.0),
-        spur=parameters.spur / cell,
-        tolerance=parameters.tolerance / cell,
-        island=parameters.island / cell,
-        voronoi=parameters.method == "voronoi",
-    )
-    notes.drop(
-        "areas of free space", islands, f"{called}: isolated and less than island={parameters.island:g} m across"
-    )
-    count, _ = _skeleton.pieces(graph)
-    if count > 1:
-        notes.warn(f"the network has {count} disconnected pieces; the robot does not fit between them", where=called)
+    graph = _lines(space, grid.resolution, parameters, notes, called)
     if parameters.method == "roadmap":
-        graph, alone = _roadmap.roadmap(
-            space,
-            graph,
-            samples=parameters.samples,
-            neighbours=parameters.neighbours,
-            max_edge=parameters.max_edge / cell,
-            seed=parameters.seed,
-        )
-        notes.drop("samples", alone, f"{called}: nothing to join them to, or in dropped areas")
-    elif parameters.method == "voronoi":
-        graph = (
-            _skeleton.divide_edges(graph, space, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
-        )
-    elif parameters.spacing > 0.0:
-        spacing = max(parameters.spacing / cell, 2.0)
-        graph = _skeleton.add_open_edges(
-            graph, space, spacing=spacing, detour=parameters.detour, phase=_phase(grid, space, spacing)
-        )
+        graph = _roadmap_graph(graph, space, grid.resolution, parameters, notes, called)
+    else:
+        graph = _sparse_graph(graph, space, grid, parameters, notes, called)
     if not len(graph.edges):
         supply = "a smaller robot_radius, more samples" if parameters.method == "roadmap" else "a smaller robot_radius"
         if parameters.method != "roadmap" and not parameters.spacing:
@@ -166,6 +163,94 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes,
     row, column, width = space.row, space.column, _widths(space, graph)
     del space  # frees three bytes per cell, which the features may need
     return _features(grid, row, column, graph, width)
+
+
+def _lines(space: FreeSpace, cell: float, parameters: Parameters, notes: DerivationNotes, called: str) -> Graph:
+    """Return the centrelines of a free space, or its diagram, without islands. cell: metres per cell."""
+    from app.derive import _skeleton
+
+    is_sparse = parameters.method != "roadmap" and parameters.merge > 0.0
+    graph, islands = _skeleton.skeleton(
+        space,
+        merge=max((parameters.merge if is_sparse else parameters.robot_radius) / cell, 2.0),
+        spur=parameters.spur / cell,
+        tolerance=parameters.tolerance / cell,
+        island=parameters.island / cell,
+        radius=parameters.robot_radius / cell,
+        share=ONE_PLACE if is_sparse else 0.0,
+        voronoi=parameters.method == "voronoi",
+    )
+    notes.drop(
+        "areas of free space", islands, f"{called}: isolated and less than island={parameters.island:g} m across"
+    )
+    count, _ = _skeleton.pieces(graph)
+    if count > 1:
+        notes.warn(f"the network has {count} disconnected pieces; the robot does not fit between them", where=called)
+    return graph
+
+
+def _roadmap_graph(
+    graph: Graph, space: FreeSpace, cell: float, parameters: Parameters, notes: DerivationNotes, called: str
+) -> Graph:
+    """Return a roadmap that joins what these lines join."""
+    from app.derive import _roadmap
+
+    graph, alone = _roadmap.roadmap(
+        space,
+        graph,
+        samples=parameters.samples,
+        neighbours=parameters.neighbours,
+        max_edge=parameters.max_edge / cell,
+        seed=parameters.seed,
+    )
+    notes.drop("samples", alone, f"{called}: nothing to join them to, or in dropped areas")
+    return graph
+
+
+def _sparse_graph(
+    graph: Graph, space: FreeSpace, grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str
+) -> Graph:
+    """Return the lines with as many nodes as people draw, and with edges across open ground."""
+    from app.derive import _skeleton, _sparse
+
+    cell, dropped = grid.resolution, 0
+    spacing, island = parameters.spacing / cell, parameters.island / cell
+    merge = min(parameters.merge, parameters.spacing / 2.0 or math.inf) / cell
+    if merge:
+        graph = _sparse.thin_out(
+            graph,
+            space,
+            share=ONE_PLACE,
+            radius=parameters.robot_radius / cell,
+            tolerance=parameters.tolerance / cell,
+        )
+        graph, dropped = _sparse.merge_close(graph, space, distance=merge, island=island)
+    if spacing:
+        graph = _skeleton.divide_edges(graph, space, max(spacing, 2.0))
+    if parameters.reach and parameters.method == "skeleton":
+        graph = _cover(graph, space, grid, parameters)
+    if merge:
+        graph, more = _sparse.merge_close(graph, space, distance=merge, island=island)
+        dropped += more
+    notes.drop(
+        "areas of free space",
+        dropped,
+        f"{called}: less than island={parameters.island:g} m across, behind passages in which the robot has no room",
+    )
+    return graph
+
+
+def _cover(graph: Graph, space: FreeSpace, grid: OccupancyGrid, parameters: Parameters) -> Graph:
+    """Return the lines with nodes and edges in open ground; a room smaller than ``reach`` gets an edge, too."""
+    from app.derive import _sparse
+
+    reach = max(parameters.reach / grid.resolution, 2.0)
+    while True:
+        phase = _phase(grid, space, max(reach / 2.0, 1.0))
+        full = _sparse.cover(graph, space, reach=reach, detour=parameters.detour, phase=phase)
+        if len(full.edges) or reach <= 2.0:
+            return full
+        reach = max(reach / 2.0, 2.0)
 
 
 def _drop_unseen(grid: OccupancyGrid, parameters: Parameters, notes: DerivationNotes, called: str) -> OccupancyGrid:

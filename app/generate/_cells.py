@@ -136,9 +136,11 @@ def finish_site(site: Site, options: SiteOptions, notes: DerivationNotes, *, gro
 def free_space_network(grid: OccupancyGrid, radius: float, notes: DerivationNotes) -> Features | None:
     """Return the network of a grid's free space, in one piece; None, with a warning, if a robot finds no path."""
     network_notes = DerivationNotes()
-    spacing = max(1.5, 25 * grid.resolution)
+    # woods, caves and yards are wide: half as dense as in buildings, and no denser than their coarse cells
+    reach = max(4.0, 20 * grid.resolution)
+    parameters = Parameters(robot_radius=radius, reach=reach, spacing=2 * reach, detour=1.5)
     try:
-        topology = network(grid, Parameters(robot_radius=radius, spacing=spacing), network_notes, "the grid")
+        topology = network(grid, parameters, network_notes, "the grid")
     except CannotConvert as error:
         notes.warn(f"the site has no network; {error.detail}")
         return None

@@ -96,19 +96,25 @@ class ForestOptions(SiteOptions):
     )
 
 
-@generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"})
+@generates(
+    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"}, version=2
+)
 def cave(given: Layers, options: CaveOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Cave: halls and passages in rock, grown by a cellular automaton."""
     return _grow_site(given, options, source, notes, STYLES["rock"], STYLES["rock"], ground="gravel")
 
 
-@generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"})
+@generates(
+    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"}, version=2
+)
 def cluttered_hall(given: Layers, options: HallOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Hall full of clutter, heaped up by a cellular automaton."""
     return _grow_site(given, options, source, notes, CLUTTER, STYLES["wall"], ground="floor")
 
 
-@generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"})
+@generates(
+    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"}, version=2
+)
 def forest(given: Layers, options: ForestOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Forest: trees with trunks and crowns, and clearings, from a cellular automaton."""
     for name in ("trunk", "tree_height"):

@@ -72,7 +72,10 @@ class Options(SiteOptions):
 
 
 @generates(
-    {"location", "objects", "occupancy", "topology", "imagery", "resources"}, parameters=Options, also={"location"}
+    {"location", "objects", "occupancy", "topology", "imagery", "resources"},
+    parameters=Options,
+    also={"location"},
+    version=2,
 )
 def terrain(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Hilly ground with woods: a height map for Gazebo, trees, and a grid of slope costs."""

@@ -30,7 +30,7 @@ from tests.generate import site_checks
 Array = NDArray[np.float64]
 GRID = PartKey("occupancy")
 COSTS = PartKey("occupancy", name="costs")
-NOISE, GROUND = "c9ffde907188bc8f", "556c0a6d595320f0"
+NOISE, GROUND = "c9ffde907188bc8f", "ae1af6858e88e8e6"
 SMALL: dict[str, Any] = {"width": 20, "depth": 15, "detail": "65"}
 
 
