@@ -13,6 +13,12 @@ from app.derive._skeleton import FreeSpace, Graph, add_edges, lengths, tidy
 ROUNDS = 8
 """Maximum number of times that all close pairs are looked at: merged nodes may be close to others."""
 
+NEAREST = 6
+"""Maximum number of close nodes that one is paired with in a round."""
+
+MAX_VISITED = 100
+"""Maximum number of nodes that a search for another way visits: mazes of single cells have thousands nearby."""
+
 SHORT_WAY = 5.0
 """A way that is at most so many times as long replaces a passage too tight for nodes at a distance."""
 
@@ -25,22 +31,34 @@ def merge_close(graph: Graph, free_space: FreeSpace, *, distance: float, island:
     behind a passage too tight for nodes at this distance is dropped if it is smaller. Returns the graph and the number
     of such pieces.
     """
-    from scipy.spatial import cKDTree
-
-    dropped = 0
+    dropped, changed = 0, {*map(tuple, graph.nodes.tolist())}
     for _ in range(ROUNDS):
-        if not len(graph.nodes):
-            break
-        pairs = cKDTree(graph.nodes).query_pairs(distance * (1.0 - 1e-9), output_type="ndarray")
-        if not len(pairs):
+        pairs = [
+            (a, b)
+            for a, b in _shortest_first(graph, _close_pairs(graph, distance))
+            if tuple(graph.nodes[a]) in changed or tuple(graph.nodes[b]) in changed
+        ]
+        if not pairs:
             break
         merging = _Merging(graph, free_space)
-        count = sum(merging.merge(a, b, distance, island) for a, b in _shortest_first(graph, pairs))
-        graph = merging.graph()
+        for a, b in pairs:
+            merging.merge(a, b, distance, island)
+        graph, changed = merging.graph(), merging.changed
         dropped += merging.pieces
-        if not count:
-            break
     return graph, dropped
+
+
+def _close_pairs(graph: Graph, distance: float) -> NDArray[np.int64]:
+    """Return the pairs of each node and its nearest ones less than ``distance`` away, at most NEAREST of them."""
+    from scipy.spatial import cKDTree
+
+    if len(graph.nodes) < 2:
+        return np.empty((0, 2), np.int64)
+    count = min(NEAREST + 1, len(graph.nodes))
+    away, near = cKDTree(graph.nodes).query(graph.nodes, k=count, distance_upper_bound=distance * (1.0 - 1e-9))
+    node, place = np.nonzero(np.isfinite(away))
+    pairs = np.sort(np.stack([node, near[node, place]], axis=1), axis=1).astype(np.int64)
+    return np.asarray(np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0))
 
 
 def thin_out(graph: Graph, free_space: FreeSpace, *, share: float, radius: float, tolerance: float) -> Graph:
@@ -69,7 +87,10 @@ def _shortest_first(graph: Graph, pairs: NDArray[np.int64]) -> list[tuple[int, i
 
 
 class _Merging:
-    """A graph while its nodes are merged. Nodes keep their indices. pieces: number of pieces that were cut off."""
+    """A graph while its nodes are merged. Nodes keep their indices. pieces: number of pieces cut off.
+
+    changed: cells of nodes that moved or have other edges than before.
+    """
 
     def __init__(self, graph: Graph, free_space: FreeSpace) -> None:
         from app.derive import _kernels_roadmap, _kernels_space
@@ -84,6 +105,7 @@ class _Merging:
             self._near[b].add(a)
         self._alive = [True] * len(self._at)
         self.pieces = 0
+        self.changed: set[tuple[int, int]] = set()
         self.clearance = np.zeros(len(self._at))
         _kernels_space.clearances(free_space.gap, graph.nodes, self.clearance)
 
@@ -118,6 +140,7 @@ class _Merging:
             if cell[0] < 0:
                 return False
         self._at[first] = cell
+        self.changed.add(cell)
         self._drop(second)
         for k in others:
             self._near[k].add(first)
@@ -152,6 +175,7 @@ class _Merging:
         return True
 
     def _drop(self, node: int) -> None:
+        self.changed |= {self._at[k] for k in self._near[node]}
         for k in self._near[node]:
             self._near[k].discard(node)
         self._near[node] = set()
@@ -173,7 +197,11 @@ class _Merging:
         for first in (start, end):
             piece = self._reached(first, node, 2.0 * island)
             whole = all(k in piece or k == node for member in piece for k in self._near[member])
-            if whole and all(math.dist(self._at[node], self._at[k]) < island for k in piece):
+            if (
+                whole
+                and len(piece) <= MAX_VISITED
+                and all(math.dist(self._at[node], self._at[k]) < island for k in piece)
+            ):
                 for k in (node, *piece):
                     self._drop(k)
                 self.pieces += 1
@@ -183,7 +211,7 @@ class _Merging:
     def _reached(self, start: int, without: int, limit: float) -> dict[int, float]:
         """Return the nodes reached from one along edges within a length, and the lengths, without using a node."""
         lengths, queue = {start: 0.0}, [(0.0, start)]
-        while queue:
+        while queue and len(lengths) <= MAX_VISITED:
             far, current = heapq.heappop(queue)
             for k in self._near[current] - {without}:
                 length = far + math.dist(self._at[current], self._at[k])
@@ -200,6 +228,7 @@ class _Merging:
         if cell[0] < 0:
             return False
         self._at[node] = cell
+        self.changed.add(cell)
         return True
 
     def _meeting(self, cell: tuple[int, int], near: float, far: float, others: set[int]) -> tuple[int, int]:
