@@ -37,8 +37,8 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
-from app.errors import FleetMapError
-from app.model import alignment
+from app.errors import CannotConvert, FleetMapError
+from app.model import stitching
 from app.model.alignment import Fit
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tests.derive.judge import Case, Figure, Result
@@ -73,12 +73,17 @@ def judge(case: Case) -> Result:
     return _measured(labels, whole, pieces, fits, merged)
 
 
-def _merge(pieces: list[Piece], labels: Mapping[str, Any]) -> tuple[list[Fit], OccupancyGrid | None]:
-    """Place the pieces by what a user has: today each one onto the first, and no merging."""
-    angle = math.radians(labels.get("angle", 180.0))
-    first = pieces[0].grid
-    rest = [alignment.align_grids(piece.grid, first, angle=angle, reach=labels.get("reach"))[0] for piece in pieces[1:]]
-    return [Fit(0.0, 0.0, 0.0, 0.0, 1.0), *rest], None
+def _merge(pieces: list[Piece], labels: Mapping[str, Any]) -> tuple[list[Fit], OccupancyGrid]:
+    """Place and merge the pieces as the server does. Raises CannotConvert if one of them cannot be placed."""
+    angle = labels.get("angle")
+    bounds = stitching.Bounds(None if angle is None else math.radians(angle), labels.get("reach"))
+    grids = [piece.grid for piece in pieces]
+    places = stitching.place_grids(grids, bounds)
+    problems = [place.problem for place in places if place.problem]
+    if problems:
+        raise CannotConvert("; ".join(problems))
+    fits = [place.fit for place in places]
+    return fits, stitching.merge_cells(grids, fits, "evidence").grid
 
 
 def _refused(expect: str, error: FleetMapError) -> Result:
@@ -91,7 +96,7 @@ def _measured(
     whole: OccupancyGrid,
     pieces: list[Piece],
     fits: list[Fit],
-    merged: OccupancyGrid | None,
+    merged: OccupancyGrid,
 ) -> Result:
     anchor = pieces[0].truth
     far, turned = [], []
@@ -107,7 +112,7 @@ def _measured(
             Figure("shift, worst", max(far), "cells", at_most=1.0),
             Figure("turn, worst", max(turned), "°", at_most=0.5),
         ]
-        if merged is not None and not any("map" in row for row in labels["pieces"]):
+        if not any("map" in row for row in labels["pieces"]):
             figures += _agreement(labels, whole, pieces, merged)
     return Result(figures, _picture(whole, pieces, fits))
 
