@@ -78,7 +78,7 @@ class Chart:
         self.grid = replace(grid, cells=cells, resolution=size)
         self.resolution = size
         self.free = cells == FREE
-        self.known = cells != UNKNOWN
+        self.observed = cells != UNKNOWN
         solid = (cells == OCCUPIED).astype(np.uint8)
         self.away = cv2.distanceTransform(1 - solid, cv2.DIST_L2, 5) * np.float32(size)
         if not solid.any():
@@ -89,7 +89,7 @@ class Chart:
         self.walls = subsample(self.outline, SAMPLES)
         self.metres_of_sample = size * len(self.outline) / max(1, len(self.walls))
         self.lines = Lines.of_cells(self.outline, size)
-        row, column = np.nonzero(self.known)
+        row, column = np.nonzero(self.observed)
         keep = np.linspace(0, max(0, len(row) - 1), min(len(row), 20_000)).astype(int)
         self.seen = self._points(row[keep], column[keep])
         self.seen_area = float(len(row)) * size**2
@@ -115,18 +115,18 @@ class Chart:
         return np.asarray(cells @ rotation(yaw).T + np.array([x, y]))
 
     def look_up(self, points: Array) -> tuple[NDArray[np.float32], Mask, Mask]:
-        """Return (metres to the next wall, is free, is known) of points [n, 2]; beyond the grid: infinite, neither."""
+        """Return (metres to the next wall, is free, is observed) of points [n, 2]; beyond it infinite, neither."""
         x, y, yaw = self.grid.origin
         local = (points - np.array([x, y])) @ rotation(yaw) / self.resolution
         column, row = np.floor(local).astype(np.int64).T
-        height, width = self.known.shape
+        height, width = self.observed.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         row, column = row[inside], column[inside]
         away = np.full(len(points), np.inf, np.float32)
-        free, known = np.zeros(len(points), bool), np.zeros(len(points), bool)
-        away[inside], free[inside], known[inside] = (
+        free, observed = np.zeros(len(points), bool), np.zeros(len(points), bool)
+        away[inside], free[inside], observed[inside] = (
             self.away[row, column],
             self.free[row, column],
-            self.known[row, column],
+            self.observed[row, column],
         )
-        return away, free, known
+        return away, free, observed

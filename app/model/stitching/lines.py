@@ -108,8 +108,8 @@ def settled(fits: Mapping[int, Fit], lines: Mapping[int, Lines], fixed: set[int]
             matrix, vector = np.zeros((3 * len(movable),) * 2), np.zeros(3 * len(movable))
             middles = {k: fits[k].apply_to(lines[k].points.mean(axis=0)[None])[0] for k in movable}
             for i, k in permutations(fits, 2):
-                there = chain(fits[i], inverse(fits[k])).apply_to(lines[i].points)
-                p, q, weight = targets[k].pairs(there, reach)
+                on_other = chain(fits[i], inverse(fits[k])).apply_to(lines[i].points)
+                p, q, weight = targets[k].pairs(on_other, reach)
                 turn = rotation(fits[k].yaw)
                 p, q, weight = fits[k].apply_to(p), fits[k].apply_to(q), turn @ weight @ turn.T
                 weight = _robust(weight, q - p, near)

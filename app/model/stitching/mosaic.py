@@ -70,11 +70,11 @@ def merge_cells(
     for row in range(0, height, step):
         shape = (min(step, height - row), width)
         values = [_strip(codes, grid, corner, yaw, size, row, shape) for codes, grid in sources]
-        known = [block for block in values if block is not None]
-        if not known:
+        blocks = [block for block in values if block is not None]
+        if not blocks:
             continue
-        solid, free = (np.sum([block == code for block in known], axis=0) for code in (OCCUPIED, FREE))
-        block = _by_evidence(known, solid, free) if seam == "evidence" else _by_age(known)
+        solid, free = (np.sum([block == code for block in blocks], axis=0) for code in (OCCUPIED, FREE))
+        block = _by_evidence(blocks, solid, free) if seam == "evidence" else _by_age(blocks)
         disputed = (solid > 0) & (free > 0)
         conflicts += int(disputed.sum())
         freed += int((disputed & (block == FREE)).sum())
@@ -90,11 +90,11 @@ def merge_cells(
 def _by_evidence(values: Sequence[Cells], solid: NDArray[np.int_], free: NDArray[np.int_]) -> Cells:
     """Sum up the evidence. A middling value (a cost) is never lowered."""
     most = np.zeros(values[0].shape, np.uint8)
-    known = np.zeros(most.shape, bool)
+    observed = np.zeros(most.shape, bool)
     for block in values:
-        known |= block != UNKNOWN
+        observed |= block != UNKNOWN
         most = np.maximum(most, np.where(block < OCCUPIED, block, FREE))
-    out = np.where(known, most, np.uint8(UNKNOWN))
+    out = np.where(observed, most, np.uint8(UNKNOWN))
     return np.where((solid > 0) & (solid * HIT >= free * MISS), np.uint8(OCCUPIED), out).astype(np.uint8)
 
 
@@ -126,8 +126,8 @@ def _extent(grids: Sequence[OccupancyGrid], size: float, max_cells: int) -> tupl
     x, y, yaw = grids[0].origin
     corners = [grids[0].corners()]
     for grid in grids[1:]:
-        known = grid.cells != UNKNOWN
-        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        observed = grid.cells != UNKNOWN
+        rows, columns = np.flatnonzero(observed.any(axis=1)), np.flatnonzero(observed.any(axis=0))
         if len(rows):
             low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
             box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) * grid.resolution

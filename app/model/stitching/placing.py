@@ -45,15 +45,16 @@ class Bounds:
     """Bounds of a search around the stored position, or around a start.
 
     angle: radians. reach: metres that a grid's middle may move. None: any; around a start START_ANGLE and START_REACH.
-    near: metres at which walls agree. least: minimum share of the walls seen by both that agree: a metre of wall in
-    free space outweighs least / (1 - least) metres of wall on a wall, since parallel walls agree by chance. overlap:
-    minimum share of a grid's known cells that another one knows, or of the others' that it knows.
+    near: metres at which walls agree, at least one and a half cells. least: minimum share of the walls seen by both
+    that agree: a metre of wall in free space outweighs least / (1 - least) metres of wall on a wall, since parallel
+    walls agree by chance. overlap: minimum share of a grid's known cells that another one knows, or of the others'
+    that it knows.
     """
 
     angle: float | None = None
     reach: float | None = None
     near: float = 0.1
-    least: float = 0.8
+    least: float = 0.9
     overlap: float = 0.1
 
     @property
@@ -103,7 +104,7 @@ def place_grids(
     Returns a placement for each grid in their order; those that fit nowhere, or in several ways, have a problem.
     """
     charts = [Chart(grid) for grid in grids]
-    near = max(bounds.near, *(chart.resolution for chart in charts))
+    near = max(bounds.near, *(1.5 * chart.resolution for chart in charts))
     for chart in charts:
         chart.look_ahead(near)
     placer = _Placer(charts, replace(bounds, near=near), starts or {})
@@ -206,18 +207,18 @@ class _Placer:
         """Measure a position of a grid against all placed ones: (evidence in metres of wall, placement)."""
         chart, tally = self.charts[index], Tally(self.bounds.near)
         onto_this, seen = inverse(fit), fit.apply_to(chart.seen)
-        known = np.zeros(len(seen), bool)
+        shared = np.zeros(len(seen), bool)
         on_others = Look.nowhere(len(chart.walls))
         for k, place in self.placed.items():
             if k == index:
                 continue
             other, back = self.charts[k], inverse(place.fit)
             on_others.join(chart.look_from(other, chain(fit, back)))
-            known |= other.look_up(back.apply_to(seen))[2]
+            shared |= other.look_up(back.apply_to(seen))[2]
             tally.add(other.look_from(chart, chain(place.fit, onto_this)), other.metres_of_sample)
         tally.add(on_others, chart.metres_of_sample)
         share = tally.agree / (tally.agree + tally.conflict) if tally.agree else 0.0
-        overlap = float(known.mean()) if len(known) else 0.0
+        overlap = float(shared.mean()) if len(shared) else 0.0
         residual = math.sqrt(tally.squares / tally.agree) if tally.agree else math.inf
         measured = replace(fit, residual=residual, agreement=share, overlap=overlap)
         evidence = tally.agree - self.bounds.conflict * tally.conflict
