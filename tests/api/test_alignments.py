@@ -238,7 +238,12 @@ def test_merge_with_bad_members_is_refused(api: Api, robots: str) -> None:
     for status, members, expected in wrong:
         detail = merge(api, robots, status, merge=members)
         assert expected in str(detail), members
-    for words in ({"grid": "two"}, {"onto": {}}, {"pairs": [[[0, 0], [0, 0]], [[1, 0], [1, 0]]]}):
+    excluded: list[dict[str, Any]] = [
+        {"grid": "two"},
+        {"onto": {}},
+        {"pairs": [[[0, 0], [0, 0]], [[1, 0], [1, 0]]]},
+    ]
+    for words in excluded:
         assert "cannot be combined with merge" in merge(api, robots, 422, **words)["detail"]
     assert "Grids of one level are merged" in merge(api, robots, 404, level="L2")["detail"]
     assert merge(api, robots, 422, merge={"poses": {"two": [0, 0, 0]}}, angle=1, reach=0.1)["detail"]
