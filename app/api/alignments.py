@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
@@ -21,7 +21,8 @@ from app.api.http.schemas import (
     problem_responses,
 )
 from app.errors import Invalid, Problem
-from app.ingest import AlignmentRequest
+from app.ingest import AlignmentRequest, MergeRequest
+from app.model.stitching import MAX_GRIDS
 
 
 class OntoBody(RequestModel):
@@ -40,14 +41,53 @@ class OntoBody(RequestModel):
 
 
 Place = tuple[float, float]
+Metres = Annotated[float, Field(ge=-1e7, le=1e7, allow_inf_nan=False)]
+Degrees = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
+
+
+class MergeBody(RequestModel):
+    """Grids of several robots to lay into one, in the frame of the first."""
+
+    grids: list[Annotated[str, Field(max_length=256)]] = Field(
+        min_length=2,
+        max_length=MAX_GRIDS,
+        description="Names of the grids, all of `level`, the oldest first. The first one stays where it is.",
+    )
+    name: str | None = Field(
+        None, max_length=100, description="Name of the merged grid. Default: the first grid's, which it replaces."
+    )
+    seam: Literal["evidence", "newest"] = Field(
+        "evidence",
+        description="Where grids disagree: `evidence` counts occupied and free observations of all grids, in doubt "
+        "occupied; with `newest` the last of `grids` that knows the cell decides.",
+    )
+    drop: bool = Field(False, description="Delete the other grids. Default: they stay as they are.")
+    pairs: dict[str, Annotated[list[tuple[Place, Place]], Field(min_length=2, max_length=1000)]] = Field(
+        default_factory=dict,
+        max_length=MAX_GRIDS,
+        description="By grid: pairs of points [[x, y], [x, y]] in metres: position in this grid, position in the "
+        "first grid. They decide if the common area is too small to find the position.",
+    )
+    poses: dict[str, tuple[Metres, Metres, Degrees]] = Field(
+        default_factory=dict,
+        max_length=MAX_GRIDS,
+        description="By grid: rough position [x, y, degrees] of its frame in the first one's. The search is limited "
+        "to `angle` (default: 20) and `reach` (default: 2) around it.",
+    )
+    overlap: float = Field(
+        0.1, ge=0, le=1, description="Minimum share of a grid that others must have in common with it, from 0 to 1."
+    )
 
 
 class AlignmentBody(RequestModel):
-    """Alignment of a stored grid with another map (`onto`) or with pairs of points (`pairs`)."""
+    """Alignment of a stored grid with another map (`onto`) or with pairs of points (`pairs`), or a `merge`."""
 
     model_config = ConfigDict(
         json_schema_extra={
-            "examples": [{"pairs": [[[0, 0], [1, 2]], [[10, 0], [11, 2]]], "dry_run": True}],
+            "examples": [
+                {"pairs": [[[0, 0], [1, 2]], [[10, 0], [11, 2]]], "dry_run": True},
+                {"merge": {"grids": ["robot-1", "robot-2"], "name": "site"}, "dry_run": True},
+            ],
         },
     )
 
@@ -60,12 +100,16 @@ class AlignmentBody(RequestModel):
         max_length=1000,
         description="Pairs of points [[x, y], [x, y]] in metres: present position, correct position.",
     )
-    angle: float = Field(180.0, ge=0, le=180, description="Maximum rotation to try, in degrees.")
+    merge: MergeBody | None = Field(None, description="Merge grids into one, instead of moving one of them.")
+    angle: float | None = Field(
+        None, ge=0, le=180, description="Maximum rotation to try, in degrees. Default: 180; around `merge.poses` 20."
+    )
     reach: float | None = Field(
         None,
         ge=0,
         le=1e7,
-        description="Maximum distance that the grid's centre may move, in metres. Default: no limit.",
+        description="Maximum distance that the grid's centre may move, in metres. Default: no limit; around "
+        "`merge.poses` 2.",
     )
     near: float | None = Field(
         None,
@@ -74,7 +118,13 @@ class AlignmentBody(RequestModel):
         description="Maximum distance in metres at which cells or points match. Default: 0.1 for cells, 0.5 "
         "for points.",
     )
-    least: float = Field(0.5, ge=0, le=1, description="Minimum share of matching cells or points, from 0 to 1.")
+    least: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Minimum share of matching cells or points, from 0 to 1. Default: 0.5; for `merge` 0.9, of the "
+        "walls that both grids saw.",
+    )
     dry_run: DryRun = False
     message: str = Field("", max_length=MAX_TEXT)
 
@@ -84,7 +134,13 @@ class AlignmentOut(BaseModel):
 
     alignment: dict[str, Any] | None = Field(
         description="`x`, `y`, `yaw`, `residual` (m), `agreement` and `overlap` (0 to 1), `origin` and the previous "
-        "origin `before`."
+        "origin `before`. Null for a merge."
+    )
+    merge: dict[str, Any] | None = Field(
+        description="For a merge: `name`, `resolution`, `origin`, `size`, `cells`, the number of `conflicts` and of "
+        "those that became free (`freed`), and for each of `grids` its motion `x`, `y`, `yaw` into the first grid's "
+        "frame, `agreement`, `overlap`, `residual`, `walls` (m) and `area` (m²) in common, other positions that fit "
+        "nearly as well (`others`), and the `problem` if it cannot be placed."
     )
     version: VersionOut | None = Field(description="Null in a dry run.")
     warnings: list[ProblemItem]
@@ -101,19 +157,34 @@ router = api_router("alignments")
         **problem_responses(AlignmentOut, 400, 404, 409, 412, 415, 422, 503, ok=201, description="A new version"),
         200: {"model": AlignmentOut, "description": "A dry run, or nothing changed."},
     },
-    summary="Align a grid with another map",
+    summary="Align a grid with another map, or merge grids",
 )
 def create_alignment(env: EnvironmentPath, body: AlignmentBody, services: ServicesDep, commit: CommitDep) -> Response:
     """Fit a stored grid onto another grid, a slice of the objects, or given points.
 
     The alignment is a rotation and a translation: the grid's origin changes, its cells do not. To rotate the cells,
     download the grid with `normalize=true` (`occupancy_grid`).
+
+    With `merge`, grids of several robots become one: each is placed by the walls that it has in common with the
+    others. A grid that fits nowhere, or in several ways, is refused: give its `pairs` or pose.
     """
+    described = commit.with_message(body.message).as_dry_run(body.dry_run)
+    if body.merge is not None:
+        outcome = services.ingest.merge(env, _merge_request(body, body.merge), described)
+    else:
+        outcome = services.ingest.align(env, _alignment_request(body), described)
+    version = outcome.version
+    if version is None or outcome.status == "unchanged":
+        return json_response(outcome.body)
+    return json_response(outcome.body, 201, version_headers(version))
+
+
+def _alignment_request(body: AlignmentBody) -> AlignmentRequest:
     if (body.onto is None) == (body.pairs is None):
-        reason = "give either onto or pairs"
+        reason = "give either onto or pairs, or merge"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
     onto = body.onto or OntoBody.model_validate({})
-    request = AlignmentRequest(
+    return AlignmentRequest(
         grid=body.grid,
         level=body.level,
         layer=onto.layer,
@@ -121,13 +192,29 @@ def create_alignment(env: EnvironmentPath, body: AlignmentBody, services: Servic
         onto_level=onto.level,
         values=onto.parameters,
         pairs=tuple(body.pairs or ()),
-        angle=math.radians(body.angle),
+        angle=math.radians(180.0 if body.angle is None else body.angle),
         reach=body.reach,
         near=body.near or (0.5 if body.pairs else 0.1),
-        least=body.least,
+        least=0.5 if body.least is None else body.least,
     )
-    outcome = services.ingest.align(env, request, commit.with_message(body.message).as_dry_run(body.dry_run))
-    version = outcome.version
-    if version is None or outcome.status == "unchanged":
-        return json_response(outcome.body)
-    return json_response(outcome.body, 201, version_headers(version))
+
+
+def _merge_request(body: AlignmentBody, merge: MergeBody) -> MergeRequest:
+    others = [word for word in ("grid", "onto", "pairs") if word in body.model_fields_set]
+    if others:
+        reason = f"{others[0]} cannot be combined with merge"
+        raise Invalid(reason, [Problem(reason, where=f"body.{others[0]}")])
+    return MergeRequest(
+        grids=tuple(merge.grids),
+        level=body.level,
+        name=merge.name or "",
+        seam=merge.seam,
+        drop=merge.drop,
+        pairs={name: tuple(pairs) for name, pairs in merge.pairs.items()},
+        poses={name: (x, y, math.radians(yaw)) for name, (x, y, yaw) in merge.poses.items()},
+        angle=None if body.angle is None else math.radians(body.angle),
+        reach=body.reach,
+        near=body.near or 0.1,
+        least=0.9 if body.least is None else body.least,
+        overlap=merge.overlap,
+    )

@@ -43,6 +43,9 @@ _TYPES: Mapping[str, type[np.generic]] = {
     "tensor(bool)": np.bool_,
 }
 
+_NO_MEMORY = ("bad_alloc", "bad allocation", "failed to allocate", "out of memory")
+"""Texts by which onnxruntime reports that memory is exhausted."""
+
 Array = NDArray[np.float32]
 Shape = list[int | str | None]
 
@@ -72,14 +75,27 @@ class LoadedModel:
     def run(self, feed: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
         """Run the model and return its outputs by name, as float32. Inputs are cast to the types that it needs.
 
-        Raises CannotConvert if the model fails or outputs anything but numbers.
+        Raises CannotConvert if the model fails (for lack of memory, too) or outputs anything but numbers.
         """
         given = {n: np.ascontiguousarray(v, _TYPES.get(self.inputs[n][0], np.float32)) for n, v in feed.items()}
         try:
             answer = self.session.run(list(self.outputs), given)
-            return {n: np.asarray(a, np.float32) for n, a in zip(self.outputs, answer, strict=True)}
+            arrays = {n: np.asarray(a, np.float32) for n, a in zip(self.outputs, answer, strict=True)}
         except Exception as error:
-            raise CannotConvert(f"the model {self.name} failed: {str(error)[:300]}") from error
+            reason = str(error)[:300] or type(error).__name__
+            hint = ""
+            if isinstance(error, MemoryError) or any(word in reason.lower() for word in _NO_MEMORY):
+                hint = (
+                    ": it needs more memory than a worker may use; export it with a smaller input or in half precision"
+                )
+            raise CannotConvert(f"the model {self.name} failed: {reason}{hint}") from error
+        for output, array in arrays.items():
+            if np.isnan(array).any():
+                raise CannotConvert(
+                    f"the model {self.name} returns values that are not numbers (NaN in {output[:60]}): check its "
+                    "normalisation, or export it in float32"
+                )
+        return arrays
 
     def signature(self) -> str:
         """Return its inputs and outputs as readable text."""

@@ -79,14 +79,19 @@ def segments(
     )  # 0: nothing, k: class k - 1
     chance = np.zeros((height, width), np.float16)
     rows, columns = starts(height, model.side), starts(width, model.side)
+    seen: set[int] = set()
     for (i, row), (j, column) in itertools.product(enumerate(rows), enumerate(columns)):
         best, score = _tile(ground.rgb[row : row + model.side, column : column + model.side], model)
+        seen.update(np.unique(best).tolist())
         # each of two overlapping tiles counts up to the middle of the overlap
         top, left = (_half(starts_, k, model.side) for starts_, k in ((rows, i), (columns, j)))
         inner = (slice(top, None), slice(left, None))
         at = (slice(row + top, row + best.shape[0]), slice(column + left, column + best.shape[1]))
         labels[at], chance[at] = best[inner] + 1, score[inner]
     labels[(chance < sure) | ~ground.valid] = 0
+    if len(seen) == 1 < len(model.classes):
+        only = model.classes[next(iter(seen))] or "none of the kinds"
+        notes.warn(f"{name}: the model {model.name} puts every pixel into one class ({only}); check its mean and std")
     label = np.zeros((height, width), np.int32)
     regions: list[Region] = []
     other = small = 0

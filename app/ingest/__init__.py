@@ -9,6 +9,7 @@ from app.ingest.derivation import DerivationRequest
 from app.ingest.drafts import RebaseResult, check_draft_match
 from app.ingest.edits import check_depth
 from app.ingest.generation import GenerationRequest
+from app.ingest.merging import MergeRequest
 from app.ingest.online import Provider
 from app.ingest.service import CommitResult, Ingest, SpooledFile, Upload, dry_run_as_json
 from app.ingest.templates import TemplateUpdate
@@ -20,6 +21,7 @@ __all__ = [
     "DerivationRequest",
     "GenerationRequest",
     "Ingest",
+    "MergeRequest",
     "Provider",
     "RebaseResult",
     "SpooledFile",

@@ -23,6 +23,8 @@ from app.ingest.derivation import check as check_wish
 from app.ingest.drafts import DraftEditor, check_writer
 from app.ingest.edits import check_depth, edit_changes
 from app.ingest.generation import GenerationRequest, prepare_generation
+from app.ingest.merging import MergeRequest, prepare_merge, previous_merge
+from app.ingest.merging import check as check_merge
 from app.ingest.prepare import Mode, PreparedUpload, datum_moved_warnings, prepare_changes, prepare_upload
 from app.ingest.templates import TemplateUpdate
 from app.limits import Limits
@@ -212,28 +214,55 @@ class Ingest:
     def align(self, environment: str, request: AlignmentRequest, commit: CommitRequest) -> CommitResult:
         """Align a grid with another map and commit it as one version.
 
-        body of the result: {alignment, version, warnings, dry_run}. Raises NotFound, Invalid, CannotConvert (nothing
-        fits), StaleParent.
+        body of the result: {alignment, merge, version, warnings, dry_run}. Raises NotFound, Invalid, CannotConvert
+        (nothing fits), StaleParent.
         """
+        described = commit.with_default_message(f"Aligned the grid {request.level}/{request.grid}")
+        key = commit.idempotency(_digest(["align", _fields(request, commit), commit.message]))
+        return self._place_grids(environment, request, described, key)
+
+    def merge(self, environment: str, request: MergeRequest, commit: CommitRequest) -> CommitResult:
+        """Merge grids of several robots into one and commit it as one version.
+
+        Returns and raises as `align`; Conflict if another grid has the result's name.
+        """
+        check_grid_name(request.name or None)
+        check_merge(request)
+        request = dataclasses.replace(request, max_cells=min(request.max_cells, self._limits.pixels))
+        described = commit.with_default_message(f"Merged the grids {', '.join(request.grids)} of {request.level}")
+        key = commit.idempotency(_digest(["merge", _fields(request, commit), commit.message]))
+        return self._place_grids(environment, request, described, key)
+
+    def _place_grids(
+        self,
+        environment: str,
+        request: AlignmentRequest | MergeRequest,
+        commit: CommitRequest,
+        key: Idempotency | None,
+    ) -> CommitResult:
+        """Run an alignment or merge in a worker and commit it."""
         request = dataclasses.replace(request, dry_run=commit.dry_run)
-        key = commit.idempotency(_digest(["align", dataclasses.asdict(request), commit.message]))
         replayed = self._previous_result(environment, key)
         if replayed is not None and replayed.version is not None:
-            report = previous_alignment(replayed.version, request)
-            return dataclasses.replace(replayed, body=_alignment_as_json(report, replayed, replayed.version.warnings))
-        described = commit.with_default_message(f"Aligned the grid {request.level}/{request.grid}")
+            stored = replayed.version
+            if isinstance(request, MergeRequest):
+                report = previous_merge(stored, request)
+            else:
+                report = previous_alignment(stored, request)
+            return dataclasses.replace(replayed, body=_alignment_as_json(request, report, replayed, stored.warnings))
+        work = prepare_merge if isinstance(request, MergeRequest) else prepare_alignment
 
         def once(base: Version) -> CommitResult:
-            result: AlignmentResult = self._run_in_worker(
-                prepare_alignment, base, request, failure="the grid could not be aligned"
-            )
+            result: AlignmentResult = self._run_in_worker(work, base, request, failure="the grids could not be placed")
             if result.prepared is None:
                 outcome = CommitResult("dry_run", None, {})
             else:
-                outcome = self._commit(environment, base, result.prepared, described, key, result.warnings)
-            return dataclasses.replace(outcome, body=_alignment_as_json(result.summary, outcome, result.warnings))
+                outcome = self._commit(environment, base, result.prepared, commit, key, result.warnings)
+            return dataclasses.replace(
+                outcome, body=_alignment_as_json(request, result.summary, outcome, result.warnings)
+            )
 
-        return self._commit_on_head(environment, None, commit.if_match, once, "align the grid")
+        return self._commit_on_head(environment, None, commit.if_match, once, "place the grids")
 
     def revert(self, environment: str, to: int, commit: CommitRequest) -> CommitResult:
         """Commit a new version with the content of an old one."""
@@ -438,13 +467,22 @@ def dry_run_as_json(store: Store, tried: Version) -> dict[str, Any]:
     return {**tried.as_dict(), "diff": {"from": tried.parent, "to": tried.ref, "layers": layers}}
 
 
+def _fields(request: AlignmentRequest | MergeRequest, commit: CommitRequest) -> dict[str, Any]:
+    return {**dataclasses.asdict(request), "dry_run": commit.dry_run}
+
+
 def _alignment_as_json(
-    report: Mapping[str, Any] | None, outcome: CommitResult, warnings: Sequence[Problem]
+    request: AlignmentRequest | MergeRequest,
+    report: Mapping[str, Any] | None,
+    outcome: CommitResult,
+    warnings: Sequence[Problem],
 ) -> dict[str, Any]:
     version_body = None if outcome.version is None else outcome.version.as_dict()
     dry_run = outcome.body if outcome.status == "dry_run" and outcome.body else None
     problems = [w.as_dict() for w in warnings]
-    return {"alignment": report, "version": version_body, "warnings": problems, "dry_run": dry_run}
+    word = "merge" if isinstance(request, MergeRequest) else "alignment"
+    reports = {"alignment": None, "merge": None, word: report}
+    return {**reports, "version": version_body, "warnings": problems, "dry_run": dry_run}
 
 
 def check_if_match(header: str | None, head: Version) -> None:

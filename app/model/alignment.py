@@ -62,13 +62,13 @@ class Fit:
 
     def apply_to(self, points: Array) -> Array:
         """Move points [n, 2]."""
-        return np.asarray(points @ _turn(self.yaw).T + np.array([self.x, self.y]), np.float64)
+        return np.asarray(points @ rotation(self.yaw).T + np.array([self.x, self.y]), np.float64)
 
     def move_grid(self, grid: OccupancyGrid) -> OccupancyGrid:
         """Move a grid; its cells stay unchanged."""
         x, y, yaw = grid.origin
         new = self.apply_to(np.array([[x, y]]))[0]
-        return replace(grid, origin=(round(float(new[0]), 9), round(float(new[1]), 9), _angle(yaw + self.yaw)))
+        return replace(grid, origin=(round(float(new[0]), 9), round(float(new[1]), 9), angle_of(yaw + self.yaw)))
 
     def as_dict(self) -> dict[str, float]:
         """Return the motion and its quality as JSON: metres, radians, shares."""
@@ -95,7 +95,7 @@ def align_grids(
     Raises CannotConvert if a grid has no outline to align, or if no position matches.
     """
     near = max(near, moving.resolution, onto.resolution)
-    moving_points, onto_points = _outline(moving), _outline(onto)
+    moving_points, onto_points = outline(moving), outline(onto)
     for points, role in ((moving_points, "that is moved"), (onto_points, "that it is moved onto")):
         if len(points) < 3:
             raise CannotConvert(f"the grid {role} has {len(points)} occupied border cells, and at least 3 are required")
@@ -106,11 +106,11 @@ def align_grids(
     from scipy.spatial import cKDTree
 
     tree, judge = cKDTree(onto_points), cKDTree(_occupied_points(onto))
-    every = _subsample(_occupied_points(moving), 20_000)
-    sample = _subsample(moving_points)
+    every = subsample(_occupied_points(moving), 20_000)
+    sample = subsample(moving_points)
     for yaw, shift in search.places(angle, limit, middle):
         at = Fit(*_shift_for(shift, yaw, middle), yaw, 0.0, 0.0)
-        refined = _refine(at, sample, tree, 3 * search.cell, near)
+        refined = refine(at, sample, tree, 3 * search.cell, near)
         distance = float(np.linalg.norm(refined.apply_to(middle[None])[0] - middle))
         if abs(refined.yaw) <= angle + 1e-3 and distance <= limit + near:
             fits.append(_with_quality(refined, every, judge, onto, near))
@@ -120,7 +120,7 @@ def align_grids(
     # among equal fits the smallest motion: sites have symmetries
     rivals = [f for f in fits if f.score >= fits[0].score - _CLOSE]
     first = min(rivals, key=lambda f: float(np.linalg.norm(f.apply_to(moving_points) - moving_points, axis=1).mean()))
-    polished = _polish(first, _subsample(moving_points, 2 * POINTS), tree, middle, near)
+    polished = _polish(first, subsample(moving_points, 2 * POINTS), tree, middle, near)
     return [_with_quality(polished, every, judge, onto, near), *(f for f in fits if f is not first)]
 
 
@@ -148,7 +148,7 @@ def fit_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float
     if len(pairs) > 2:
         best = _largest(a, b, near)
     yaw, shift = _rigid(a[best], b[best])
-    away = np.linalg.norm(a @ _turn(yaw).T + shift - b, axis=1)
+    away = np.linalg.norm(a @ rotation(yaw).T + shift - b, axis=1)
     spread = [float(np.linalg.norm(p[best] - p[best].mean(axis=0))) for p in (a, b)]
     fit = Fit(float(shift[0]), float(shift[1]), yaw, float(np.sqrt((away[best] ** 2).mean())), float(best.mean()))
     return fit, np.flatnonzero(~best).tolist(), spread[1] / spread[0] if spread[0] > 0 else 1.0
@@ -166,7 +166,7 @@ def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
         if np.linalg.norm(a[i] - a[j]) < 1e-6 or np.linalg.norm(b[i] - b[j]) < 1e-6:
             continue
         yaw, shift = _rigid(a[[i, j]], b[[i, j]])
-        away = np.linalg.norm(a @ _turn(yaw).T + shift - b, axis=1)
+        away = np.linalg.norm(a @ rotation(yaw).T + shift - b, axis=1)
         good = away <= near
         error = float(away[good].sum())
         if (-good.sum(), error) < (-best.sum(), best_error):
@@ -223,7 +223,7 @@ class _Search:
         peaks.sort(key=lambda f: (-f[0], abs(f[1]), f[1]))
         out: list[tuple[float, Array]] = []
         for _, yaw, at in peaks:
-            twins = (abs(_angle(yaw - y)) < 2.5 * step and np.linalg.norm(at - a) < 4 * self.cell for y, a in out)
+            twins = (abs(angle_of(yaw - y)) < 2.5 * step and np.linalg.norm(at - a) < 4 * self.cell for y, a in out)
             if not any(twins):
                 out.append((yaw, at))
                 if len(out) == MAX_REFINED:
@@ -232,7 +232,7 @@ class _Search:
 
     def _scores(self, yaw: float) -> Array:
         """Return for each cell the number of matching cells with the middle at this cell."""
-        turned = np.floor(self.points @ _turn(yaw).T / self.cell + 0.5).astype(int)
+        turned = np.floor(self.points @ rotation(yaw).T / self.cell + 0.5).astype(int)
         image = np.zeros((self.height, self.width))
         image[turned[:, 1] % self.height, turned[:, 0] % self.width] = 1.0
         return np.asarray(np.fft.irfft2(self.field * np.fft.rfft2(image).conj(), s=image.shape))
@@ -248,21 +248,21 @@ class _Search:
 # --- refinement ------------------------------------------------------------------------------------------------------
 
 
-def _refine(start: Fit, points: Array, tree: Any, wide: float, near: float) -> Fit:
+def refine(start: Fit, points: Array, tree: Any, wide: float, near: float) -> Fit:
     """Refine by closest points, from a wide search to a narrow one."""
     yaw, shift = start.yaw, np.array([start.x, start.y])
     for reach in (wide, wide / 2, 2 * near, near):
         for _ in range(25):
-            placed = points @ _turn(yaw).T + shift
+            placed = points @ rotation(yaw).T + shift
             away, index = tree.query(placed, distance_upper_bound=max(reach, near))
             good = np.isfinite(away)
             if good.sum() < 3:
                 break
             turn, move = _rigid(placed[good], tree.data[index[good]])
-            yaw, shift = yaw + turn, _turn(turn) @ shift + move
+            yaw, shift = yaw + turn, rotation(turn) @ shift + move
             if abs(turn) < 1e-5 and float(np.abs(move).max()) < 1e-4:
                 break
-    return Fit(float(shift[0]), float(shift[1]), _angle(yaw), 0.0, 0.0)
+    return Fit(float(shift[0]), float(shift[1]), angle_of(yaw), 0.0, 0.0)
 
 
 def _polish(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> Fit:
@@ -273,13 +273,13 @@ def _polish(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> F
     from scipy.optimize import minimize
     from scipy.spatial import cKDTree
 
-    theirs = _subsample(np.asarray(tree.data), 2 * POINTS)
+    theirs = subsample(np.asarray(tree.data), 2 * POINTS)
     centred = points - middle
     moving_tree = cKDTree(centred)
     size = float(np.sqrt((centred**2).sum(axis=1).mean()))  # a rotation in metres, as the motion of an average point
 
     def cost(v: Array) -> float:
-        turn, at = _turn(float(v[0]) / size), v[1:]
+        turn, at = rotation(float(v[0]) / size), v[1:]
         away, _ = tree.query(centred @ turn.T + at, distance_upper_bound=near)
         back, _ = moving_tree.query((theirs - at) @ turn, distance_upper_bound=near)
         return float((np.minimum(away, near) ** 2).mean() + (np.minimum(back, near) ** 2).mean())
@@ -292,7 +292,7 @@ def _polish(fit: Fit, points: Array, tree: Any, middle: Array, near: float) -> F
     start = np.array([fit.yaw * size, *fit.apply_to(middle[None])[0]])
     tried = [minimise(start + np.array([k * near / 2, 0.0, 0.0]), near / 2, 30) for k in (0, 1, -1, 2, -2, 3, -3)]
     best = minimise(min(tried, key=lambda result: float(result.fun)).x, near / 8, 100).x
-    yaw = _angle(float(best[0]) / size)
+    yaw = angle_of(float(best[0]) / size)
     return Fit(*_shift_for(best[1:], yaw, middle), yaw, 0.0, 0.0)
 
 
@@ -300,7 +300,7 @@ def _with_quality(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near:
     """Return the fit with its quality. every: the moving grid's occupied cells."""
     placed = fit.apply_to(every)
     x, y, yaw = onto.origin
-    inside = (placed - np.array([x, y])) @ _turn(yaw) / onto.resolution
+    inside = (placed - np.array([x, y])) @ rotation(yaw) / onto.resolution
     margin = near / onto.resolution
     covered = ((inside >= -margin) & (inside <= np.array([onto.width, onto.height]) + margin)).all(axis=1)
     away, _ = judge.query(placed[covered], distance_upper_bound=near * (1 + 1e-9))
@@ -316,7 +316,7 @@ def _distinct(fits: list[Fit], middle: Array, near: float) -> list[Fit]:
     for fit in fits:
         moved_middle = fit.apply_to(middle[None])[0]
         if fit.score > 0 and not any(
-            abs(_angle(fit.yaw - o.yaw)) < 0.05
+            abs(angle_of(fit.yaw - o.yaw)) < 0.05
             and np.linalg.norm(moved_middle - o.apply_to(middle[None])[0]) < 4 * near
             for o in out
         ):
@@ -329,26 +329,27 @@ def _rigid(a: Array, b: Array) -> tuple[float, Array]:
     low, high = a.mean(axis=0), b.mean(axis=0)
     p, q = a - low, b - high
     yaw = math.atan2(float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()), float((p * q).sum()))
-    return yaw, high - _turn(yaw) @ low
+    return yaw, high - rotation(yaw) @ low
 
 
-def _turn(yaw: float) -> Array:
+def rotation(yaw: float) -> Array:
+    """Return the matrix [2, 2] that rotates column vectors by an angle in radians."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s], [s, c]])
 
 
-def _angle(yaw: float) -> float:
+def angle_of(yaw: float) -> float:
     """Normalise an angle to ±π, rounded to 1e-12."""
     return round(math.remainder(yaw, 2 * math.pi), 12)
 
 
 def _shift_for(at: Array, yaw: float, middle: Array) -> tuple[float, float]:
     """Return the shift of a motion that rotates by yaw and moves the middle to ``at``."""
-    x, y = (at - _turn(yaw) @ middle).tolist()
+    x, y = (at - rotation(yaw) @ middle).tolist()
     return x, y
 
 
-def _subsample(points: Array, limit: int = POINTS) -> Array:
+def subsample(points: Array, limit: int = POINTS) -> Array:
     """Return at most this number of points, evenly selected."""
     return points if len(points) <= limit else points[np.linspace(0, len(points) - 1, limit).astype(int)]
 
@@ -358,7 +359,7 @@ def _occupied_points(grid: OccupancyGrid) -> Array:
     return _placed_cells(grid, grid.cells == OCCUPIED)
 
 
-def _outline(grid: OccupancyGrid) -> Array:
+def outline(grid: OccupancyGrid) -> Array:
     """Return the middles of occupied cells next to others, in metres: the visible outline of walls of any thickness."""
     import cv2
 
@@ -371,4 +372,4 @@ def _placed_cells(grid: OccupancyGrid, chosen: NDArray[np.bool_]) -> Array:
     row, column = np.nonzero(chosen)
     x, y, yaw = grid.origin
     cells = (np.column_stack([column, row]) + 0.5) * grid.resolution
-    return np.asarray(cells @ _turn(yaw).T + np.array([x, y]))
+    return np.asarray(cells @ rotation(yaw).T + np.array([x, y]))

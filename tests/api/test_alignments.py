@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.model.grid import OccupancyGrid
 from tests.api.conftest import Api
 from tests.model.test_alignment import hall
+from tests.model.test_stitching import piece
 
 
 def files(name: str, origin: list[float]) -> dict[str, bytes]:
@@ -110,3 +112,139 @@ def test_impossible_alignments_are_refused(api: Api, env: str) -> None:
     assert "do not fit" in align(api, env, 422, pairs=pairs, least=0.9)["detail"]
     preview = align(api, env, 200, pairs=pairs, least=0.9, dry_run=True)
     assert any("do not fit" in w["problem"] for w in preview["warnings"])
+
+
+def elsewhere() -> OccupancyGrid:
+    """Return a grid of another place: blocks of 0.3 m in an open field."""
+    cells = np.zeros((60, 60), np.uint8)
+    for row, column in np.random.default_rng(2).integers(2, 56, (25, 2)):
+        cells[row : row + 3, column : column + 3] = 100
+    return OccupancyGrid(cells, 0.1, (-3.0, -3.0, 0.0))
+
+
+def piece_files(name: str, view: tuple[float, float, float] | None) -> dict[str, bytes]:
+    """Return what a robot saw of the hall between two x, turned by degrees, or elsewhere."""
+    grid = elsewhere() if view is None else piece(hall(0.1), *view)
+    shades = np.select([grid.cells == 100, grid.cells == 0], [0, 254], 205).astype(np.uint8)
+    out = io.BytesIO()
+    Image.fromarray(shades[::-1]).save(out, "PNG")
+    lines = f"image: {name}.png\nresolution: 0.1\norigin: {list(grid.origin)}\nnegate: 0\n"
+    return {
+        f"{name}.yaml": f"{lines}occupied_thresh: 0.65\nfree_thresh: 0.196\n".encode(),
+        f"{name}.png": out.getvalue(),
+    }
+
+
+@pytest.fixture
+def robots(api: Api, request: pytest.FixtureRequest) -> str:
+    """Return an environment with the grids of two robots, and one of another place."""
+    name = f"mg-{abs(hash(request.node.name)) % 10**9}"
+    api.post("environments", {"name": name})
+    api.upload(name, piece_files("one", (-3.0, 3.5, 10.0)), grid="one")
+    api.upload(name, piece_files("two", (0.5, 9.0, 80.0)), grid="two")
+    api.upload(name, piece_files("apart", None), grid="apart")
+    return name
+
+
+def merge(api: Api, env: str, expect: int = 201, headers: dict[str, str] | None = None, **body: Any) -> Any:
+    body = {"merge": {"grids": ["one", "two"], **body.pop("merge", {})}, **body}
+    return api("POST", f"environments/{env}/alignments", expect, json=body, headers=headers).json()
+
+
+def grid_names(api: Api, env: str) -> set[str]:
+    rows = api.get(f"environments/{env}/versions/latest/layers").json()
+    return {row["name"] for row in rows if row["layer"] == "occupancy"}
+
+
+def test_merge_lays_grids_of_robots_into_one(api: Api, robots: str) -> None:
+    preview = merge(api, robots, 200, merge={"name": "site"}, dry_run=True)
+    assert preview["version"] is None
+    assert preview["alignment"] is None
+    assert grid_names(api, robots) == {"one", "two", "apart"}, "a dry run changes nothing"
+    tried = f"environments/{robots}/versions/{preview['dry_run']['id']}"
+    assert api.get(f"{tried}/preview.png").content.startswith(b"\x89PNG"), "a dry run can be looked at"
+    result = merge(api, robots, merge={"name": "site"}, message="two robots")
+    report = result["merge"]
+    assert report == preview["merge"]
+    assert grid_names(api, robots) == {"one", "two", "apart", "site"}
+    two = report["grids"][1]
+    assert math.degrees(two["yaw"]) == pytest.approx(70.0, abs=0.5)
+    # 4.5 m along the hall's x, seen in the first robot's frame, which is turned by 10 degrees
+    assert (two["x"], two["y"]) == pytest.approx(
+        (4.5 * math.cos(math.radians(10)), -4.5 * math.sin(math.radians(10))), abs=0.1
+    )
+    assert two["agreement"] > 0.9
+    assert 0 < two["residual"] < 0.1
+    assert (report["resolution"], report["freed"]) == (0.1, 0)
+    known = report["cells"]["occupied"] + report["cells"]["free"]
+    assert known * 0.01 == pytest.approx(96.0, rel=0.05), "all of the hall, and nothing else"
+    layers = api.get(f"environments/{robots}/versions/latest/layers").json()
+    assert next(row for row in layers if row["name"] == "site")["information"] == "raw"
+    steps = api.get(f"environments/{robots}/versions/latest/reports/occupancy_grid?grid=site").json()["layers"][0][
+        "steps"
+    ]
+    assert steps[-1]["step"] == "merged"
+    again = merge(api, robots, 200, merge={"name": "site"})
+    assert again["version"]["version"] == result["version"]["version"], "nothing changed"
+
+
+def test_merge_replaces_first_grid_and_is_undone_by_a_revert(api: Api, robots: str) -> None:
+    before = api.get(f"environments/{robots}/versions/latest").json()
+    pgm = api.get(f"environments/{robots}/versions/latest/maps/occupancy_grid/one.pgm").content
+    key = {"idempotency-key": "merge-once"}
+    result = merge(api, robots, headers=key, merge={"drop": True, "seam": "newest"})
+    assert result["version"]["message"] == "Merged the grids one, two of ground"
+    assert grid_names(api, robots) == {"one", "apart"}
+    assert merge(api, robots, headers=key, merge={"drop": True, "seam": "newest"})["merge"] == result["merge"]
+    merge(api, robots, 412, headers={"if-match": f'"{before["version"]}"'}, merge={"grids": ["one", "apart"]})
+    api.post(f"environments/{robots}/versions", {"revert_to": before["version"]}, expect=201)
+    assert grid_names(api, robots) == {"one", "two", "apart"}
+    assert api.get(f"environments/{robots}/versions/latest/maps/occupancy_grid/one.pgm").content == pgm
+
+
+def test_merge_refuses_what_it_cannot_decide(api: Api, robots: str) -> None:
+    apart = {"grids": ["one", "apart"]}
+    refused = merge(api, robots, 422, merge=apart)
+    assert "apart: " in refused["detail"]
+    assert "give pairs" in refused["detail"]
+    assert refused["errors"][0]["where"] == "body.merge.grids.1"
+    preview = merge(api, robots, 200, merge=apart, dry_run=True)
+    assert preview["version"] is None
+    assert "problem" in preview["merge"]["grids"][1]
+    assert any("apart: " in w["problem"] for w in preview["warnings"])
+    # a place 6 m to the right of the hall's middle, in a frame that is turned by 10 degrees
+    c, s = math.cos(math.radians(10)), math.sin(math.radians(10))
+    pairs = [[[0, 0], [6.25 * c, -6.25 * s]], [[1, 0], [7.25 * c, -7.25 * s]]]
+    placed = merge(api, robots, merge={**apart, "pairs": {"apart": pairs}, "name": "both"})
+    assert math.degrees(placed["merge"]["grids"][1]["yaw"]) == pytest.approx(-10.0, abs=1e-3)
+    assert any("do not confirm" in w["problem"] for w in placed["warnings"])
+    assert grid_names(api, robots) == {"one", "two", "apart", "both"}
+
+
+def test_merge_with_bad_members_is_refused(api: Api, robots: str) -> None:
+    wrong: list[tuple[int, dict[str, Any], str]] = [
+        (422, {"grids": ["one", "one"]}, "named twice"),
+        (422, {"grids": ["one"]}, "at least 2"),
+        (404, {"grids": ["one", "moon"]}, "available: ground/apart"),
+        (409, {"name": "apart"}, "another grid has the name"),
+        (422, {"name": "a/b"}, "slash"),
+        (422, {"poses": {"one": [0, 0, 0]}}, "stays where it is"),
+        (422, {"poses": {"apart": [0, 0, 0]}}, "not one of the grids"),
+        (422, {"pairs": {"two": [[[0, 0], [0, 0]], [[0, 0], [0, 0]]]}}, "same position"),
+        (422, {"pairs": {"two": [[[0, 0], [9e6, 0]], [[1, 0], [9e6, 1]]]}}, "the limit is"),
+        (422, {"poses": {"two": [0, 0, 1e9]}}, "360"),
+        (422, {"seam": "best"}, "evidence"),
+    ]
+    for status, members, expected in wrong:
+        detail = merge(api, robots, status, merge=members)
+        assert expected in str(detail), members
+    excluded: list[dict[str, Any]] = [
+        {"grid": "two"},
+        {"onto": {}},
+        {"pairs": [[[0, 0], [0, 0]], [[1, 0], [1, 0]]]},
+    ]
+    for words in excluded:
+        assert "cannot be combined with merge" in merge(api, robots, 422, **words)["detail"]
+    assert "Grids of one level are merged" in merge(api, robots, 404, level="L2")["detail"]
+    assert merge(api, robots, 422, merge={"poses": {"two": [0, 0, 0]}}, angle=1, reach=0.1)["detail"]
+    assert grid_names(api, robots) == {"one", "two", "apart"}

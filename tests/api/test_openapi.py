@@ -16,6 +16,7 @@ from app.formats import all_formats, get_format
 from app.parameters import describe
 from tests.api import samples
 from tests.api.conftest import ADMIN, Api, parts, running, settings_for
+from tests.api.test_alignments import piece_files
 
 UPLOADED = {"datum.yaml": samples.DATUM}
 """Files that the upload examples name."""
@@ -231,6 +232,9 @@ def test_openapi_examples_work(api: Api, schema: dict[str, Any], tmp_path: Path)
             resource_ids[path] = draft_of(api)
         if path.endswith("/sources/{name}"):
             api.upload("orchard", UPLOADED)
+        if operation == "post /api/v1/environments/{env}/alignments":
+            for name, view in (("robot-1", (-3.0, 3.5, 10.0)), ("robot-2", (0.5, 9.0, 80.0))):
+                api.upload("orchard", piece_files(name, view), grid=name)
         if path == "/api/v1/environments/{env}/derivations":
             api.upload("orchard", {"lane.geojson": LANE})
         if _name((path, method, op)) == "purge_environment":

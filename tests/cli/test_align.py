@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.api.test_alignments import files
+from tests.api.test_alignments import files, piece_files
 from tests.cli.conftest import Fleetmap
 
 
@@ -116,3 +116,33 @@ def test_derive_lists_derivations_of_server(
     assert "no server set" in alone.err
     monkeypatch.setenv("FLEETMAP_TOKEN", "wrong")
     assert fleetmap("derive", "--server", "http://127.0.0.1:9").status == 0
+
+
+def test_align_merges_grids(fleetmap: Fleetmap, tmp_path: Path) -> None:
+    for name, view in (("one", (-3.0, 3.5, 10.0)), ("two", (0.5, 9.0, 80.0))):
+        for file, data in piece_files(name, view).items():
+            (tmp_path / file).write_bytes(data)
+        paths = (tmp_path / f"{name}.yaml", tmp_path / f"{name}.png")
+        assert fleetmap("import", *paths, "-e", "crew", "--grid", name).status == 0
+    preview = fleetmap("align", "crew", "--merge", "one", "two", "--name", "site", "--dry-run")
+    assert preview.status == 0, preview.err
+    assert "crew: ground/two turned by 70." in preview.out.replace("turned by 69.", "turned by 70.")
+    assert "m of walls in common" in preview.out
+    assert "nothing is stored" in preview.out
+    pose = ("--pose", "two=4.4,-0.8,75", "--angle", "10", "--reach", "1")
+    body = fleetmap("align", "crew", "--merge", "one", "two", *pose, "--seam", "newest", "--drop", "--json").json
+    assert math.degrees(body["merge"]["grids"][1]["yaw"]) == pytest.approx(70, abs=0.5)
+    assert body["merge"]["name"] == "one"
+    for wrong, says in (
+        (("--merge", "one"), "at least two grids"),
+        (("--merge", "one", "two", "--grid", "one"), "cannot be combined with --merge"),
+        (("one", "two"), "--merge to merge grids"),
+        (("one", "--drop"), "require --merge"),
+    ):
+        refused = fleetmap("align", "crew", *wrong)
+        assert refused.status == 2, wrong
+        assert says in " ".join(refused.err.replace("│", " ").split()), wrong
+    for option in (("--pose", "two=1,2"), ("--pair", "0,0=1,1")):
+        refused = fleetmap("align", "crew", "--merge", "one", "two", *option)
+        assert refused.status == 1
+        assert f"{option[0]} must be" in refused.err
