@@ -101,9 +101,9 @@ def places(
     for row in out.rows:
         along = np.array(between(row, step))
         offset = jitter(stream, len(along), max_offset)
-        there = present(stream, len(along), missing)
-        u = np.clip(along + offset[:, 0], row.low, row.high)[there]
-        rows.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[there, 1], strict=True)])
+        kept = present(stream, len(along), missing)
+        u = np.clip(along + offset[:, 0], row.low, row.high)[kept]
+        rows.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[kept, 1], strict=True)])
     return rows
 
 

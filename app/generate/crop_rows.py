@@ -97,8 +97,8 @@ def _row(site: Site, i: str, out: _field.Field, row: Row, options: CropRows, str
     along = np.array(_field.between(row, options.plant_spacing))
     offset = _trees.jitter(stream, len(along), options.jitter)
     size = 0.75 + 0.25 * stream.random((len(along), 2))
-    there = _trees.present(stream, len(along), options.missing)
-    along, offset, size = along[there], offset[there], size[there]
+    kept = _trees.present(stream, len(along), options.missing)
+    along, offset, size = along[kept], offset[kept], size[kept]
     shapes: list[dict[str, Any]] = []
     seen = []
     for position, (a, b), (c, d) in zip(along.tolist(), offset.tolist(), size.tolist(), strict=True):
