@@ -254,8 +254,8 @@ class Field:
 
     @property
     def steepest(self) -> float:
-        """Return the largest slope of a curved row against a straight one."""
-        return 2 * abs(self.curve) / self.reach
+        """Return the largest slope of a curved line against a straight one, at the fence."""
+        return 2 * abs(self.curve) * (self.reach + self.options.headland) / self.reach**2
 
     def to_local(self, u: float, v: float) -> tuple[float, float]:
         """Return a position in local metres."""
@@ -336,7 +336,7 @@ def open_field(site: Site, options: FieldOptions, lines: Sequence[Line], layout:
     if count is not None:
         lines = lines[:count]
     length = options.row_length or DEFAULT_ROW_METRES
-    _bend(out, layout, length + 2 * options.headland)
+    _bend(out, layout, length)
     room = min(layout.spacing, options.headland) / 2 - options.robot_radius - layout.half
     fence = site.set_fence(_outline(out, layout, length, len(lines)), room=room)
     if site.is_given:
@@ -354,16 +354,19 @@ def open_field(site: Site, options: FieldOptions, lines: Sequence[Line], layout:
     return out
 
 
-def _bend(out: Field, layout: Layout, across: float | None) -> None:
-    """Set the curve of the rows. across: metres along u from 0; None: those of the fence."""
-    out.curve = 0.0
-    low, high = 0.0, across or 0.0
-    if across is None:
-        low, _, high, _ = out.inner(0.0).bounds
+def _bend(out: Field, layout: Layout, length: float | None) -> None:
+    """Set the curve of the rows. length: of a row that begins a headland from u = 0; None: as the fence has it."""
+    out.curve, headland = 0.0, out.options.headland
+    low, high = headland, headland + (length or 0.0)
+    if length is None:
+        west, _, east, _ = out.inner(0.0).bounds
+        low, high = west + headland, east - headland
     out.middle, out.reach, out.curve = (low + high) / 2, max((high - low) / 2, 1.0), layout.curve
     if out.steepest > MAX_SLOPE:
         raise invalid_option_error(
-            "curve", f"{layout.curve:g} m is too much for rows of {high - low:.0f} m: at most {MAX_SLOPE / 4:g} of it"
+            "curve",
+            f"{layout.curve:g} m is too much for rows of {max(high - low, 0.0):.0f} m: they would turn by more than "
+            f"{math.degrees(math.atan(MAX_SLOPE)):.0f}°",
         )
 
 

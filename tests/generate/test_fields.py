@@ -40,10 +40,10 @@ PLAIN = {"angle": 0, "skew": 0, "taper": 0, "curve": 0, "missing": 0, "cross_ais
 """Parameters of a field with straight rows of equal length."""
 
 DIGESTS = {
-    "orchard": "0e86a32b7493455d101cad5dc70099acb8184000ec0b373fdfb35d5f84af40e0",
-    "crop_rows": "fc9c99282053075fc228b54363fb87d6e33ef4dafd2b83d39cb46050b808c827",
+    "orchard": "c4406877942ac51d6bef01ba0576a44cd3b992eb3fc32b900c948bf92dd29623",
+    "crop_rows": "304562043f852a428b9452e91484d4011da56802e0583cd996c4e27cc5f73929",
     "polytunnels": "6f72dae31d843aa8c702399fd7e70539b2c40bcf259c2eb281aa391313f4c67c",
-    "vineyard": "b621082604dbcec2e7ccc3eb1269d501f1789cff511e45d248a14851212db596",
+    "vineyard": "ba3c58f7f83cdf184d667f49505579bd51eb87117ff4e859f9c045fb0bbbbc9c",
     "warehouse": "a355e178bd1a86eebc18a1f0654290ca0d35fa528abe8abd7ca87268d2b98870",
 }
 HERE = Datum(53.2686, -0.5245, heading=12.0)
