@@ -7,6 +7,7 @@ neighbours stay close to the sample's; with lowest entropy first, rare patterns 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -289,7 +290,7 @@ def _fix(allowed: Bool, patches: U8, options: Options, place: _cells.GridFrame, 
     rows, columns = allowed.shape[0] * steps, allowed.shape[1] * steps
     for option, value in (("free", FREE), ("blocked", OCCUPIED)):
         for x, y in _points(getattr(options, option), option):
-            r, c = int((y - place.y) // size), int((x - place.x) // size)
+            r, c = (math.floor(v / size + 1e-9) for v in (y - place.y, x - place.x))
             if not (0 <= r < rows and 0 <= c < columns):
                 raise invalid_option_error(option, f"({x:g}, {y:g}) is outside the site")
             allowed[r // steps, c // steps] &= patches[:, r % steps, c % steps] == value
