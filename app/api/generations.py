@@ -22,6 +22,7 @@ from app.api.http.schemas import (
     problem_responses,
 )
 from app.errors import Invalid, NotFound, Problem
+from app.generate import LIKE
 from app.ingest import GenerationRequest
 
 
@@ -89,8 +90,11 @@ def create_generation(
     """Create a version whose provenance records generator, seed and parameters. The same values give the same layers.
 
     Layers that were generated before are replaced. Returns 409 if a layer was uploaded or edited, unless `replace` is
-    true.
+    true. The parameter `like` names an environment that the caller may read.
     """
+    like = body.parameters.get(LIKE)
+    if like not in (None, ""):
+        principal.require_environment(str(like))
     order = GenerationRequest(body.generator, body.seed, body.parameters, body.replace)
     try:
         described = commit.with_message(body.message).as_dry_run(body.dry_run)

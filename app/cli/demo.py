@@ -15,10 +15,27 @@ TITLE = "Demo orchard"
 DATUM = (52.4205, 5.6132)
 """Latitude and longitude of the local origin, the south-west corner of the yard. x runs east along the tree rows."""
 
+PLAIN: dict[str, Any] = {
+    "angle": 0.0,
+    "skew": 0.0,
+    "taper": 0.0,
+    "curve": 0.0,
+    "missing": 0.0,
+    "cross_aisles": 0,
+    "cross_width": 3.0,
+    "headland": 5.0,
+    "yard": 8.0,
+    "docks": 2,
+    "shed": 7.0,
+    "row_spacing": 3.6,
+    "tree_spacing": 1.8,
+}
+"""Straight rows along the x axis, so that examples can name places: nothing is drawn from the seed but trees."""
+
 SITE: dict[str, Any] = {
     "generator": "orchard",
     "seed": 7,
-    "parameters": {"datum": DATUM, "rows": 6, "row_length": 36.0},
+    "parameters": {"datum": DATUM, "rows": 6, "row_length": 36.0, **PLAIN},
     "message": "demo orchard",
 }
 

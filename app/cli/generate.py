@@ -194,7 +194,8 @@ def _write(
     notes = DerivationNotes()
     with output.progress_bar(f"generating {site}"):
         layers = generate.run(site, seed, generator_values, Layers(datum=datum), notes)
-        how = generate.step(site, seed, generator_values, {}, layers.datum if datum is None else None)
+        made_up = layers.datum if datum is None else None
+        how = generate.step(site, seed, generator_values, {}, made_up, generate.drawn_values(notes))
         came = Provenance("generated", steps=(how,))
         result = write_layers(layers, to, {n: v for n, v in values.items() if n not in ours}, came)
     report = replace(

@@ -17,7 +17,9 @@ import numpy as np
 from app import parameters, plugins
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Invalid, MissingLayer, NotFound, Problem
-from app.model.frame import Datum
+from app.generate import _likeness, _variety
+from app.model.fences import fences
+from app.model.frame import GROUND, Datum
 from app.model.layers import Layer, Layers, PartKey, is_empty
 from app.model.names import did_you_mean
 
@@ -26,6 +28,12 @@ MAX_CELLS = 2**26
 """Default name of a generated grid."""
 
 MAX_OBJECTS = 200_000
+
+DRAWN = "parameters"
+"""Subject of the note with the drawn values of parameters."""
+
+LIKE = "like"
+"""Name of the parameter that names another environment, of which a generator takes its ranges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +150,17 @@ def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, A
     return generator, parameters.parse(generator.parameters, values, f"parameter of {name}")
 
 
-def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: DerivationNotes) -> Layers:
+def run(
+    name: str,
+    seed: int,
+    values: Mapping[str, Any],
+    given: Layers,
+    notes: DerivationNotes,
+    like: Layers | None = None,
+) -> Layers:
     """Run a generator: return only new parts, with the datum and the levels of the whole.
+
+    like: the environment that the parameter ``like`` names, of which the ranges are measured.
 
     Raises NotFound, Invalid, MissingLayer (with the layers that it works on), CannotGenerate.
     """
@@ -157,7 +174,7 @@ def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: D
         raise MissingLayer(
             f"{name} needs {' or '.join(sorted(maker.changes))}, which is missing: upload a map or generate a site"
         )
-    generated_layers = maker.function(given, options, RandomSource(seed, name), notes)
+    generated_layers = _drawn_site(maker, options, RandomSource(seed, name), given, notes, like)
     fresh = {k: p for k, p in generated_layers.parts.items() if given.parts.get(k) is not p and not is_empty(p)}
     if not fresh:
         raise CannotGenerate(f"{name} generated nothing with these parameters: change them")
@@ -167,17 +184,69 @@ def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: D
     return Layers(fresh, given.datum or generated_layers.datum, generated_layers.levels)
 
 
+def _drawn_site(
+    maker: Generator, options: Any, source: RandomSource, given: Layers, notes: DerivationNotes, like: Layers | None
+) -> Layers:
+    """Run a generator with drawn values for parameters that are not set, and report them."""
+    measured, why = _measured(maker, options, like)
+    fenced = bool(_variety.spans(maker.parameters)) and GROUND in fences(given, lambda *_, **__: None)
+    draw = _variety.draw(options, source.stream, measured, fenced=fenced, why=why)
+    while True:
+        trial = DerivationNotes()
+        try:
+            out = maker.function(given, draw.options, source, trial)
+            break
+        except CannotGenerate as error:
+            other = draw.given_way(error)
+            if other is None:
+                raise  # what is wrong when every drawn value has given way is about values that were set
+            draw = other
+    if draw.values:
+        notes.fill(DRAWN, dict(draw.values), f"{draw.why}; set them to keep them")
+    notes.warnings += trial.warnings
+    notes.dropped += trial.dropped
+    notes.template += trial.template
+    return out
+
+
+def drawn_values(notes: DerivationNotes) -> dict[str, float]:
+    """Return the values of parameters that ``run`` drew, by its notes."""
+    return next((line.value for line in notes.template if line.subject == DRAWN), {})
+
+
+def _measured(maker: Generator, options: Any, like: Layers | None) -> tuple[Mapping[str, tuple[float, float]], str]:
+    """Return the ranges of the environment that ``like`` names, and where the ranges of all parameters come from."""
+    wanted = getattr(options, LIKE, None)
+    if wanted is None:
+        return {}, "drawn from the seed"
+    if like is None:
+        problem = "can be read only by a server: store the site in an environment of it"
+        raise CannotGenerate(f"{LIKE}: {wanted} {problem}", [Problem(problem, where=LIKE)])
+    names = {span.measured or name for name, span in _variety.spans(maker.parameters).items()}
+    ranges = _likeness.measure(like, names, wanted)
+    listed = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in sorted(ranges.items()))
+    return ranges, f"drawn from the seed, within what was measured in {wanted} ({listed})"
+
+
 def step(
-    name: str, seed: int, values: Mapping[str, Any], used: Mapping[PartKey, str], datum: Datum | None = None
+    name: str,
+    seed: int,
+    values: Mapping[str, Any],
+    used: Mapping[PartKey, str],
+    datum: Datum | None = None,
+    drawn: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return the provenance of a generation: enough to repeat it.
 
-    used: hashes of the parts that it read. datum: the one that it created.
+    used: hashes of the parts that it read. datum: the one that it created. drawn: values of parameters that were not
+    set (``drawn_values``).
     """
     generator, options = check(name, seed, values)
     defaults = {p["name"]: p["default"] for p in parameters.describe(generator.parameters)}
     members: dict[str, Any] = {"step": name, "seed": seed, "version": generator.version}
     members["parameters"] = {**defaults, **parameters.canonical(options)}
+    if drawn:
+        members["drawn"] = dict(drawn)
     if datum is not None:
         members["datum"] = datum.as_dict()
     if used:

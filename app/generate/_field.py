@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import shapely
 
-from app.generate._shapes import mm, rectangle, round_geometry
+from app.generate._shapes import angle, mm, rectangle, round_geometry
 from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_option_error
+from app.generate._variety import drawn
 from app.parameters import parameter
 
 MIN_AISLE_METRES = 2.0
@@ -26,35 +27,163 @@ MIN_AISLE_METRES = 2.0
 
 MAX_ROWS = 500
 
+MARGIN_METRES = 2.0
+"""Distance of a field without a fence from the origin, in metres."""
+
+DEFAULT_ROW_METRES = 40.0
+"""Length of rows by which an environment's fence is not yet known, in metres."""
+
+CURVE_STEP_METRES = 2.0
+"""Length of the straight pieces of a curved row, in metres."""
+
+MAX_SLOPE = 0.4
+"""Maximum slope of a curved row against a straight one."""
+
+MAX_SLANT = 1.0
+"""Maximum metres by which a field without a fence widens or leans for each metre across the rows."""
+
+MIN_PIECE_METRES = 3.0
+"""Minimum length of a row's piece between two aisles across, in metres."""
+
 
 @dataclass(frozen=True, slots=True)
 class FieldOptions(SiteOptions):
     """Parameters that every field has."""
 
-    row_length: float | None = parameter(
+    like: str | None = parameter(
         None,
-        "maximum length of a row; default: as long as the fence allows, 40 without a fence",
+        "environment of the server whose rows are measured (network, objects, grid): parameters that are not set are "
+        "drawn from its ranges",
+    )
+    row_length: float | None = drawn(
+        28.0,
+        60.0,
+        "maximum length of a row",
+        step=0.5,
         minimum=3.0,
         maximum=1000.0,
         unit="m",
+        fence="as long as the fence allows",
+        yields="high",
+        helps=("docks", "yard"),
     )
-    headland: float = parameter(
-        5.0,
+    angle: float | None = drawn(
+        0.0,
+        179.5,
+        "direction of the rows, counter-clockwise from the x axis",
+        step=0.5,
+        minimum=-360.0,
+        maximum=360.0,
+        unit="°",
+        fence="along the fence's longest side",
+    )
+    skew: float | None = drawn(
+        -14.0,
+        14.0,
+        "angle by which the rows' starts lean against the direction across the rows",
+        step=0.5,
+        minimum=-45.0,
+        maximum=45.0,
+        unit="°",
+        fence="as the fence has it",
+    )
+    taper: float | None = drawn(
+        -0.25,
+        0.15,
+        "share by which the last row is longer than the first",
+        step=0.01,
+        minimum=-0.6,
+        maximum=0.6,
+        fence="as the fence has it",
+        yields="zero",
+    )
+    headland: float = drawn(
+        3.5,
+        7.0,
         "depth of the headland between a row's end and the fence, where robots turn",
+        step=0.1,
         minimum=1.5,
         maximum=50.0,
         unit="m",
+        yields="low",
+        helps=("yard", "docks", "rows_per_tunnel"),
     )
-    yard: float = parameter(8.0, "depth of the yard along the longest side", minimum=6.0, maximum=50.0, unit="m")
-    docks: int = parameter(2, "number of charging docks in the yard", minimum=1, maximum=20)
+    yard: float = drawn(
+        7.0,
+        12.0,
+        "depth of the yard along the longest side",
+        step=0.5,
+        minimum=6.0,
+        maximum=50.0,
+        unit="m",
+        yields="low",
+        helps=("headland",),
+    )
+    docks: int = drawn(1, 4, "number of charging docks in the yard", step=1, minimum=1, maximum=20, yields="low")
     node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
+
+
+@dataclass(frozen=True, slots=True)
+class FarmOptions(FieldOptions):
+    """Parameters of fields with a farm's yard."""
+
+    shed: float = drawn(
+        0.0, 12.0, "length of the shed in the yard; 0: none", step=4.0, minimum=0.0, maximum=50.0, unit="m"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class RowOptions(FarmOptions):
+    """Parameters of fields whose rows are of single plants: they may be curved, crossed and have gaps."""
+
+    curve: float | None = drawn(
+        -1.5,
+        1.5,
+        "how far the middle of the field's rows lies beside the line between their ends",
+        step=0.1,
+        minimum=-50.0,
+        maximum=50.0,
+        unit="m",
+        fence="0 in a fence",
+        yields="zero",
+    )
+    missing: float = drawn(
+        0.0, 0.08, "share of plants that are missing, some beside each other", step=0.005, minimum=0.0, maximum=0.9
+    )
+    cross_aisles: int = drawn(
+        0, 1, "number of aisles across all rows", step=1, minimum=0, maximum=20, yields="low", helps=("row_length",)
+    )
+    cross_width: float = drawn(
+        3.0, 5.0, "width of an aisle across the rows", step=0.1, minimum=1.0, maximum=30.0, unit="m"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How the rows of a field lie; metres.
+
+    Attributes:
+        spacing: from one row to the next.
+        half: from a row's centre to its side, including all jitter.
+        word: the parameter that decides ``half``.
+        curve: how far the middle of a row lies beside the line between its ends.
+        crossings, crossing_width: aisles across the rows.
+    """
+
+    spacing: float
+    half: float
+    word: str = "row_spacing"
+    curve: float = 0.0
+    crossings: int = 0
+    crossing_width: float = 0.0
 
 
 @dataclass(slots=True)
 class Aisle:
     """Aisle between two rows. low, high: its ends along u.
 
-    west, east: whether a robot can change there to the aisle before it.
+    west, east: whether a robot can change there to the aisle before it. crossings: u of the aisles across the rows, by
+    their number; crossed: of those on which a robot can change to the aisle before it.
     """
 
     name: str
@@ -63,17 +192,28 @@ class Aisle:
     high: float
     west: bool = False
     east: bool = False
+    crossings: dict[int, float] = field(default_factory=dict)
+    crossed: set[int] = field(default_factory=set)
 
 
 @dataclass(slots=True)
 class Row:
-    """Row or other line between two aisles. number: from 1 in its kind. low, high: its ends along u."""
+    """Row or other line between two aisles. number: from 1 in its kind. low, high: its ends along u.
+
+    part: of a row that aisles cross, from 1; 0 if none does.
+    """
 
     number: int
     v: float
     low: float
     high: float
     kind: str
+    part: int = 0
+
+    @property
+    def name(self) -> str:
+        """Its number, and a letter for each part of a crossed row: 3, 4a, 4b."""
+        return f"{self.number}{chr(96 + self.part) if self.part else ''}"
 
     @property
     def length(self) -> float:
@@ -92,33 +232,66 @@ class Line:
 
 @dataclass(slots=True)
 class Field:
-    """Field on a site. yaw: of the rows. origin: local metres of u = v = 0."""
+    """Field on a site. yaw: of the rows. origin: local metres of u = v = 0. middle, reach: of the rows along u."""
 
     site: Site
     options: FieldOptions
     yaw: float
     origin: tuple[float, float]
+    curve: float = 0.0
+    middle: float = 0.0
+    reach: float = 1.0
     rows: list[Row] = field(default_factory=list)
     aisles: list[Aisle] = field(default_factory=list)
+
+    def bend(self, u: Any) -> Any:
+        """Return by how many metres a curved row lies beside a straight one at u (a number or an array)."""
+        return self.curve * (1.0 - ((u - self.middle) / self.reach) ** 2) if self.curve else 0.0 * u
+
+    def heading(self, u: float) -> float:
+        """Return the direction of the rows at u."""
+        return angle(self.yaw + math.atan(-2 * self.curve * (u - self.middle) / self.reach**2))
+
+    @property
+    def steepest(self) -> float:
+        """Return the largest slope of a curved line against a straight one, at the fence."""
+        return 2 * abs(self.curve) * (self.reach + self.options.headland) / self.reach**2
 
     def to_local(self, u: float, v: float) -> tuple[float, float]:
         """Return a position in local metres."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
+        v = v + self.bend(u)
         return mm(self.origin[0] + c * u - s * v), mm(self.origin[1] + s * u + c * v)
+
+    def shape_to_local(self, shape: Any) -> Any:
+        """Convert a shape of the field's frame to local metres."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+
+        def moved(uv: Any) -> Any:
+            u, v = uv[:, 0], uv[:, 1] + self.bend(uv[:, 0])
+            return np.column_stack([self.origin[0] + c * u - s * v, self.origin[1] + s * u + c * v])
+
+        return round_geometry(shapely.transform(self.dense(shape), moved))
+
+    def dense(self, shape: Any) -> Any:
+        """Return a shape with corners close enough that its sides follow curved rows."""
+        return shapely.segmentize(shape, CURVE_STEP_METRES) if self.curve else shape
 
     def area(self, low_u: float, low_v: float, high_u: float, high_v: float) -> Any:
         """Return a rectangle of the field, within the fence, in local metres."""
-        corners = [self.to_local(u, v) for u, v in ((low_u, low_v), (high_u, low_v), (high_u, high_v), (low_u, high_v))]
-        return round_geometry(shapely.intersection(shapely.Polygon(corners), self.site.fence))
+        whole = self.shape_to_local(shapely.box(low_u, low_v, high_u, high_v))
+        return round_geometry(shapely.intersection(whole, self.site.fence))
 
     def strip(self, row: Row, width: float) -> Any:
         """Return the ground of a row, in local metres."""
+        if self.curve:
+            return self.shape_to_local(shapely.box(row.low, row.v - width / 2, row.high, row.v + width / 2))
         x, y = self.to_local((row.low + row.high) / 2, row.v)
         return rectangle(x, y, self.yaw, row.length, width)
 
     def line(self, row: Row) -> Any:
         """Return a row's centreline, in local metres."""
-        return shapely.LineString([self.to_local(row.low, row.v), self.to_local(row.high, row.v)])
+        return self.shape_to_local(shapely.LineString([(row.low, row.v), (row.high, row.v)]))
 
     def trim_after(self, kind: str) -> None:
         """Drop everything after the last line of a kind."""
@@ -133,9 +306,10 @@ class Field:
 
         def turned(xy: Any) -> Any:
             d = xy - np.array(self.origin)
-            return np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]])
+            u = c * d[:, 0] + s * d[:, 1]
+            return np.column_stack([u, c * d[:, 1] - s * d[:, 0] - self.bend(u)])
 
-        return shapely.buffer(shapely.transform(self.site.fence, turned), -margin, join_style="mitre")
+        return shapely.transform(self.dense(shapely.buffer(self.site.fence, -margin, join_style="mitre")), turned)
 
 
 def number_rows(rows: int) -> list[Line]:
@@ -143,45 +317,93 @@ def number_rows(rows: int) -> list[Line]:
     return [Line("row", k, f"r{k}.5") for k in range(1, rows + 1)]
 
 
-def open_field(
-    site: Site,
-    options: FieldOptions,
-    lines: Sequence[Line],
-    *,
-    row_count: int | None,
-    spacing: float,
-    half: float,
-    word: str = "row_spacing",
-    length: float = 40.0,
-) -> Field:
+def row_layout(options: RowOptions, spacing: float, half: float, word: str = "row_spacing") -> Layout:
+    """Return the layout of a field of single plants; see ``Layout``."""
+    crossings = (options.cross_aisles, options.cross_width)
+    return Layout(spacing, half, word, options.curve or 0.0, *crossings)
+
+
+def open_field(site: Site, options: FieldOptions, lines: Sequence[Line], layout: Layout, *, count: int | None) -> Field:
     """Lay out a field on the site, with the rows and aisles that its fence can contain.
 
     Args:
         lines: the sequence of lines, at most.
-        row_count: number of lines of a site without a fence; None: all, if they were requested.
-        spacing: metres from one to the next.
-        half: metres from a row's centre to its side, including all jitter.
-        word: the parameter that decides ``half``.
+        count: number of lines that were requested, and of a site without a fence; None: as many as the fence contains.
 
     Raises CannotGenerate if a robot has no room.
     """
-    margin = 2.0
-    count = len(lines) if row_count is None else row_count
-    across = (options.row_length or length) + 2 * options.headland
-    depth = options.yard + options.headland * 1.5 + (count - 1) * spacing
-    room = min(spacing, options.headland) / 2 - options.robot_radius - half
-    fence = site.set_fence(shapely.box(-margin, -margin, across - margin, depth - margin), room=room)
-    out = Field(site, options, 0.0, (-margin, -margin))
-    if site.is_given:
-        out.yaw, out.origin = _longest(fence)
-    else:
+    out = Field(site, options, math.radians(options.angle or 0.0), (-MARGIN_METRES, -MARGIN_METRES))
+    if count is not None:
         lines = lines[:count]
-    _check_room(site, options, spacing, half, word)
-    _lay(out, lines, spacing, count_lost=row_count is None)
+    length = options.row_length or DEFAULT_ROW_METRES
+    _bend(out, layout, length)
+    room = min(layout.spacing, options.headland) / 2 - options.robot_radius - layout.half
+    fence = site.set_fence(_outline(out, layout, length, len(lines)), room=room)
+    if site.is_given:
+        for word in ("skew", "taper"):
+            if getattr(options, word) is not None:
+                raise invalid_option_error(word, "the environment's fence decides where rows end: omit it")
+        out.yaw, out.origin = _longest(fence) if options.angle is None else _along(fence, options.angle)
+        _bend(out, layout, None)
+    _check_room(out, options, layout)
+    _lay(out, lines, layout, count_lost=count is not None)
+    _cross(out, layout)
     nodes = 2 + 2 * options.docks + sum(len(stops(out, aisle)) for aisle in out.aisles[1:])
     if nodes > MAX_NODES - 200:
         raise invalid_option_error("node_spacing", f"there would be {nodes} nodes; the limit is {MAX_NODES - 200}")
     return out
+
+
+def _bend(out: Field, layout: Layout, length: float | None) -> None:
+    """Set the curve of the rows. length: of a row that begins a headland from u = 0; None: as the fence has it."""
+    out.curve, headland = 0.0, out.options.headland
+    low, high = headland, headland + (length or 0.0)
+    if length is None:
+        west, _, east, _ = out.inner(0.0).bounds
+        low, high = west + headland, east - headland
+    out.middle, out.reach, out.curve = (low + high) / 2, max((high - low) / 2, 1.0), layout.curve
+    if out.steepest > MAX_SLOPE:
+        raise invalid_option_error(
+            "curve",
+            f"{layout.curve:g} m is too much for rows of {max(high - low, 0.0):.0f} m: they would turn by more than "
+            f"{math.degrees(math.atan(MAX_SLOPE)):.0f}°",
+        )
+
+
+def _outline(out: Field, layout: Layout, length: float, count: int) -> Any:
+    """Return the fence of a field without one, in local metres: it leans and widens as the rows do."""
+    options, turn = out.options, out.options.headland / 2
+    lean = math.tan(math.radians(options.skew or 0.0))
+    depth = options.yard + 1.5 * options.headland + (count - 1) * layout.spacing
+    field_depth = (count - 1) * layout.spacing
+    widening = (options.taper or 0.0) * length
+    slant = lean + (widening / field_depth if field_depth > 0 else 0.0)
+    if abs(slant) > MAX_SLANT:
+        raise invalid_option_error(
+            "taper",
+            f"rows of {length:g} m would change by more than {MAX_SLANT:g} of the distance between them: use less",
+        )
+    west, east = (turn * (math.hypot(1.0, v) + 1.0) + layout.spacing * abs(v) / 2 for v in (lean, slant))
+    first = options.yard + turn  # the fence is straight along the yard
+    back = depth - first
+    corners = [
+        (0.0, 0.0),
+        (length + west + east, 0.0),
+        (length + west + east, first),
+        (length + west + east + slant * back, depth),
+        (lean * back, depth),
+        (0.0, first),
+    ]
+    return out.shape_to_local(shapely.Polygon(corners))
+
+
+def _along(fence: Any, direction: float) -> tuple[float, tuple[float, float]]:
+    """Return (yaw, start) of rows in a direction, degrees: from the fence's first corner across them."""
+    yaw = angle(math.radians(direction))
+    ring = shapely.get_coordinates(fence.exterior)
+    across = np.round(-math.sin(yaw) * ring[:, 0] + math.cos(yaw) * ring[:, 1], 3)
+    x, y = ring[int(np.argmin(across))].tolist()
+    return yaw, (mm(x), mm(y))
 
 
 def _longest(fence: Any) -> tuple[float, tuple[float, float]]:
@@ -194,24 +416,26 @@ def _longest(fence: Any) -> tuple[float, tuple[float, float]]:
     return round(math.atan2(dy, dx), 6), (mm(x), mm(y))
 
 
-def _check_room(site: Site, options: FieldOptions, spacing: float, half: float, word: str) -> None:
+def _check_room(out: Field, options: FieldOptions, layout: Layout) -> None:
     """Check that a robot fits between two rows, and around their ends."""
-    needed = options.robot_radius + half + SLACK * site.resolution
-    if spacing / 2 < needed:
-        raise invalid_option_error(
-            word,
-            f"rows {spacing:.2f} m apart that reach {half:.2f} m to each side are too close for a robot of radius "
-            f"{options.robot_radius:g} m: at least {2 * needed:.2f} m are needed with cells of {site.resolution:g} m",
-        )
+    size = out.site.resolution
+    needed = (options.robot_radius + layout.half + SLACK * size) * math.hypot(1.0, out.steepest)
+    for word, width in ((layout.word, layout.spacing), ("cross_width", layout.crossing_width + 2 * layout.half)):
+        if width / 2 < needed and (word == layout.word or layout.crossings):
+            raise invalid_option_error(
+                word,
+                f"rows {width:.2f} m apart that reach {layout.half:.2f} m to each side are too close for a robot of "
+                f"radius {options.robot_radius:g} m: at least {2 * needed:.2f} m are needed with cells of {size:g} m",
+            )
     if options.headland / 2 < needed:
         raise invalid_option_error(
             "headland", f"must be at least {2 * needed:.2f} m for robots to turn, got {options.headland:g} m"
         )
 
 
-def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool) -> None:
+def _lay(out: Field, lines: Sequence[Line], layout: Layout, *, count_lost: bool) -> None:
     """Return rows and aisles, from the lane up to the end of the fence."""
-    options, site = out.options, out.site
+    options, site, spacing = out.options, out.site, layout.spacing
     turn = options.headland / 2
     inner = out.inner(turn)
     drive = out.inner(options.robot_radius + SLACK * site.resolution)
@@ -227,7 +451,8 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool)
             f"the fence has no room for a lane of {options.headland + MIN_AISLE_METRES:g} m behind a yard of "
             f"{options.yard:g} m",
         )
-    lane = _longest_aisle(lane, options)
+    limit = options.row_length if site.is_given else None
+    lane = _longest_aisle(lane, limit, options)
     out.aisles.append(Aisle("Lane", v, *lane))
     v += turn
     left = 0
@@ -236,7 +461,7 @@ def _lay(out: Field, lines: Sequence[Line], spacing: float, *, count_lost: bool)
         last = k == len(lines) - 1
         span = None if last else _widest_row(inner, v + spacing / 2, (before.low, before.high))
         if span is not None:
-            span = _longest_aisle(span, options, (before.low, before.high))
+            span = _longest_aisle(span, limit, options, (before.low, before.high))
         if span is None or span[1] - span[0] < options.headland + MIN_AISLE_METRES:
             span = None
         after = None if span is None else Aisle(line.aisle, v + spacing / 2, *span)
@@ -285,16 +510,44 @@ def _widest_row(area: Any, v: float, before: tuple[float, float] | None) -> tupl
 
 
 def _longest_aisle(
-    reach: tuple[float, float], options: FieldOptions, before: tuple[float, float] | None = None
+    reach: tuple[float, float], limit: float | None, options: FieldOptions, before: tuple[float, float] | None = None
 ) -> tuple[float, float]:
-    """Return an aisle for rows of maximum length: from its start, or from the start of the one before."""
-    if options.row_length is None:
+    """Return an aisle for rows of a maximum length: from its start, or from the start of the one before."""
+    if limit is None:
         return reach
     low = reach[0] if before is None else max(reach[0], before[0])
-    return low, min(reach[1], mm(low + options.row_length + 2 * options.headland / 2))
+    return low, min(reach[1], mm(low + limit + 2 * options.headland / 2))
 
 
-# --- network and yard -------------------------------------------------------------------------------------------------
+def _cross(out: Field, layout: Layout) -> None:
+    """Lead aisles across the rows, at equal distances, where they leave pieces of rows on both sides."""
+    drive = out.inner(out.options.robot_radius + SLACK * out.site.resolution)
+    low = float(np.median([row.low for row in out.rows]))
+    high = float(np.median([row.high for row in out.rows]))
+    half = layout.crossing_width / 2
+    places = {k: mm(low + (high - low) * k / (layout.crossings + 1)) for k in range(1, layout.crossings + 1)}
+    if layout.crossings and (high - low) / (layout.crossings + 1) < 2 * half + MIN_PIECE_METRES:
+        raise invalid_option_error(
+            "cross_aisles",
+            f"rows of {high - low:.1f} m have no room for {layout.crossings} of {2 * half:g} m: use fewer, or longer "
+            "rows",
+        )
+    rows: list[Row] = []
+    split: dict[float, set[int]] = {}
+    for row in out.rows:
+        near = {k: u for k, u in places.items() if row.low + 1.0 < u - half and u + half < row.high - 1.0}
+        split[row.v] = set(near)
+        cuts = [row.low, *itertools.chain.from_iterable((u - half, u + half) for u in near.values()), row.high]
+        for part, (a, b) in enumerate(zip(cuts[::2], cuts[1::2], strict=True), 1):
+            rows.append(Row(row.number, row.v, mm(a), mm(b), row.kind, part if near else 0))
+    out.rows = rows
+    for before, after in itertools.pairwise(out.aisles):
+        open_at = split.get(next((v for v in split if before.v < v < after.v), math.nan), set())
+        for k in open_at:
+            u = places[k]
+            if drive.contains(out.dense(shapely.LineString([(u, before.v), (u, after.v)]))):
+                before.crossings[k] = after.crossings[k] = u
+                after.crossed.add(k)
 
 
 def stops(out: Field, aisle: Aisle) -> list[tuple[str, float]]:
@@ -303,131 +556,14 @@ def stops(out: Field, aisle: Aisle) -> list[tuple[str, float]]:
     first, last = aisle.low + turn, aisle.high - turn
     steps = max(1, round((last - first) / out.options.node_spacing))
     inner = [(f"c{k - 1}", first + (last - first) * k / steps) for k in range(1, steps)]
-    return [("ca", aisle.low), ("cb", first), *inner, ("cy", last), ("cz", aisle.high)]
-
-
-def network(
-    out: Field,
-    on_lane: Mapping[str, float],
-    *,
-    aisle_speed: float,
-    lane_speed: float,
-    along: str = "row_traversal",
-    change: str = "row_change",
-    one_way: bool = False,
-) -> None:
-    """Add edges of lane and aisles, and the nodes of both. on_lane: nodes already on the lane, and their u.
-
-    one_way: aisles are driven alternately from low to high u and back, as far as both ends are connected.
-    """
-    site, lane = out.site, out.aisles[0]
-    at_ends = (("LaneWest", lane.low), ("LaneEast", lane.high))
-    for name, u in at_ends:
-        site.node(name, out.to_local(u, lane.v), yaw=out.yaw)
-    listed = sorted([*((u, name) for name, u in on_lane.items()), *((u, name) for name, u in at_ends)])
-    for (_, a), (_, b) in itertools.pairwise(listed):
-        site.add_edges(a, b, speed=lane_speed)
-    ends, round_both = {"Lane": ("LaneWest", "LaneEast")}, True
-    for number, aisle in enumerate(out.aisles[1:]):
-        round_both = round_both and aisle.west and aisle.east
-        names = [
-            site.node(f"{aisle.name}-{name}", out.to_local(u, aisle.v), yaw=out.yaw) for name, u in stops(out, aisle)
-        ]
-        single = one_way and round_both
-        for a, b in itertools.pairwise(names if number % 2 == 0 else names[::-1]):
-            site.add_edges(a, b, action=along, speed=aisle_speed, both=not single)
-        ends[aisle.name] = (names[0], names[-1])
-    for before, after in itertools.pairwise(out.aisles):
-        for side, good in ((0, after.west), (1, after.east)):
-            if good:
-                action = "move_base" if before is lane else change
-                site.add_edges(ends[before.name][side], ends[after.name][side], action=action, speed=lane_speed)
-
-
-def _pitch(options: FieldOptions) -> float:
-    """Return the distance in metres from one dock to the next."""
-    return mm(max(1.5, 2 * options.robot_radius + 0.6))
-
-
-def _lane_nodes(out: Field) -> dict[str, float]:
-    """Return u of the yard's nodes on the lane."""
-    lane, options = out.aisles[0], out.options
-    pitch = _pitch(options)
-    middle = mm((lane.low + lane.high + options.docks * pitch) / 2)
-    positions = {f"Yard{k + 1}": mm(middle - k * pitch) for k in range(options.docks)}
-    positions["YardGate"] = mm(middle - options.docks * pitch - 1.0)
-    return positions
-
-
-def yard(out: Field) -> dict[str, float]:
-    """Add the yard along the longest side: docks, a gate, a barn and a water tank, as far as there is room.
-
-    Returns its nodes on the lane, and their u.
-    """
-    site, options, lane = out.site, out.options, out.aisles[0]
-    positions = _lane_nodes(out)
-    radius = options.robot_radius
-    reach = lane.v - max(2.0, 2 * radius + 0.5)
-    first, gate = positions["Yard1"], positions["YardGate"]
-    if gate - 0.5 < lane.low or first + 0.5 > lane.high:
-        raise invalid_option_error(
-            "docks", f"the lane of {lane.high - lane.low:.1f} m has no room for {options.docks} docks"
-        )
-    low_u, high_u = max(lane.low, gate - 2.0), min(lane.high, first + radius + 14.0)
-    site.draw(out.area(low_u, 0.0, high_u, lane.v + 1.0), "gravel")
-    free = shapely.buffer(site.fence, -0.3)
-    for name, u in positions.items():
-        site.node(name, out.to_local(u, lane.v), yaw=out.yaw)
-    for k in range(options.docks):
-        u = positions[f"Yard{k + 1}"]
-        dock = f"Dock{k + 1}"
-        facing = out.yaw - math.pi / 2
-        charging: dict[str, Any] = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
-        site.node(dock, out.to_local(u, reach), yaw=facing, **charging)
-        site.add_edges(f"Yard{k + 1}", dock, speed=0.5)
-        behind = mm(reach - radius - 2 * SLACK * site.resolution - 0.25)
-        place = out.to_local(u, behind)
-        open_to = lowest(out, u, min(radius + 0.3, options.headland / 2))
-        if open_to is None or open_to > reach or not free.contains(rectangle(*place, out.yaw, 0.6, 0.4)):
-            raise invalid_option_error(
-                "yard", f"{options.yard:g} m is too shallow for the docks of a robot of radius {radius:g} m"
-            )
-        site.box(
-            f"charger{k + 1}", "machine", place, (0.6, 0.4, 0.9), yaw=out.yaw, colour="charger", name=f"Charger {k + 1}"
-        )
-    below = lowest(out, gate, min(radius + 0.5, options.headland / 2))
-    if below is None or lane.v - below < 0.5:
-        raise invalid_option_error("yard", f"{options.yard:g} m is too shallow for a gate")
-    site.node("Gate", out.to_local(gate, below), yaw=out.yaw + math.pi / 2)
-    site.add_edges("YardGate", "Gate", speed=0.5)
-    start = first + radius + 1.0
-    depth = mm(min(5.0, lane.v - 2.5 - radius))
-    barn = out.to_local(start + 3.5, 0.5 + depth / 2)
-    tank = out.to_local(start + 9.0, 2.0)
-    if free.contains(rectangle(*barn, out.yaw, 7.0, depth)):
-        site.box("barn", "building", barn, (7.0, depth, 4.0), yaw=out.yaw, colour="roof", name="Barn")
-    else:
-        site.notes.drop("barns", 1, "the yard has no room for it")
-    wet = shapely.Point(tank).buffer(1.5, quad_segs=4)
-    if free.contains(wet):
-        site.post("tank", "obstacle", tank, 1.0, 2.2, colour="water", name="Water tank")
-        site.zone("keepout-tank", "keepout", wet, name="Water tank")
-    else:
-        site.notes.drop("water tanks", 1, "the yard has no room for it")
-    slow = out.area(low_u, 0.0, high_u, lane.v + 1.0)
-    if slow.geom_type == "Polygon":
-        site.zone("speed-yard", "speed", slow, name="Yard", value=0.5)
-    return positions
-
-
-def lowest(out: Field, u: float, margin: float) -> float | None:
-    """Return the lowest v below the lane that is straight ahead and at least a margin from the fence; else None."""
-    inner, top = out.inner(margin), out.aisles[0].v
-    if inner.is_empty:
-        return None
-    cut = shapely.intersection(inner, shapely.LineString([(u, inner.bounds[1] - 1), (u, top)]))
-    pieces = [p.bounds for p in shapely.get_parts(cut) if p.geom_type == "LineString"]
-    return next((mm(low) for _, low, _, high in pieces if abs(high - top) < 1e-6), None)
+    inner += [(f"x{k}", u) for k, u in aisle.crossings.items()]
+    return [
+        ("ca", aisle.low),
+        ("cb", first),
+        *sorted(inner, key=lambda stop: stop[1]),
+        ("cy", last),
+        ("cz", aisle.high),
+    ]
 
 
 def ground(out: Field, *, field_colour: str, lane_colour: str = "path") -> None:

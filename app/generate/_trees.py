@@ -21,6 +21,9 @@ MAX_TREES = 40_000
 """Maximum number of trees: a trunk and a crown have 144 triangles, and a derivation reads ten million."""
 
 MAX_PLANTS = 50_000
+MISSING_BESIDE = 0.3
+"""Share of the places beside a missing plant that are empty too: diseases and machines take neighbours."""
+
 MAX_PER_ROW = 9_000
 """Maximum number of solids of one object; ``app.model.solids`` reads 10 000."""
 
@@ -90,13 +93,29 @@ def jitter(stream: np.random.Generator, count: int, max_offset: float) -> Any:
     return np.round((2.0 * stream.random((count, 2)) - 1.0) * max_offset, 3)
 
 
-def places(out: Field, stream: np.random.Generator, kind: str, step: float, max_offset: float) -> list[list[Any]]:
-    """Return the positions (u, v) of plants in the rows of a kind, row by row; none beyond a row's ends."""
+def places(
+    out: Field, stream: np.random.Generator, step: float, max_offset: float, missing: float = 0.0
+) -> list[list[tuple[float, float]]]:
+    """Return the positions (u, v) of plants, row by row; none beyond a row's ends. missing: share that is not there."""
     rows = []
     for row in out.rows:
-        if row.kind == kind:
-            along = np.array(between(row, step))
-            offset = jitter(stream, len(along), max_offset)
-            u = np.clip(along + offset[:, 0], row.low, row.high)
-            rows.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[:, 1], strict=True)])
+        along = np.array(between(row, step))
+        offset = jitter(stream, len(along), max_offset)
+        kept = present(stream, len(along), missing)
+        u = np.clip(along + offset[:, 0], row.low, row.high)[kept]
+        rows.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[kept, 1], strict=True)])
     return rows
+
+
+def present(stream: np.random.Generator, count: int, missing: float) -> Any:
+    """Draw which of the plants in a row are there: bool [count]. Beside a missing one others are more often missing.
+
+    The first and the last one of a row are there: people replant at its ends, and a row is as long as it says.
+    """
+    out = np.ones(count, bool)
+    chances = stream.random(count)
+    again = max(missing, MISSING_BESIDE) if missing else 0.0
+    first = missing * (1.0 - again) / (1.0 - missing)  # so that the share of missing ones is the wanted one
+    for k in range(1, count - 1):
+        out[k] = chances[k] >= (first if out[k - 1] else again)
+    return out

@@ -5,25 +5,53 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from app.derive import DerivationNotes
-from app.generate import RandomSource, _field, _trees, generates
-from app.generate._field import FieldOptions
+from app.generate import RandomSource, _field, _field_network, _trees, generates
+from app.generate._field import RowOptions
 from app.generate._site import Site, invalid_option_error
+from app.generate._variety import drawn
 from app.model.layers import Layers
 from app.parameters import parameter
 
 
 @dataclass(frozen=True, slots=True)
-class Orchard(FieldOptions):
-    """Parameters of an orchard."""
+class Orchard(RowOptions):
+    """Parameters of an orchard.
 
-    rows: int | None = parameter(
-        None,
-        "number of tree rows; default: as many as fit into the fence, 8 without one",
+    Ranges: intensive and semi-dwarf apples and cherries (Robinson et al., The tall spindle apple production system,
+    2006; Ontario Ministry of Agriculture, Orchard design for the new apple orchard).
+    """
+
+    rows: int | None = drawn(
+        5,
+        12,
+        "number of tree rows",
+        step=1,
         minimum=2,
         maximum=_field.MAX_ROWS,
+        fence="as many as fit into the fence",
     )
-    row_spacing: float = parameter(3.6, "distance between rows", minimum=1.0, maximum=30.0, unit="m")
-    tree_spacing: float = parameter(1.8, "distance between trees in a row", minimum=0.5, maximum=30.0, unit="m")
+    row_spacing: float = drawn(
+        3.0,
+        5.0,
+        "distance between rows",
+        step=0.05,
+        minimum=1.0,
+        maximum=30.0,
+        unit="m",
+        yields="high",
+        helps=("headland",),
+    )
+    tree_spacing: float = drawn(
+        1.0,
+        2.8,
+        "distance between trees in a row",
+        step=0.05,
+        minimum=0.5,
+        maximum=30.0,
+        unit="m",
+        yields="high",
+        measured="plant_spacing",
+    )
     jitter: float = parameter(0.1, "maximum random offset of a tree", minimum=0.0, maximum=5.0, unit="m")
     tree_height: float = parameter(3.2, "height of the trees", minimum=1.0, maximum=30.0, unit="m")
     crown_diameter: float = parameter(1.6, "diameter of the trees' crowns", minimum=0.3, maximum=20.0, unit="m")
@@ -34,6 +62,7 @@ class Orchard(FieldOptions):
     {"location", "objects", "occupancy", "topology", "zones", "imagery", "resources"},
     parameters=Orchard,
     also={"location"},
+    version=2,
 )
 def orchard(given: Layers, options: Orchard, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
@@ -41,30 +70,26 @@ def orchard(given: Layers, options: Orchard, source: RandomSource, notes: Deriva
         raise invalid_option_error("crown_diameter", "must be at least trunk_diameter")
     site = Site(given, options, notes, coloured=True)
     lines = _field.number_rows(options.rows or _field.MAX_ROWS)
+    half = options.trunk_diameter / 2 + options.jitter
     out = _field.open_field(
-        site,
-        options,
-        lines,
-        row_count=None if options.rows else 8,
-        spacing=options.row_spacing,
-        half=options.trunk_diameter / 2 + options.jitter,
+        site, options, lines, _field.row_layout(options, options.row_spacing, half), count=options.rows
     )
     trees = sum(int(row.length / options.tree_spacing) + 1 for row in out.rows)
     if trees > _trees.MAX_TREES:
         raise invalid_option_error("tree_spacing", f"there would be {trees} trees; the limit is {_trees.MAX_TREES}")
     _field.ground(out, field_colour="meadow")
     for row in out.rows:
-        site.mark(f"row{row.number}", "tree_row", out.line(row), name=f"Row {row.number}")
+        site.mark(f"row{row.name}", "tree_row", out.line(row), name=f"Row {row.name}")
         site.draw(out.strip(row, min(1.0, options.row_spacing / 2)), "soil")
     size = source.stream("size")
-    stood = _trees.places(out, source.stream("places"), "row", options.tree_spacing, options.jitter)
+    stood = _trees.places(out, source.stream("places"), options.tree_spacing, options.jitter, options.missing)
     for row, plants in zip(out.rows, stood, strict=True):
         drawn = size.random((len(plants), 3))
         for k, ((u, v), (a, b, c)) in enumerate(zip(plants, drawn.tolist(), strict=True), 1):
             height = options.tree_height * (0.85 + 0.15 * a)
             _trees.tree(
                 site,
-                f"tree{row.number}-{k}",
+                f"tree{row.name}-{k}",
                 out.to_local(u, v),
                 trunk=options.trunk_diameter / 2,
                 height=height,
@@ -72,5 +97,5 @@ def orchard(given: Layers, options: Orchard, source: RandomSource, notes: Deriva
                 below=0.25 * height,
                 tint=int(4 * c),
             )
-    _field.network(out, _field.yard(out), aisle_speed=0.8, lane_speed=1.2)
+    _field_network.network(out, _field_network.yard(out, options.shed), aisle_speed=0.8, lane_speed=1.2)
     return site.finish(ground="grass")

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from app.derive import DerivationNotes
-from app.generate import RandomSource, _field, _trees, generates
-from app.generate._field import Field, FieldOptions, Line, Row
+from app.generate import RandomSource, _field, _field_network, _trees, generates
+from app.generate._field import FarmOptions, Field, Layout, Line, Row
 from app.generate._shapes import angle, mm
 from app.generate._site import Site, invalid_option_error, rgb
+from app.generate._variety import drawn
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -24,28 +25,53 @@ MAX_TUNNELS = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Polytunnels(FieldOptions):
-    """Parameters of a field of polytunnels."""
+class Polytunnels(FarmOptions):
+    """Parameters of a field of polytunnels.
 
-    tunnels: int | None = parameter(
-        None, "number of tunnels; default: as many as fit into the fence, 2 without one", minimum=1, maximum=MAX_TUNNELS
+    Ranges: Riseholme's strawberries (two tunnels of five rows, 1.28 to 1.41 m apart), and tunnels of 6.4 to 8.5 m.
+    """
+
+    tunnels: int | None = drawn(
+        1,
+        4,
+        "number of tunnels",
+        step=1,
+        minimum=1,
+        maximum=MAX_TUNNELS,
+        fence="as many as fit into the fence",
+        measured="tunnels",
     )
-    rows_per_tunnel: int = parameter(5, "number of table rows in a tunnel", minimum=1, maximum=20)
-    row_spacing: float = parameter(
-        1.35, "distance between rows, and between outer rows and a tunnel's legs", minimum=0.8, maximum=6.0, unit="m"
+    rows_per_tunnel: int = drawn(4, 6, "number of table rows in a tunnel", step=1, minimum=1, maximum=20, yields="low")
+    row_spacing: float = drawn(
+        1.28,
+        1.5,
+        "distance between rows, and between outer rows and a tunnel's legs",
+        step=0.01,
+        minimum=0.8,
+        maximum=6.0,
+        unit="m",
+        yields="high",
+        helps=("headland",),
     )
     table_width: float = parameter(
         0.3, "width of the tables that the plants grow on", minimum=0.1, maximum=2.0, unit="m"
     )
     table_height: float = parameter(1.1, "height of the tables' lower side", minimum=0.2, maximum=2.0, unit="m")
-    leg_spacing: float = parameter(2.5, "distance between the legs of a table", minimum=0.5, maximum=10.0, unit="m")
-    hoop_spacing: float = parameter(2.0, "distance between the hoops of a tunnel", minimum=0.5, maximum=10.0, unit="m")
+    leg_spacing: float = drawn(
+        2.0, 3.0, "distance between the legs of a table", step=0.1, minimum=0.5, maximum=10.0, unit="m", yields="high"
+    )
+    hoop_spacing: float = drawn(
+        1.8, 2.5, "distance between the hoops of a tunnel", step=0.1, minimum=0.5, maximum=10.0, unit="m", yields="high"
+    )
     tunnel_height: float = parameter(3.6, "height of the hoops", minimum=2.0, maximum=8.0, unit="m")
     side_height: float = parameter(1.8, "height of the hoops' straight legs", minimum=0.5, maximum=4.0, unit="m")
 
 
 @generates(
-    {"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Polytunnels, also={"location"}
+    {"location", "objects", "occupancy", "topology", "zones", "imagery"},
+    parameters=Polytunnels,
+    also={"location"},
+    version=2,
 )
 def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Polytunnels: hoops and covers over rows of tables with strawberries, aisles between them, and a yard."""
@@ -53,15 +79,9 @@ def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes
         raise invalid_option_error("tunnel_height", "must be above side_height")
     site = Site(given, options, notes, coloured=True)
     count = options.rows_per_tunnel
-    tunnel_count = options.tunnels or 2
-    out = _field.open_field(
-        site,
-        options,
-        _lines(options.tunnels or MAX_TUNNELS, count),
-        row_count=None if options.tunnels else tunnel_count * (count + 1) + 1,
-        spacing=options.row_spacing,
-        half=max(options.table_width / 2, 0.04),
-    )
+    layout = Layout(options.row_spacing, max(options.table_width / 2, 0.04))
+    lines = _lines(options.tunnels or MAX_TUNNELS, count)
+    out = _field.open_field(site, options, lines, layout, count=len(lines) if options.tunnels else None)
     out.trim_after("legs")
     legs = [row for row in out.rows if row.kind == "legs"]
     if len(legs) < 2:
@@ -90,7 +110,7 @@ def polytunnels(given: Layers, options: Polytunnels, source: RandomSource, notes
     for row in out.rows:
         if row.kind == "row":
             _table(site, out, row, options, stream)
-    _field.network(out, _field.yard(out), aisle_speed=0.6, lane_speed=1.0)
+    _field_network.network(out, _field_network.yard(out, options.shed), aisle_speed=0.6, lane_speed=1.0)
     return site.finish(ground="grass")
 
 

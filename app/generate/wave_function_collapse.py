@@ -1,13 +1,15 @@
 """Wave-function collapse: a site in which every small window occurs in a sample (Gumin 2016; ``_wfc``).
 
-The sample is a built-in one, 5 m × 5 m, or a grid of the environment. With ``order=rows`` the shares of tiles and of
+The sample is a built-in one, 5 m × 5 m, or a grid of the environment; of a grid, patches as large as a rack with its
+aisle or a part of a room are put together (``_patches``). With ``order=rows`` the shares of tiles and of
 neighbours stay close to the sample's; with lowest entropy first, rare patterns become rarer.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate, Problem
-from app.generate import RandomSource, _cells, _wfc, generates
+from app.generate import RandomSource, _cells, _patches, _wfc, generates
 from app.generate._cells import STYLES, CellStyle
 from app.generate._site import Site, SiteOptions, invalid_option_error
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
@@ -90,25 +92,34 @@ class Options(SiteOptions):
     )
     width: float = parameter(10.0, "size along x, if there is no fence", minimum=0.5, maximum=10_000.0, unit="m")
     depth: float = parameter(10.0, "size along y, if there is no fence", minimum=0.5, maximum=10_000.0, unit="m")
-    model: Literal["overlapping", "tiled"] = parameter(
-        "overlapping", "overlapping: every window of tiles occurs in the sample; tiled: every pair of neighbours does"
+    model: Literal["overlapping", "tiled", "patches"] | None = parameter(
+        None,
+        "overlapping: every window of tiles occurs in the sample; tiled: every pair of neighbours does; patches: "
+        "pieces as large as a rack with its aisle lie side by side where their sides agree; default: patches for a "
+        "grid, else overlapping",
     )
     pattern: int | None = parameter(
         None,
-        "overlapping: tiles along a window; default: 5; larger is closer to the sample and harder to solve",
+        "overlapping: tiles along a window; patches: tiles from one patch to the next; default: 5; larger is closer to "
+        "the sample and harder to solve",
         minimum=2,
         maximum=8,
     )
     tile: int | None = parameter(
-        None, "number of cells along a tile; default: overlapping 1, tiled 2", minimum=1, maximum=64
+        None,
+        "number of cells along a tile; default: overlapping 1, tiled 2, patches: so that a patch is as wide as an "
+        "obstacle and the free space beside it usually are",
+        minimum=1,
+        maximum=64,
     )
     symmetry: Literal["none", "mirror", "rotate", "all"] = parameter(
         "none", "whether the sample is also used mirrored, rotated by quarters, or both"
     )
     wrap: bool = parameter(False, "whether the sample continues at its other side")
-    border: Literal["walls", "open", "periodic"] = parameter(
-        "walls",
-        "border: closed by walls; open like a section of a larger site; or periodic, so that copies fit together",
+    border: Literal["walls", "open", "periodic"] | None = parameter(
+        None,
+        "border: closed by walls; open like a section of a larger site; or periodic, so that copies fit together; "
+        "default: as the sample's; the built-in ones have walls",
     )
     order: Literal["rows", "entropy"] = parameter(
         "rows", "order of decisions: row by row, close to the sample's shares, or lowest entropy first"
@@ -132,6 +143,14 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     contradict it, and if all attempts fail.
     """
     sample, known_cells, resolution, look = _sample(given, options, notes)
+    is_grid = look is STYLES["obstacle"]
+    if options.model is None:
+        options = replace(options, model="patches" if is_grid else "overlapping")
+    if options.model == "patches":
+        return _patchwork(given, options, source, notes, (sample, known_cells, resolution, look))
+    if options.border is None:
+        is_open = is_grid and not _patches.is_closed(*_patches.filled(sample, known_cells), resolution)
+        options = replace(options, border="open" if is_open else "walls")
     pattern = _pattern(options)
     tile = options.tile or (1 if options.model == "overlapping" else 2)
     sample, known_cells = _whole_tiles(sample, known_cells, tile, notes)
@@ -166,16 +185,8 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     if thick:
         wall = _single_index((model.tiles == BORDER).all(axis=(1, 2)), "border", "a wall tile")
         fixed[:thick], fixed[-thick:], fixed[:, :thick], fixed[:, -thick:] = wall, wall, wall, wall
-    size = resolution * tile
     for option, mask, label in (("free", open_, "a free tile"), ("blocked", full, "an occupied tile")):
-        for x, y in _points(getattr(options, option), option):
-            r, c = int((y - place.y) // size), int((x - place.x) // size)
-            if not (0 <= r < rows and 0 <= c < columns):
-                raise invalid_option_error(option, f"({x:g}, {y:g}) is outside the site")
-            number = _single_index(mask, option, label)
-            if fixed[r, c] not in (-1, number):
-                raise invalid_option_error(option, f"({x:g}, {y:g}) is on a wall, or both free and occupied")
-            fixed[r, c] = number
+        _fix_tiles(fixed, mask, option, label, options, place, resolution * tile)
     tiles = _wfc.collapse_model(
         model,
         (rows, columns),
@@ -191,6 +202,100 @@ def wave_function_collapse(given: Layers, options: Options, source: RandomSource
     _cells.add_objects(site, place, cells == BORDER, STYLES["wall"])
     _cells.add_objects(site, place, cells == OCCUPIED, look)
     return _cells.finish_site(site, options, notes, ground="concrete")
+
+
+def _patchwork(
+    given: Layers,
+    options: Options,
+    source: RandomSource,
+    notes: DerivationNotes,
+    sample: tuple[U8, Bool, float, CellStyle],
+) -> Layers:
+    """Return a site of patches of a sample (``_patches``)."""
+    cells, known_cells, resolution, look = sample
+    cells, known_cells = _patches.filled(cells, known_cells)
+    steps = options.pattern or _patches.BLOCKS
+    block = options.tile or max(1, round(_patches.usual_period(cells, resolution) / steps / resolution))
+    if options.tile is None:
+        notes.fill(
+            "tile",
+            block,
+            f"patches of {steps * block * resolution:.2g} m, as the sample's obstacles and aisles",
+            "tile",
+        )
+    blocks = _patches.coarse(cells, known_cells, block, resolution)
+    if blocks.cells.size > MAX_SAMPLE_CELLS:
+        raise invalid_option_error(
+            "sample", f"has {blocks.cells.size} tiles; the limit is {MAX_SAMPLE_CELLS}: use a larger tile"
+        )
+    border = options.border or ("walls" if _patches.is_closed(cells, known_cells, resolution) else "open")
+    if options.wrap and border == "walls":
+        raise invalid_option_error(
+            "wrap", "a sample that continues at its other side has no walls: use border=open or periodic"
+        )
+    if border == "walls":
+        blocks = _patches.bordered(blocks, BORDER)
+    site = Site(given, options, notes)
+    step = steps * block
+    place = _cells.site_grid_frame(site, options.width, options.depth, resolution, step=step)
+    shape = place.rows // step, place.columns // step
+    if border == "walls" and min(shape) < 2:
+        raise invalid_option_error("width", f"each side must be at least {2 * step * resolution:g} m, two patches")
+    patches, counts = _patches.learn(blocks, steps, options.symmetry, BORDER, wrap=options.wrap)
+    allowed = _patches.places(patches, shape, BORDER, closed=border == "walls")
+    _fix(allowed, patches, options, place, block)
+    out = _patches.collapse(
+        patches,
+        counts,
+        allowed,
+        source.stream,
+        notes,
+        periodic=border == "periodic",
+        scan=options.order == "rows",
+        repairs=options.repairs,
+        joined=options.connected,
+        border=BORDER if border == "walls" else None,
+    )
+    drawn = np.kron(out, np.ones((block, block), np.uint8))
+    _cells.add_objects(site, place, drawn == BORDER, STYLES["wall"])
+    _cells.add_objects(site, place, drawn == OCCUPIED, look)
+    return _cells.finish_site(site, options, notes, ground="concrete")
+
+
+def _fix_tiles(
+    fixed: NDArray[np.int64],
+    mask: Bool,
+    option: str,
+    label: str,
+    options: Options,
+    place: _cells.GridFrame,
+    size: float,
+) -> None:
+    """Fix the tiles at the positions of an option: the first of those that the mask allows, in place."""
+    rows, columns = fixed.shape
+    for x, y in _points(getattr(options, option), option):
+        r, c = int((y - place.y) // size), int((x - place.x) // size)
+        if not (0 <= r < rows and 0 <= c < columns):
+            raise invalid_option_error(option, f"({x:g}, {y:g}) is outside the site")
+        number = _single_index(mask, option, label)
+        if fixed[r, c] not in (-1, number):
+            raise invalid_option_error(option, f"({x:g}, {y:g}) is on a wall, or both free and occupied")
+        fixed[r, c] = number
+
+
+def _fix(allowed: Bool, patches: U8, options: Options, place: _cells.GridFrame, block: int) -> None:
+    """Keep only patches that are free, or occupied, at the positions that the options fix."""
+    steps = patches.shape[1] - 1
+    size = place.resolution * block
+    rows, columns = allowed.shape[0] * steps, allowed.shape[1] * steps
+    for option, value in (("free", FREE), ("blocked", OCCUPIED)):
+        for x, y in _points(getattr(options, option), option):
+            r, c = (math.floor(v / size + 1e-9) for v in (y - place.y, x - place.x))
+            if not (0 <= r < rows and 0 <= c < columns):
+                raise invalid_option_error(option, f"({x:g}, {y:g}) is outside the site")
+            allowed[r // steps, c // steps] &= patches[:, r % steps, c % steps] == value
+            if not allowed[r // steps, c // steps].any():
+                raise invalid_option_error(option, f"({x:g}, {y:g}) is on a wall, or no patch of the sample fits there")
 
 
 def _pattern(options: Options) -> int:

@@ -12,6 +12,7 @@ from app.errors import Conflict, Problem
 from app.ingest.prepare import READ, open_store
 from app.model.layers import Layers, PartKey
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Replace
+from app.store.store import Store
 from app.store.values import PartEntry, Version
 
 
@@ -24,15 +25,23 @@ class GenerationRequest:
     values: Mapping[str, Any]
     replace: bool = False
 
+    @property
+    def like(self) -> str | None:
+        """The environment that the site shall resemble, if the generator has such a parameter."""
+        return getattr(generate.check(self.generator, self.seed, self.values)[1], generate.LIKE, None)
+
 
 def prepare_generation(
-    database_url: str, blob_dir: str, base: Version, order: GenerationRequest
+    database_url: str, blob_dir: str, base: Version, order: GenerationRequest, like: Version | None = None
 ) -> tuple[Prepared, tuple[Problem, ...]]:
     """Run a generator on a version (in a worker).
 
     A generator of whole sites ignores the parts that such a generator created before, and deletes those that the new
-    site lacks: the last site's fence does not bind the next one. Raises MissingLayer, CannotGenerate, Conflict (the
-    part was uploaded or edited).
+    site lacks: the last site's fence does not bind the next one.
+
+    like: version that the site shall resemble.
+
+    Raises MissingLayer, CannotGenerate, Conflict (the part was uploaded or edited).
     """
     store = open_store(database_url, blob_dir)
     generator, _ = generate.check(order.generator, order.seed, order.values)
@@ -45,13 +54,17 @@ def prepare_generation(
     notes = DerivationNotes()
     progress.report(READ, order.generator)
     with progress.within(READ, 1.0 - READ):
-        generated_layers = generate.run(order.generator, order.seed, order.values, given, notes)
+        model = None if like is None else _like_layers(store, like)
+        generated_layers = generate.run(order.generator, order.seed, order.values, given, notes, model)
     progress.report(1.0 - READ, "storing")
     existing_parts = {e.key: e for e in base.parts if e.count > 0}
     _check_free(order, generator, generated_layers, existing_parts)
     credit = tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution))
     made_up = generated_layers.datum if base.datum is None else None
-    how = generate.step(order.generator, order.seed, order.values, {k: e.hash for k, e in used.items()}, made_up)
+    hashes, drawn = {k: e.hash for k, e in used.items()}, generate.drawn_values(notes)
+    how = generate.step(order.generator, order.seed, order.values, hashes, made_up, drawn)
+    if like is not None:
+        how[generate.LIKE] = {"environment": like.environment, "version": like.number}
     sources = tuple(sorted({s for e in used.values() for s in e.provenance.sources}))
     provenance = Provenance("generated", None, sources, None, (how,), credit)
     operations: list[Operation] = [
@@ -66,6 +79,13 @@ def prepare_generation(
     datum = generated_layers.datum if generated_layers.datum != base.datum else KEEP
     levels = generated_layers.levels if generated_layers.levels != base.levels else KEEP
     return store.versions.prepare(base, Changes(tuple(operations), datum, levels)), notes.as_warnings()
+
+
+def _like_layers(store: Store, version: Version) -> Layers:
+    """Return what is measured of an environment: its objects, its network and its grid."""
+    wanted = [e.key for e in version.parts if e.count > 0 and e.key.layer in ("objects", "topology", "occupancy")]
+    loaded = store.content.load(version, sorted(wanted))
+    return Layers(loaded.parts, version.datum, version.levels)
 
 
 def _is_generated(entry: PartEntry) -> bool:

@@ -275,8 +275,9 @@ def test_parameters_of_generators_have_types_units_defaults_and_bounds(offline: 
     result = offline("generate", "orchard", "--parameters")
     assert result.status == 0
     lines = {line.split()[0]: " ".join(line.split()) for line in result.out.splitlines() if line}
-    assert lines["row_spacing"] == "row_spacing number, 1 to 30 m 3.6 distance between rows"
-    assert lines["docks"] == "docks whole number, 1 to 20 2 number of charging docks in the yard"
+    assert lines["row_spacing"] == "row_spacing number, 1 to 30 m distance between rows; default: from the seed, 3 to 5"
+    docks = "docks whole number, 1 to 20 number of charging docks in the yard; default: from the seed, 1 to 4"
+    assert lines["docks"] == docks
     described = {p["name"]: p for p in offline("generate", "orchard", "--parameters", "--json").json["parameters"]}
     assert described.keys() <= lines.keys()
     assert described["docks"]["schema"] == {"type": "integer", "minimum": 1, "maximum": 20}

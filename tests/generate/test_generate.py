@@ -120,6 +120,20 @@ def test_generation_commits_version_with_provenance(ingest: Ingest, store: Store
     assert other.version.root != result.version.root
 
 
+def test_provenance_has_drawn_values_and_the_version_that_was_measured(ingest: Ingest, store: Store) -> None:
+    values = {"rows": 3, "row_length": 20, "row_spacing": 4.8, "curve": 0, "resolution": 0.2}
+    ingest.generate("here", GenerationRequest("orchard", 1, values), COMMIT)
+    like = GenerationRequest("orchard", 2, {"rows": 3, "row_length": 20, "resolution": 0.2, "like": "here"})
+    version = ingest.generate("here", like, COMMIT).version
+    assert version is not None
+    (step,) = next(e for e in version.parts if e.key.layer == "objects").provenance.steps
+    assert step["like"] == {"environment": "here", "version": 1}
+    assert step["drawn"]["row_spacing"] == pytest.approx(4.8, abs=0.02)
+    assert "rows" not in step["drawn"]
+    fixed = GenerationRequest("orchard", 2, {**dict(like.values), **step["drawn"]})
+    assert ingest.generate("here", fixed, COMMIT).status == "unchanged"
+
+
 def test_new_site_replaces_only_an_earlier_site(ingest: Ingest, store: Store) -> None:
     ingest.generate("here", order(), COMMIT)
     version = ingest.generate("here", order(fence=False), COMMIT).version

@@ -324,3 +324,52 @@ def test_wfc_site_is_generated_on_command_line(tmp_path: Path, capsys: pytest.Ca
     )
     assert status == 0, capsys.readouterr().err
     assert out.stat().st_size > 100
+
+
+def hall() -> NDArray[np.uint8]:
+    """A closed hall of 14 m × 10 m in cells of 0.1 m: racks with aisles of 1.4 m between them, a gangway around."""
+    cells = np.full((100, 140), FREE, np.uint8)
+    cells[[0, 1, -2, -1]] = OCCUPIED
+    cells[:, [0, 1, -2, -1]] = OCCUPIED
+    for k in range(4):
+        cells[18 + 20 * k : 24 + 20 * k, 20:120] = OCCUPIED
+    return cells
+
+
+def test_patches_of_a_grid_keep_racks_and_aisles() -> None:
+    given = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(hall(), 0.1)})
+    for seed in (1, 2):
+        notes = DerivationNotes()
+        layers = generate.run(NAME, seed, {"sample": "map", "width": 16, "depth": 12}, given, notes)
+        (grid,) = (g for k, g in layers.grids().items() if k.name == "map")
+        full = (grid.cells == OCCUPIED).astype(np.uint8)
+        assert full[0].all(), "walls, as the sample has them"
+        assert full[:, -1].all()
+        assert cv2.connectedComponents((grid.cells == FREE).astype(np.uint8), connectivity=4)[0] == 2
+        _, _, stats, _ = cv2.connectedComponentsWithStats(full[5:-5, 5:-5], connectivity=8)
+        racks = stats[1:][stats[1:, cv2.CC_STAT_WIDTH] * grid.resolution >= 3.0]
+        assert len(racks) >= 3
+        assert (racks[:, cv2.CC_STAT_HEIGHT] * grid.resolution <= 1.0).all(), "which do not grow together"
+        assert [line.option for line in notes.template if line.subject == "tile"] == ["tile"]
+        again = generate.run(NAME, seed, {"sample": "map", "width": 16, "depth": 12}, given, DerivationNotes())
+        assert (next(g for k, g in again.grids().items() if k.name == "map").cells == grid.cells).all()
+
+
+def test_patches_keep_fixed_places_and_refuse_what_does_not_fit() -> None:
+    given = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(hall(), 0.1)})
+    values = {"sample": "map", "width": 16, "depth": 12}
+    layers = generate.run(NAME, 1, {**values, "blocked": "8,6", "free": "4,3"}, given, DerivationNotes())
+    (grid,) = (g for k, g in layers.grids().items() if k.name == "map")
+    assert grid.cells[round(6 / grid.resolution), round(8 / grid.resolution)] == OCCUPIED
+    assert grid.cells[round(3 / grid.resolution), round(4 / grid.resolution)] == FREE
+    for wrong, why in (
+        ({"free": "0.1,0.1"}, "free: .* is on a wall, or no patch of the sample fits"),
+        ({"blocked": "99,1"}, "blocked: .* is outside the site"),
+        ({"width": 1.5}, "width: each side must be at least"),
+        ({"wrap": True}, "wrap: a sample that continues"),
+    ):
+        with pytest.raises(CannotGenerate, match=why):
+            generate.run(NAME, 1, {**values, **wrong}, given, DerivationNotes())
+    unknown = Layers({PartKey("occupancy", "ground", "map"): OccupancyGrid(np.full((40, 40), UNKNOWN, np.uint8), 0.1)})
+    with pytest.raises(CannotGenerate, match="sample: has no known cell"):
+        generate.run(NAME, 1, values, unknown, DerivationNotes())

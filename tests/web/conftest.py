@@ -13,6 +13,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
 
+from app.cli.demo import PLAIN
 from tests.cli.conftest import TOKEN, ServerProcess
 
 SECONDS = 60.0
@@ -45,6 +46,8 @@ class WebServer:
     def make_site(self, name: str, generator: str = "orchard", **parameters: Any) -> str:
         """Create an environment with a generated site as version 1."""
         self.call("POST", "environments", json={"name": name, "title": name.title()})
+        if generator == "orchard":  # straight rows along the x axis: tests click on places
+            parameters = {"rows": 8, "row_length": 40.0, **PLAIN, **parameters}
         body = {"generator": generator, "seed": 7, "parameters": parameters}
         self.call("POST", f"environments/{name}/generations", 201, json=body, timeout=120)
         return name
