@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import fields
 
 from app.derive import DerivationNotes, _model, _plans
+from app.derive._colour import segments
 from app.derive._pictures import GroundImage, infrared_band
-from app.derive._segments import METHOD_PARAMETERS, Segmentation, Segments, segments
+from app.derive._segments import METHOD_PARAMETERS, Segmentation, Segments
 from app.errors import Invalid, Problem
 from app.model.geodesy import LocalFrame
 from app.model.grid import OccupancyGrid
