@@ -1,12 +1,18 @@
-"""Segment an aerial image into fields, trees, vegetation, paths, roads and buildings, without a model.
+"""Segment an aerial image into fields, trees, vegetation, water, paths, roads and buildings, without a model.
 
-Pixels are classified by colour: k-means in CIELAB groups them (seeded, so that the same image gives the same groups),
-and the excess green of a group, (2g - r - b) of colours that sum to 1 (Woebbecke et al. 1995), decides whether it is
-vegetation. With ``index`` every pixel is classified by its own excess green, or by NDVI = (nir - red) / (nir + red) if
-there is a near-infrared band. Dark or rough vegetation is wood, bright and smooth vegetation is turf. Wood is cut into
-crowns at the saddles of its distance to the edge; round ones are trees. Large areas of turf or bare ground are fields,
-separated at edges (Canny). Other areas are classified by shape: long and narrow is a path, or a road if it is wide;
-compact, with straight edges and of one shade is a building. The rest, and shadow, is nothing.
+Pixels are classified by colour, after the image's colour cast is removed (its bright pixels are grey, Land 1977):
+k-means in CIELAB groups them (seeded, so that the same image gives the same groups), and the excess green of a group,
+(2g - r - b) of colours that sum to 1 (Woebbecke et al. 1995), decides whether it is vegetation. With ``index`` every
+pixel is classified by its own excess green, or by NDVI = (nir - red) / (nir + red) if there is a near-infrared band;
+then water is where NDWI = (green - nir) / (green + nir) is high (McFeeters 1996). Without one, only large, dark, smooth
+and bluish areas are water. Dark or rough vegetation is wood, bright and smooth vegetation is turf. Wood is cut into
+crowns at the saddles of its distance to the edge; round ones are trees. Areas of turf are fields, separated at edges
+(Canny). Other areas are classified by shape: long and narrow is a path, or a road if it is wide; compact, with straight
+edges and of one shade is a building.
+
+Colour does not tell a grey roof from a car park, nor muddy water from bare ground: each region has a confidence, which
+falls for what is rough, bluish, of a shape that roofs have, or beside a shadow that it may cast itself. Regions below
+``confidence``, shadow and everything else are unknown.
 """
 
 from __future__ import annotations
@@ -15,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
+from app.derive._cover import ROUGH, cover, crowns, indices, water
 from app.derive._pictures import GroundImage
 from app.derive._regions import GREEN, SHADOW, RegionBuilder
 from app.derive._segments import Segmentation, Segments
@@ -37,8 +44,6 @@ def segments(
 
     Raises CannotConvert for an image without colours, or with a single one.
     """
-    import cv2
-
     if ground.grey and nir is None and ground.raw.shape[2] >= 3:
         raise CannotConvert(
             f"{name} does not state which of its bands are red, green and blue: tag them (gdal_translate -colorinterp "
@@ -49,35 +54,42 @@ def segments(
             f"{name} has no colours, so vegetation cannot be detected: use a colour image, or segmentation=plan for a "
             "floor plan"
         )
-    min_area = 1.0 if how.minimum_area is None else how.minimum_area
-    work = RegionBuilder(ground, min_area)
+    seen = cover(ground)
+    work = RegionBuilder(ground, seen, 1.0 if how.minimum_area is None else how.minimum_area)
     if method == "index":
         grows = _vegetation_by_index(ground, nir, notes, name)
-        work.vegetation(grows)
-        rest = ground.valid & ~grows
+        if nir is not None:
+            work.water(water(ground, seen, nir) & ~grows, measured=True)
+        work.vegetation(grows, np.zeros_like(grows))
         work.small(notes, name)
-        return Segments(work.label, work.regions, rest | work.open_)
-    smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0)
-    lab = cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
-    group, centres = _groups(np.asarray(lab, np.float32), ground.valid, how.clusters, how.cluster_seed)
+        return Segments(work.label, work.regions, work.open_)
+    group, centres = _groups(seen.lab, ground.valid, how.clusters, how.cluster_seed)
     if len(centres) < 2:
         raise CannotConvert(f"{name} has a single colour: nothing to segment")
-    of = group[ground.valid]
-    sums = np.stack([np.bincount(of, smooth[..., k][ground.valid], len(centres)) for k in range(3)], axis=1)
-    means = sums / np.maximum(np.bincount(of, minlength=len(centres)), 1)[:, None]
-    green = (2 * means[:, 1] - means[:, 0] - means[:, 2]) / np.maximum(means.sum(axis=1), 1.0) > GREEN
-    dark = ~green & (centres[:, 0] < SHADOW)
-    grows = ground.valid & green[group]
-    work.vegetation(grows)
-    for k in np.flatnonzero(~green & ~dark).tolist():
-        work.add_sealed(ground.valid & (group == k))
-    shadow = ground.valid & dark[group]
-    area = ground.resolution**2
-    notes.drop("m² of shadow", round(float(shadow.sum()) * area), f"{name}: too dark to classify")
+    wet = water(ground, seen, nir)
+    if nir is None:
+        leafy = crowns(ground, seen) & ~wet
+        green = ground.valid & (_greens(centres)[group] | leafy) & ~wet
+    else:
+        green = ground.valid & (indices(ground, nir)[0] > NDVI)
+        leafy = green & (seen.rough > ROUGH)
+    shadow = ground.valid & ~green & ~wet & ((centres[:, 0] < SHADOW)[group] | seen.shade)
+    work.water(wet, measured=nir is not None)
+    work.vegetation(green, leafy)
+    for k in range(len(centres)):
+        work.add_sealed(ground.valid & (group == k) & ~green & ~wet & ~shadow, measured=nir is not None)
+    notes.drop("m² of shadow", round(float(shadow.sum()) * ground.resolution**2), f"{name}: too dark to classify")
     work.small(notes, name)
-    left = (work.label == 0) & ground.valid & ~shadow & ~work.open_
-    notes.drop("m² of ground", round(float(left.sum()) * area), f"{name}: shape and colour match no kind")
     return Segments(work.label, work.regions, work.open_)
+
+
+def _greens(centres: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which colours [k, 3] in CIELAB are vegetation's."""
+    import cv2
+
+    rgb = np.clip(cv2.cvtColor(centres[None], cv2.COLOR_LAB2RGB)[0], 0.0, 1.0)
+    total = np.maximum(rgb.sum(axis=1), 1 / 255)
+    return np.asarray((2 * rgb[:, 1] - rgb[:, 0] - rgb[:, 2]) / total > GREEN)
 
 
 def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: DerivationNotes, name: str) -> NDArray[np.bool_]:
@@ -89,12 +101,7 @@ def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: Derivation
         total = np.maximum(rgb.sum(axis=2), 1.0)
         index, minimum = (2 * rgb[..., 1] - rgb[..., 0] - rgb[..., 2]) / total, GREEN
     else:
-        infrared, red = ground.raw[..., nir].astype(np.float64), _red(ground)
-        with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values are no vegetation
-            total = infrared + red
-            index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0)
-        index = np.clip(np.nan_to_num(index, nan=0.0), -1.0, 1.0).astype(np.float32)
-        minimum = NDVI
+        index, minimum = indices(ground, nir)[0], NDVI
     index = cv2.GaussianBlur(np.where(ground.valid, index, np.float32(0)).astype(np.float32), (3, 3), 0)
     values = index[ground.valid]
     low, high = float(values.min()), float(values.max())
@@ -108,11 +115,6 @@ def _vegetation_by_index(ground: GroundImage, nir: int | None, notes: Derivation
     word = "excess green" if nir is None else "NDVI"
     notes.fill("threshold", round(threshold, 4), f"{name}: pixels with a higher {word} are vegetation")
     return np.asarray(ground.valid & (index > threshold))
-
-
-def _red(ground: GroundImage) -> NDArray[np.float64]:
-    """Return the raw red band, in the same unit as near infrared."""
-    return np.asarray(ground.raw[..., 0], np.float64)
 
 
 def _groups(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
+from app.derive._cover import ROUGH, WINDOW, Cover
 from app.derive._pictures import GroundImage
 from app.derive._segments import Kind, Region
 
@@ -20,13 +21,6 @@ GREEN = 0.06
 DARK, SHADOW = 38.0, 20.0
 """CIELAB lightness (0 to 100) below which vegetation is wood, and below which other pixels are shadow."""
 
-ROUGH = 2.5
-"""Minimum roughness of wood: mean difference of lightness from its median within 5 pixels, over ``WINDOW`` metres.
-
-A median follows edges, so a smooth tree on smooth turf has no roughness.
-"""
-
-WINDOW = 1.5
 CROWNS = (0.8, 20.0)
 """Minimum and maximum diameter of a tree's crown in metres."""
 
@@ -35,6 +29,9 @@ ROUND = 0.75
 
 LONG = 4.0
 """Minimum ratio of length to width of paths and roads."""
+
+BULGE = 2.5
+"""Maximum diameter of the widest place of a path or road, in its mean widths."""
 
 PATH, ROAD = 4.0, 20.0
 """Width in metres above which paths are roads, and maximum width of roads."""
@@ -45,6 +42,27 @@ FIELD, TURF = 50.0, 10.0
 BUILDING, SIDE, RECTANGULAR = 8.0, 2.5, 0.78
 """Minimum area in square metres, minimum side in metres, and minimum share of its rectangle, of a building."""
 
+CALM = 1.8
+"""Maximum roughness of turf."""
+
+WATER, DOUBT = 0.7, 0.5
+"""Confidence of water that is recognised by colour alone; factor of confidence for each reason to doubt."""
+
+LEAVES, SOIL = (85.0, 150.0), (50.0, 95.0)
+"""Hues of turf and of bare soil in CIELAB, in degrees."""
+
+EARTHY = 10.0
+"""Minimum chroma of bare soil: roofs and paved ground are greyer."""
+
+VAST = 500.0
+"""Minimum area of a field of bare ground that is no roof, in square metres."""
+
+NARROW = 0.8
+"""Width in metres below which a path is doubtful: it may be the edge of a roof."""
+
+SHADOW_REACH, SHADY = 1.5, 0.15
+"""Width in metres of the edge in which a shadow is looked for, and minimum share of shade there."""
+
 MIXED = 0.25
 """Share of green up to which an area is no vegetation, and share of other pixels up to which it is."""
 
@@ -52,15 +70,13 @@ MIXED = 0.25
 class RegionBuilder:
     """Builder of regions: adds the regions of one image one after the other."""
 
-    def __init__(self, ground: GroundImage, min_area: float) -> None:
-        import cv2
-
+    def __init__(self, ground: GroundImage, seen: Cover, min_area: float) -> None:
         self.size = ground.resolution
         self.minimum_area = max(min_area / self.size**2, 1.0)
         self.height, self.width = (int(n) for n in ground.valid.shape)
         self.label = np.zeros(ground.valid.shape, np.int32)
         self.regions: list[Region] = []
-        self.lightness = cv2.cvtColor(ground.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
+        self.cover, self.lightness = seen, seen.light
         self.few = 0
         self.valid = ground.valid
         self.open_ = np.zeros(ground.valid.shape, bool)
@@ -95,38 +111,61 @@ class RegionBuilder:
             out.append((labels[at] == k, at, area))
         return out
 
-    # --- vegetation ---------------------------------------------------------------------------------------------------
-    def vegetation(self, grows: NDArray[np.bool_]) -> None:
-        """Add the regions of wood and turf."""
+    # --- water --------------------------------------------------------------------------------------------------------
+    def water(self, wet: NDArray[np.bool_], *, measured: bool) -> None:
+        """Add the regions of water. measured: whether they come from a near-infrared band, not from colour alone."""
         import cv2
 
-        light = self.lightness
-        box = (self.pixels(WINDOW), self.pixels(WINDOW))
-        rough = cv2.blur(np.abs(light - cv2.medianBlur(light, 5)), box)
-        # the roughness of an edge to another area is not the vegetation's own
-        within = cv2.erode(grows.astype(np.uint8), np.ones(box, np.uint8)) == 1
-        wood = grows & ((cv2.blur(light, (3, 3)) < DARK) | (within & (rough > ROUGH)))
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+        clean = cv2.morphologyEx(wet.astype(np.uint8), cv2.MORPH_CLOSE, kernel) if measured else wet
+        for mask, at, area in self.pieces(clean):
+            still = _fit(1.0 - float(self.cover.rough[at][mask].mean()) / 10.0)
+            confidence = still if measured else _fit(WATER * still)
+            self.add(mask, at, Region("water", confidence, {"area": self.metres(area)}))
+
+    # --- vegetation ---------------------------------------------------------------------------------------------------
+    def vegetation(self, grows: NDArray[np.bool_], leafy: NDArray[np.bool_]) -> None:
+        """Add the regions of wood and turf. Vegetation that is neither rough nor calm is unknown.
+
+        leafy: pixels whose surroundings look like crowns.
+        """
+        import cv2
+
+        light, rough = self.lightness, self.cover.rough
+        box = np.ones((self.cover.window, self.cover.window), np.uint8)
+        # the roughness of an edge to another area is not the vegetation's own
+        within = cv2.erode(grows.astype(np.uint8), box) == 1
+        dark = cv2.blur(light, (3, 3)) < DARK
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+        wood = grows & (dark | ((within | leafy) & (rough > ROUGH)))
         wood = grows & (cv2.morphologyEx(wood.astype(np.uint8), cv2.MORPH_CLOSE, kernel, iterations=2) == 1)
         wood = cv2.morphologyEx(wood.astype(np.uint8), cv2.MORPH_OPEN, kernel) == 1
         for mask, at, _ in self.pieces(wood):
             self._wood(mask, at)
-        turf = cv2.morphologyEx((grows & ~wood).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+        calm = (grows & ~wood & within & (rough < CALM)).astype(np.uint8)
+        # the turf's own edge, up to the window of the roughness
+        near = cv2.dilate(calm, box, iterations=2) == 1
+        turf = cv2.morphologyEx((grows & ~wood & near).astype(np.uint8), cv2.MORPH_OPEN, kernel)
         edges = cv2.Canny(cv2.GaussianBlur(np.clip(light * 2.55, 0, 255).astype(np.uint8), (5, 5), 0), 60, 150)
-        parted = turf & (cv2.dilate(edges, kernel) == 0)
-        for mask, at, area in self.pieces(parted):
+        for mask, at, area in self.pieces(turf & (cv2.dilate(edges, kernel) == 0)):
             # restore the pixels that the edge itself took
             high, wide = (slice(max(0, s.start - 2), s.stop + 2) for s in at)
             grown = np.pad(mask, ((at[0].start - high.start, 2), (at[1].start - wide.start, 2)))
             room = turf[high, wide] == 1
             grown = grown[: room.shape[0], : room.shape[1]]
             grown = (cv2.dilate(grown.astype(np.uint8), kernel, iterations=2) == 1) & room
-            if self.metres(area) < TURF:
-                self.open_[high, wide] |= grown
-                continue
-            shade = float(light[high, wide][grown].std())
-            attributes = {"surface": "green", "area": self.metres(area)}
-            self.add(grown, (high, wide), Region("field", _fit(1.0 - shade / 30.0), attributes))
+            if self.metres(area) >= TURF:
+                self._turf(grown, (high, wide), area, calm)
+
+    def _turf(self, mask: NDArray[np.bool_], at: tuple[slice, slice], area: int, calm: Mask) -> None:
+        """Add a field of turf. It is sure as far as it is calm, of one shade, and not as bluish as water."""
+        shade = float(self.lightness[at][mask].std())
+        a, b = (float(np.median(self.cover.lab[at][..., k][mask])) for k in (1, 2))
+        hue = math.degrees(math.atan2(b, a))
+        sure = (1.0 - shade / 30.0) * min(1.0, 2.0 * float(calm[at][mask].mean()))
+        if not LEAVES[0] <= hue <= LEAVES[1]:
+            sure *= DOUBT
+        self.add(mask, at, Region("field", _fit(sure), {"surface": "green", "area": self.metres(area)}))
 
     def metres(self, area: float) -> float:
         """Return pixels as square metres, for attributes."""
@@ -159,8 +198,8 @@ class RegionBuilder:
             self.add(part, _inner(at, inner), Region("vegetation", 0.6, {"area": self.metres(size)}))
 
     # --- ground and roofs ---------------------------------------------------------------------------------------------
-    def add_sealed(self, mask: NDArray[np.bool_]) -> None:
-        """Add the regions of ground and roofs of one colour group."""
+    def add_sealed(self, mask: NDArray[np.bool_], *, measured: bool) -> None:
+        """Add the regions of ground and roofs of one colour group. measured: whether water is known from a band."""
         import cv2
 
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
@@ -168,13 +207,43 @@ class RegionBuilder:
         clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, kernel, iterations=2)
         clean[(self.label > 0) | ~self.valid] = 0
         for piece, at, area in self.pieces(clean):
-            self._add_by_shape(piece, at, area)
+            ends = at[0].start == 0 or at[1].start == 0 or at[0].stop == self.height or at[1].stop == self.width
+            region = _classify_shape(piece, self.lightness[at], area, self.minimum_area, self.size, ends)
+            if region is not None:
+                if region.kind != "building":
+                    region.confidence = self._ground_confidence(region, piece, at, measured=measured)
+                self.add(piece, at, region)
 
-    def _add_by_shape(self, piece: NDArray[np.bool_], at: tuple[slice, slice], area: int) -> None:
-        ends = at[0].start == 0 or at[1].start == 0 or at[0].stop == self.height or at[1].stop == self.width
-        region = _classify_shape(piece, self.lightness[at], area, self.minimum_area, self.size, ends)
-        if region is not None:
-            self.add(piece, at, region)
+    def _ground_confidence(
+        self, region: Region, piece: NDArray[np.bool_], at: tuple[slice, slice], *, measured: bool
+    ) -> float:
+        """Return how sure a piece is ground, and not a roof, a crown or water."""
+        sure = region.confidence
+        if region.kind == "field":
+            a, b = (float(np.median(self.cover.lab[at][..., k][piece])) for k in (1, 2))
+            soil = math.hypot(a, b) >= EARTHY and SOIL[0] <= math.degrees(math.atan2(b, a)) <= SOIL[1]
+            vast = region.attributes["area"] >= VAST
+            sure = _fit(sure / 0.6 * (0.8 if vast and (measured or soil) else 0.55 if vast and soil else 0.35))
+        elif region.attributes["width"] < max(NARROW, 3 * self.size):
+            sure *= DOUBT
+        if float(self.cover.rough[at][piece].mean()) > ROUGH:
+            sure *= DOUBT
+        if sure >= 0.5 and self._casts_shadow(piece, at):
+            sure *= DOUBT
+        return _fit(sure)
+
+    def _casts_shadow(self, piece: NDArray[np.bool_], at: tuple[slice, slice]) -> bool:
+        """Return whether shade lies along much of a piece's edge, as beside a wall."""
+        import cv2
+
+        reach = max(2, round(SHADOW_REACH / self.size))
+        high, wide = (slice(max(0, s.start - reach), s.stop + reach) for s in at)
+        padded = np.pad(piece, ((at[0].start - high.start, reach), (at[1].start - wide.start, reach)))
+        shade = self.cover.shade[high, wide]
+        inner: Mask = padded[: shade.shape[0], : shade.shape[1]].astype(np.uint8)
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        ring = (cv2.dilate(inner, kernel) == 1) & (inner == 0)
+        return bool(ring.any() and shade[ring].mean() > SHADY)
 
 
 class ColourRules:
@@ -265,6 +334,9 @@ def _classify_shape(
     attributes: dict[str, Any] = {"area": square_metres}
     metres, side = width * size, min(w, h) * size
     long = length >= LONG * width and metres <= ROAD and length * size >= 2 * WINDOW
+    if long:  # a ragged area has a long outline, too, but is wider than a band of its length
+        away = cv2.distanceTransform(np.pad(piece, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        long = 2 * float(away.max()) <= BULGE * max(width, 2.0)
     straight = rectangular >= RECTANGULAR and square_metres >= BUILDING and side >= SIDE
     # a path leads somewhere: a straight band that is isolated in the image is rather a roof
     if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):

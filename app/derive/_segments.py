@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from app.parameters import parameter
 
-Kind = Literal["field", "tree", "vegetation", "path", "road", "building", "area"]
+Kind = Literal["field", "tree", "vegetation", "water", "path", "road", "building", "area"]
 KINDS: tuple[str, ...] = get_args(Kind)
 """Kinds of regions; an ``area`` is a separate region of unknown kind."""
 
@@ -39,8 +39,8 @@ class Segmentation:
     )
     confidence: float | None = parameter(
         None,
-        "model: minimum confidence of a result; default: 0.25, for Segment-Anything (its predicted IoU) 0.88, for "
-        "pixel classes 0.5",
+        "minimum confidence of a region; what is less sure is unknown (kind area, with its guess). Default: 0.5, for "
+        "models of the YOLO family 0.25, for Segment-Anything (its predicted IoU) 0.88",
         minimum=0.01,
         maximum=1.0,
     )
@@ -73,7 +73,7 @@ class Segmentation:
 
 METHOD_PARAMETERS = {
     "model": ("model",),
-    "confidence": ("model",),
+    "confidence": ("colour", "index", "model"),
     "points": ("model",),
     "stability": ("model",),
     "clusters": ("colour",),
@@ -87,7 +87,7 @@ METHOD_PARAMETERS = {
 
 @dataclass(slots=True)
 class Region:
-    """Segmented region. confidence: 0 to 1, how well shape and shade fit its kind. attributes: further properties."""
+    """Segmented region. confidence: 0 to 1, how sure its kind is. attributes: further properties."""
 
     kind: Kind
     confidence: float
@@ -101,9 +101,21 @@ class Segments:
     Attributes:
         label: int32 [h, w], 0 nothing, k the region k - 1.
         regions: in the order of their labels.
-        open_: bool [h, w], pixels known to be no obstacle that belong to no region.
+        open_: bool [h, w], pixels of no region that are surely no obstacle.
     """
 
     label: NDArray[np.int32]
     regions: list[Region]
     open_: NDArray[np.bool_]
+
+
+MIN_CONFIDENCE = 0.5
+"""Default minimum confidence of a region that was segmented by colour or vegetation index."""
+
+
+def doubt(segmented: Segments, sure: float) -> None:
+    """Turn regions that are less sure into areas of unknown kind, with their kind as ``guess``."""
+    for region in segmented.regions:
+        if region.confidence < sure and region.kind != "area":
+            region.attributes["guess"] = region.kind
+            region.kind = "area"

@@ -15,7 +15,7 @@ from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import LOCAL
 from app.model.layers import MAP, Layers, Part, PartKey
 
-OBSTACLES = frozenset({"tree", "vegetation", "building"})
+OBSTACLES = frozenset({"tree", "vegetation", "building", "water"})
 
 
 @dataclass(frozen=True, slots=True)
