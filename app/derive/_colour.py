@@ -59,14 +59,14 @@ def segments(
     if method == "index":
         grows = _vegetation_by_index(ground, nir, notes, name)
         if nir is not None:
-            work.water(water(ground, seen, nir) & ~grows, measured=True)
+            work.water(water(ground, seen, nir)[0] & ~grows, measured=True)
         work.vegetation(grows, np.zeros_like(grows))
         work.small(notes, name)
         return Segments(work.label, work.regions, work.open_)
     group, centres = _groups(seen.lab, ground.valid, how.clusters, how.cluster_seed)
     if len(centres) < 2:
         raise CannotConvert(f"{name} has a single colour: nothing to segment")
-    wet = water(ground, seen, nir)
+    lake, wet = water(ground, seen, nir)
     if nir is None:
         leafy = crowns(ground, seen) & ~wet
         green = ground.valid & (_greens(centres)[group] | leafy) & ~wet
@@ -74,7 +74,7 @@ def segments(
         green = ground.valid & (indices(ground, nir)[0] > NDVI)
         leafy = green & (seen.rough > ROUGH)
     shadow = ground.valid & ~green & ~wet & ((centres[:, 0] < SHADOW)[group] | seen.shade)
-    work.water(wet, measured=nir is not None)
+    work.water(lake, measured=nir is not None)
     work.vegetation(green, leafy)
     for k in range(len(centres)):
         work.add_sealed(ground.valid & (group == k) & ~green & ~wet & ~shadow, measured=nir is not None)

@@ -55,6 +55,7 @@ class Cover:
         rough: float32 [h, w], mean difference of lightness from its median within 5 pixels, at the size of the image's
             details. A median follows edges, so a smooth tree on smooth turf has no roughness.
         shade: bool [h, w], much darker than the image.
+        contrast: float32 [h, w], difference of colour (CIELAB) across the pixel, over a few of the image's details.
         window: side of the roughness's window in pixels, odd.
     """
 
@@ -62,6 +63,7 @@ class Cover:
     light: Plane
     rough: Plane
     shade: NDArray[np.bool_]
+    contrast: Plane
     window: int
 
 
@@ -78,7 +80,21 @@ def cover(ground: GroundImage) -> Cover:
     lab[..., 1:] -= _cast(lab, ground.valid)
     window = max(WINDOW_PIXELS, int(WINDOW / ground.resolution) // 2 * 2 + 1)
     median = float(np.median(light[ground.valid]))
-    return Cover(lab, light, _roughness(light, window), light < SHADE * median, window)
+    step = _blur(light)
+    return Cover(lab, light, _roughness(light, window, step), light < SHADE * median, _contrast(lab, step), window)
+
+
+def _contrast(lab: Plane, step: int) -> Plane:
+    """Return the largest difference of a channel's mean within a few details of the image. step: their size."""
+    import cv2
+
+    out = np.zeros(lab.shape[:2], np.float32)
+    side = 2 * step + 1
+    kernel = np.ones((2 * side + 1, 2 * side + 1), np.uint8)
+    for k in range(3):
+        mean = cv2.blur(np.ascontiguousarray(lab[..., k]), (side, side))
+        np.maximum(out, cv2.dilate(mean, kernel) - cv2.erode(mean, kernel), out=out)
+    return out
 
 
 def _cast(lab: Plane, valid: NDArray[np.bool_]) -> Plane:
@@ -92,11 +108,10 @@ def _cast(lab: Plane, valid: NDArray[np.bool_]) -> Plane:
     return np.asarray(np.round(grey, 1), np.float32)
 
 
-def _roughness(light: Plane, window: int) -> Plane:
+def _roughness(light: Plane, window: int, step: int) -> Plane:
     """Return the roughness at the size of the image's details: an enlarged image has none at that of its pixels."""
     import cv2
 
-    step = _blur(light)
     if step == 1:
         return np.asarray(cv2.blur(np.abs(light - cv2.medianBlur(light, 5)), (window, window)), np.float32)
     height, width = light.shape
@@ -147,14 +162,18 @@ def crowns(ground: GroundImage, seen: Cover) -> NDArray[np.bool_]:
     return np.asarray(leaf & (cv2.blur(leaf.astype(np.float32), (seen.window, seen.window)) > 0.5))
 
 
-def water(ground: GroundImage, seen: Cover, nir: int | None) -> NDArray[np.bool_]:
-    """Mark water: by NDWI with a near-infrared band, else what is large, dark, smooth and bluish."""
+def water(ground: GroundImage, seen: Cover, nir: int | None) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Mark (water, what may be water): by NDWI with a near-infrared band, else what is large, dark, smooth and bluish.
+
+    Bright pixels with a high NDWI may be muddy water, or paint.
+    """
     import cv2
 
+    lab = seen.lab
     if nir is not None:
         ndvi, ndwi = indices(ground, nir)
-        return np.asarray(ground.valid & (ndwi > WET) & (ndvi < WET_NDVI))
-    lab = seen.lab
+        wet = ground.valid & (ndwi > WET) & (ndvi < WET_NDVI)
+        return wet & (seen.light < DIM), wet
     wet = ground.valid & (seen.rough < STILL) & (lab[..., 0] < DIM) & (lab[..., 1] < COLD) & (lab[..., 2] < COLD)
     side = max(3, int(2 * WINDOW / ground.resolution) // 2 * 2 + 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
@@ -162,4 +181,5 @@ def water(ground: GroundImage, seen: Cover, nir: int | None) -> NDArray[np.bool_
     _, labels, stats, _ = cv2.connectedComponentsWithStats(wide, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] * ground.resolution**2 >= LAKE
     large[0] = False
-    return np.asarray(large[labels])
+    wet = np.asarray(large[labels])
+    return wet, wet

@@ -63,6 +63,11 @@ NARROW = 0.8
 SHADOW_REACH, SHADY = 1.5, 0.15
 """Width in metres of the edge in which a shadow is looked for, and minimum share of shade there."""
 
+OUTLINE, OUTLINED = 10.0, 0.7
+"""Minimum contrast at the edge of a region, and minimum share of it along a path or road: water and roofs whose shade
+changes fall apart into bands without edges.
+"""
+
 MIXED = 0.25
 """Share of green up to which an area is no vegetation, and share of other pixels up to which it is."""
 
@@ -224,13 +229,29 @@ class RegionBuilder:
             soil = math.hypot(a, b) >= EARTHY and SOIL[0] <= math.degrees(math.atan2(b, a)) <= SOIL[1]
             vast = region.attributes["area"] >= VAST
             sure = _fit(sure / 0.6 * (0.8 if vast and (measured or soil) else 0.55 if vast and soil else 0.35))
-        elif region.attributes["width"] < max(NARROW, 3 * self.size):
-            sure *= DOUBT
+        else:
+            if region.attributes["width"] < max(NARROW, 3 * self.size):
+                sure *= DOUBT
+            if sure >= 0.5 and self._outlined(piece, at) < OUTLINED:
+                sure *= DOUBT
         if float(self.cover.rough[at][piece].mean()) > ROUGH:
             sure *= DOUBT
         if sure >= 0.5 and self._casts_shadow(piece, at):
             sure *= DOUBT
         return _fit(sure)
+
+    def _outlined(self, piece: NDArray[np.bool_], at: tuple[slice, slice]) -> float:
+        """Return the share of a piece's edge at which the colour changes: elsewhere the same surface goes on."""
+        import cv2
+
+        padded = np.pad(piece, 1).astype(np.uint8)
+        edge = (padded == 1) & (cv2.erode(padded, np.ones((3, 3), np.uint8)) == 0)
+        # the image's border is no edge of the piece
+        rows, columns = np.nonzero(edge[1:-1, 1:-1])
+        rows, columns = rows + at[0].start, columns + at[1].start
+        inner = (rows > 0) & (rows < self.height - 1) & (columns > 0) & (columns < self.width - 1)
+        found = self.cover.contrast[rows[inner], columns[inner]]
+        return float((found > OUTLINE).mean()) if len(found) else 1.0
 
     def _casts_shadow(self, piece: NDArray[np.bool_], at: tuple[slice, slice]) -> bool:
         """Return whether shade lies along much of a piece's edge, as beside a wall."""

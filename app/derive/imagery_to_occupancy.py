@@ -23,7 +23,7 @@ class Parameters(Segmentation):
     """Parameters of imagery_to_occupancy."""
 
 
-@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0)
+@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0, version=2)
 def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Occupancy grid from an image: trees, vegetation, buildings and walls are occupied.
 
