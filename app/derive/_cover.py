@@ -41,6 +41,9 @@ WET, WET_NDVI = 0.05, 0.1
 STILL, DIM, COLD = 0.8, 50.0, 2.0
 """Maximum roughness, lightness, and a* and b* of water that is recognised by colour."""
 
+RED = 10.0
+"""Minimum a* of what is too red for water, such as tiles, which have a high NDWI."""
+
 LAKE = 400.0
 """Minimum area of water that is recognised by colour, in square metres: shadows are smaller."""
 
@@ -165,7 +168,7 @@ def crowns(ground: GroundImage, seen: Cover) -> NDArray[np.bool_]:
 def water(ground: GroundImage, seen: Cover, nir: int | None) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Mark (water, what may be water): by NDWI with a near-infrared band, else what is large, dark, smooth and bluish.
 
-    Bright pixels with a high NDWI may be muddy water, or paint.
+    Bright or red pixels with a high NDWI may be muddy water, paint or tiles.
     """
     import cv2
 
@@ -173,7 +176,7 @@ def water(ground: GroundImage, seen: Cover, nir: int | None) -> tuple[NDArray[np
     if nir is not None:
         ndvi, ndwi = indices(ground, nir)
         wet = ground.valid & (ndwi > WET) & (ndvi < WET_NDVI)
-        return wet & (seen.light < DIM), wet
+        return wet & (seen.light < DIM) & (lab[..., 1] < RED), wet
     wet = ground.valid & (seen.rough < STILL) & (lab[..., 0] < DIM) & (lab[..., 1] < COLD) & (lab[..., 2] < COLD)
     side = max(3, int(2 * WINDOW / ground.resolution) // 2 * 2 + 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
