@@ -19,6 +19,7 @@ import shapely
 
 from app.generate._shapes import mm, rectangle, round_geometry
 from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_option_error
+from app.model.aisles import stop_positions
 from app.parameters import parameter
 
 MIN_AISLE_METRES = 2.0
@@ -299,11 +300,7 @@ def _longest_aisle(
 
 def stops(out: Field, aisle: Aisle) -> list[tuple[str, float]]:
     """Return an aisle's nodes and their u: headland, row's end, along the row, row's end, headland."""
-    turn = out.options.headland / 2
-    first, last = aisle.low + turn, aisle.high - turn
-    steps = max(1, round((last - first) / out.options.node_spacing))
-    inner = [(f"c{k - 1}", first + (last - first) * k / steps) for k in range(1, steps)]
-    return [("ca", aisle.low), ("cb", first), *inner, ("cy", last), ("cz", aisle.high)]
+    return stop_positions(aisle.low, aisle.high, out.options.headland / 2, out.options.node_spacing)
 
 
 def network(

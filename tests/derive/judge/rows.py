@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from app import formats, generate
-from app.derive import DerivationNotes, Step, all_derivations, run, with_parameters
-from app.errors import CannotConvert, Invalid
+from app.derive import DerivationNotes, all_derivations, run
+from app.errors import CannotConvert
 from app.formats import ReadContext
 from app.model.features import Features
 from app.model.frame import GROUND
@@ -131,27 +131,18 @@ def _generated(case: Case) -> list[Truth]:
     return out
 
 
-def _step(name: str, **values: str) -> Step:
-    return with_parameters([all_derivations()[name].step()], values)[0]
-
-
 def _derive(source: Layers) -> Derived:
-    """Derive rows and network as a user would; nothing where there is no such derivation."""
-    picture = bool(source.parts_of("imagery"))
-    steps = (
-        (("imagery_to_objects", {"segmentation": "rows"}), ("imagery_to_topology", {}))
-        if picture
-        else (("occupancy_to_rows", {}), ("occupancy_to_topology", {"method": "rows"}))
-    )
-    made: list[Features | None] = []
-    for name, values in steps:
-        try:
-            (part,) = run([_step(name, **values)], source).parts_of(all_derivations()[name].gives).values()
-        except (Invalid, KeyError, CannotConvert):
-            made.append(None)
-            continue
-        assert isinstance(part, Features)
-        made.append(part)
+    """Derive rows and network as a user would; nothing where there are none."""
+    name = "imagery_to_rows" if source.parts_of("imagery") else "occupancy_to_rows"
+    made: list[Features | None] = [None, None]
+    try:
+        with_rows = run([all_derivations()[name].step()], source)
+        with_network = run([all_derivations()["rows_to_topology"].step()], with_rows)
+    except CannotConvert:
+        pass
+    else:
+        (made[0],) = with_rows.vector("objects").values()
+        (made[1],) = with_network.vector("topology").values()
     objects, network = made
     rows = [] if objects is None else [g for g, p in _of(objects) if p["kind"] == "row"]
     ends = np.array([shapely.get_coordinates(g)[[0, -1]] for g in rows]).reshape(-1, 2, 2)
