@@ -17,18 +17,23 @@ from app.errors import CannotConvert
 ROWS = "rows"
 """Name of the part."""
 
+CLEARER = 1.5
+"""Factor by which the rows of a later mask must be clearer."""
+
 Item = tuple[str, Any, dict[str, Any]]
 
 
 def fields_of(
     masks: Sequence[NDArray[np.bool_]], size: float, left: float, bottom: float, notes: DerivationNotes, name: str
 ) -> list[RowField]:
-    """Return the fields in the mask whose rows are clearest. masks: [h, w], row 0 at the bottom.
+    """Return the fields in the mask whose rows are clearest. masks: [h, w], row 0 at the bottom, the
+    likeliest first.
 
     Raises CannotConvert if no mask has rows.
     """
     first = [find_fields(mask, size, left, bottom, limit=1) for mask in masks]
-    scores = [fields[0].score if fields else 0.0 for fields in first]
+    # where plants are dark, the aisles are bright rows, too: a later mask must be clearly better
+    scores = [(fields[0].score if fields else 0.0) / CLEARER**k for k, fields in enumerate(first)]
     clearest = int(np.argmax(scores))
     best = find_fields(masks[clearest], size, left, bottom) if scores[clearest] else []
     if not best:

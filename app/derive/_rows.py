@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,9 @@ SAMPLE = 40_000
 ALONG = 1.0
 """Length of a step along a row in metres: a step with any cell counts once, so that walls weigh no more than trees."""
 
+FINE = 0.05
+"""Minimum distance of the fine lines on which rows are looked for, in metres; of the coarse ones it is twice that."""
+
 GAP = 4.0
 """Maximum gap in a row, in metres: posts of tunnels stand 3 m apart."""
 
@@ -38,8 +42,8 @@ MIN_LENGTH, MIN_ROWS = 5.0, 3
 MIN_SCORE, MIN_SHARE = 100.0, 0.15
 """Minimum score of a field (three rows of 20 m have 134), and its minimum share of the best field's."""
 
-DIRECTIONS = 10
-"""Number of directions in which rows are looked for."""
+DIRECTIONS, FINE_DIRECTIONS = 6, 3
+"""Number of directions in which rows are looked for, on coarse and on fine lines."""
 
 REGULAR, MISSING = 0.25, 2
 """Tolerated deviation from the distance of rows, as a share of it, and maximum multiple of it at missing rows."""
@@ -120,7 +124,7 @@ def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float
     xy = np.column_stack([left + (columns + 0.5) * size, bottom + (rows + 0.5) * size])
     out: list[RowField] = []
     while len(xy) >= 2 * MIN_ROWS and len(out) < limit:
-        best = max((_best_in(xy, yaw, size) for yaw in _directions(xy, size)), key=_score, default=None)
+        best = max(_candidates(xy, size), key=_score, default=None)
         if best is None or best.score < max(MIN_SCORE, MIN_SHARE * out[0].score if out else 0.0):
             break
         out.append(best)
@@ -171,9 +175,17 @@ def _directions(xy: Array, size: float) -> list[float]:
     return out
 
 
-def _best_in(xy: Array, yaw: float, size: float) -> RowField | None:
-    """Return the best field of a direction."""
-    lines = _segments(xy, yaw, size)
+def _candidates(xy: Array, size: float) -> Iterator[RowField | None]:
+    """Yield the best field of each likely direction, on coarse lines, and of the likeliest ones on fine lines."""
+    directions = _directions(xy, size)
+    for across, count in ((max(2 * size, 2 * FINE), DIRECTIONS), (max(size, FINE), FINE_DIRECTIONS)):
+        for yaw in directions[:count]:
+            yield _best_in(xy, yaw, across)
+
+
+def _best_in(xy: Array, yaw: float, across: float) -> RowField | None:
+    """Return the best field of a direction. across: distance of the lines on which rows are looked for, in metres."""
+    lines = _segments(xy, yaw, across)
     fields = [one for one in (_field(yaw, chain) for chain in _chains(lines)) if one is not None]
     fields = [replace(one, score=one.score * _emptiness(one, xy)) for one in fields]
     return max(fields, key=_score, default=None)
@@ -192,10 +204,9 @@ def _emptiness(field: RowField, xy: Array) -> float:
     return (1.0 - min(full / total, 1.0)) ** 2
 
 
-def _segments(xy: Array, yaw: float, size: float) -> list[Row]:
+def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     """Return the segments along a direction, each the strongest of its neighbourhood, in the order of v."""
     u, v = _turned(xy, yaw)
-    across = max(2 * size, 0.1)
     low_u, low_v = float(u.min()), float(v.min())
     i = np.floor((u - low_u) / ALONG).astype(np.int64)
     j = np.floor((v - low_v) / across).astype(np.int64)
