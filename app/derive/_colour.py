@@ -33,6 +33,9 @@ NDVI = 0.2
 SPREAD = 0.03
 """Minimum difference in excess green or NDVI between vegetation and the rest."""
 
+NOISE = 3.0
+"""Difference in CIELAB below which two groups have the same colour, and differ by noise only."""
+
 SAMPLE = 2**16
 """Maximum number of pixels from which the groups are computed."""
 
@@ -137,4 +140,17 @@ def _groups(
     for start in range(0, len(flat), 2**18):
         away = ((flat[start : start + 2**18, None, :] - centres[None]) ** 2).sum(axis=2)
         out[start : start + 2**18] = away.argmin(axis=1)
-    return out.reshape(valid.shape), centres
+    same = _similar(centres)
+    kept = np.unique(same)
+    return np.searchsorted(kept, same).astype(np.uint8)[out.reshape(valid.shape)], centres[kept]
+
+
+def _similar(centres: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return for each colour the first one that differs from it by noise only."""
+    away = np.sqrt(((centres[:, None] - centres[None]) ** 2).sum(axis=2))
+    same = np.arange(len(centres))
+    for k in range(1, len(centres)):
+        near = np.flatnonzero(away[k, :k] < NOISE)
+        if len(near):
+            same[k] = same[near[0]]
+    return same

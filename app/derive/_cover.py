@@ -144,10 +144,13 @@ def _blur(light: Plane) -> int:
 
 
 def indices(ground: GroundImage, nir: int) -> tuple[Plane, Plane]:
-    """Return NDVI and NDWI of each pixel; 0 where a band has no usable value."""
+    """Return NDVI and NDWI of each pixel; 0 where a band is missing or has no usable value."""
     infrared = ground.raw[..., nir].astype(np.float32)
     out = []
     for band, sign in ((0, 1.0), (1, -1.0)):
+        if band >= ground.raw.shape[2]:
+            out.append(np.zeros(infrared.shape, np.float32))
+            continue
         other = ground.raw[..., band].astype(np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # NaN and infinite values have no index
             total = infrared + other

@@ -68,6 +68,9 @@ OUTLINE, OUTLINED = 10.0, 0.7
 changes fall apart into bands without edges.
 """
 
+HALL = 10_000.0
+"""Area in square metres above which a building is doubtful; above ten times that, a rectangle is a field."""
+
 MIXED = 0.25
 """Share of green up to which an area is no vegetation, and share of other pixels up to which it is."""
 
@@ -228,7 +231,8 @@ class RegionBuilder:
             a, b = (float(np.median(self.cover.lab[at][..., k][piece])) for k in (1, 2))
             soil = math.hypot(a, b) >= EARTHY and SOIL[0] <= math.degrees(math.atan2(b, a)) <= SOIL[1]
             vast = region.attributes["area"] >= VAST
-            sure = _fit(sure / 0.6 * (0.8 if vast and (measured or soil) else 0.55 if vast and soil else 0.35))
+            known = measured and (soil or region.attributes["area"] >= HALL)
+            sure = _fit(sure / 0.6 * (0.8 if vast and known else 0.55 if vast and soil else 0.35))
         else:
             if region.attributes["width"] < max(NARROW, 3 * self.size):
                 sure *= DOUBT
@@ -358,14 +362,17 @@ def _classify_shape(
     if long:  # a ragged area has a long outline, too, but is wider than a band of its length
         away = cv2.distanceTransform(np.pad(piece, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         long = 2 * float(away.max()) <= BULGE * max(width, 2.0)
-    straight = rectangular >= RECTANGULAR and square_metres >= BUILDING and side >= SIDE
+    straight = rectangular >= RECTANGULAR and BUILDING <= square_metres <= 10 * HALL and side >= SIDE
     # a path leads somewhere: a straight band that is isolated in the image is rather a roof
     if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):
         sides = sorted((round(w * size, 2), round(h * size, 2)), reverse=True)
-        return Region("building", _fit(rectangular * uniform), {**attributes, "sides": sides})
+        sure = rectangular * uniform * (DOUBT if square_metres > HALL else 1.0)  # fields are rectangles, too
+        return Region("building", _fit(sure), {**attributes, "sides": sides})
     if long:
         slender = 1.0 - LONG / 2 / max(length / width, LONG)
         kind: Kind = "path" if metres <= PATH else "road"
+        if kind == "road" and not ends and length < 2 * LONG * width:  # a roof with wings is a short wide band
+            slender *= DOUBT
         return Region(kind, _fit(slender * uniform), {**attributes, "width": round(metres, 2)})
     if square_metres >= FIELD:
         return Region("field", _fit(0.6 * uniform), {**attributes, "surface": "bare"})

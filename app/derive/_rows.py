@@ -87,7 +87,7 @@ class RowField:
     """Field of parallel rows.
 
     Attributes:
-        yaw: direction of the rows in radians, from 0 to pi, from the local x axis.
+        yaw: direction of the rows in radians from the local x axis, see ``half_turn``.
         rows: in the order of v.
         regular: share of the distances of rows that are regular.
         score: support of the field, for comparing fields.
@@ -107,6 +107,11 @@ class RowField:
         """Return a position along and across the rows in local metres."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return round(c * u - s * v, 6), round(s * u + c * v, 6)
+
+
+def half_turn(yaw: float) -> float:
+    """Return a line's direction from -pi/4 to 3 pi/4: rows are then numbered from south to north, or east to west."""
+    return (yaw + math.pi / 4) % math.pi - math.pi / 4
 
 
 def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float, limit: int = 8) -> list[RowField]:
@@ -171,7 +176,7 @@ def _directions(xy: Array, size: float) -> list[float]:
     out = []
     for k in sorted(peaks, key=lambda k: -energy[k])[:DIRECTIONS]:
         near = [math.radians(k / 2 + tenth / 10) for tenth in range(-5, 6)]
-        out.append(max(near, key=lambda yaw: _energy(few, yaw, across)) % math.pi)
+        out.append(half_turn(max(near, key=lambda yaw: _energy(few, yaw, across))))
     return out
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from app.model.grid import FREE, UNKNOWN
 from app.parameters import parameter
 
 Kind = Literal["field", "tree", "vegetation", "water", "path", "road", "building", "area"]
@@ -72,6 +73,7 @@ class Segmentation:
 
 
 METHOD_PARAMETERS = {
+    "probabilities": ("colour", "index", "model"),
     "model": ("model",),
     "confidence": ("colour", "index", "model"),
     "points": ("model",),
@@ -119,3 +121,22 @@ def doubt(segmented: Segments, sure: float) -> None:
         if region.confidence < sure and region.kind != "area":
             region.attributes["guess"] = region.kind
             region.kind = "area"
+
+
+OBSTACLES = frozenset({"tree", "vegetation", "building", "water"})
+"""Kinds of regions that block robots."""
+
+
+def probability_cells(segmented: Segments) -> NDArray[np.uint8]:
+    """Return the probability in percent that each pixel is occupied: uint8 [h, w]; 255 where nothing is guessed.
+
+    A region that is an obstacle with confidence c counts c, other ground 1 - c.
+    """
+    values = [UNKNOWN]
+    for region in segmented.regions:
+        kind = region.attributes.get("guess", region.kind)
+        chance = region.confidence if kind in OBSTACLES else 1.0 - region.confidence
+        values.append(UNKNOWN if kind == "area" else round(100 * chance))
+    cells = np.array(values, np.uint8)[segmented.label]
+    cells[segmented.open_ & (segmented.label == 0)] = FREE
+    return cells

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._rows import Row, RowField
+from app.derive._rows import Row, RowField, half_turn
 from app.errors import CannotConvert, Invalid, MissingLayer
 from app.model.aisles import stop_positions
 from app.model.features import Features, concatenate, features
@@ -105,7 +105,7 @@ def _row_field(rows: list[tuple[NDArray[np.float64], Mapping[str, Any]]]) -> Row
     """Return drawn rows as a field."""
     steps = np.array([ends[1] - ends[0] for ends, _ in rows])
     double = 2 * np.arctan2(steps[:, 1], steps[:, 0])
-    yaw = math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2 % math.pi
+    yaw = half_turn(math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2)
     c, s = math.cos(yaw), math.sin(yaw)
     out = []
     for ends, properties in rows:
