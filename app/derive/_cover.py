@@ -77,9 +77,9 @@ def cover(ground: GroundImage) -> Cover:
     smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0)
     lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB), np.float32)
     del smooth
-    own = cv2.cvtColor(ground.rgb.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
-    light = np.ascontiguousarray(own[..., 0], np.float32)
-    del own
+    converted = cv2.cvtColor(ground.rgb.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
+    light = np.ascontiguousarray(converted[..., 0], np.float32)
+    del converted
     lab[..., 1:] -= _cast(lab, ground.valid)
     window = max(WINDOW_PIXELS, int(WINDOW / ground.resolution) // 2 * 2 + 1)
     median = float(np.median(light[ground.valid]))

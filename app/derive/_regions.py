@@ -231,8 +231,8 @@ class RegionBuilder:
             a, b = (float(np.median(self.cover.lab[at][..., k][piece])) for k in (1, 2))
             soil = math.hypot(a, b) >= EARTHY and SOIL[0] <= math.degrees(math.atan2(b, a)) <= SOIL[1]
             vast = region.attributes["area"] >= VAST
-            known = measured and (soil or region.attributes["area"] >= HALL)
-            sure = _fit(sure / 0.6 * (0.8 if vast and known else 0.55 if vast and soil else 0.35))
+            is_ground = measured and (soil or region.attributes["area"] >= HALL)
+            sure = _fit(sure / 0.6 * (0.8 if vast and is_ground else 0.55 if vast and soil else 0.35))
         else:
             if region.attributes["width"] < max(NARROW, 3 * self.size):
                 sure *= DOUBT
@@ -254,8 +254,8 @@ class RegionBuilder:
         rows, columns = np.nonzero(edge[1:-1, 1:-1])
         rows, columns = rows + at[0].start, columns + at[1].start
         inner = (rows > 0) & (rows < self.height - 1) & (columns > 0) & (columns < self.width - 1)
-        found = self.cover.contrast[rows[inner], columns[inner]]
-        return float((found > OUTLINE).mean()) if len(found) else 1.0
+        contrast = self.cover.contrast[rows[inner], columns[inner]]
+        return float((contrast > OUTLINE).mean()) if len(contrast) else 1.0
 
     def _casts_shadow(self, piece: NDArray[np.bool_], at: tuple[slice, slice]) -> bool:
         """Return whether shade lies along much of a piece's edge, as beside a wall."""

@@ -220,32 +220,32 @@ def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     steps = weight > 0
     # three bins together: a row is not exactly on one line
     steps[1:-1] |= steps[:-2] | steps[2:]
-    found: list[tuple[float, int, int, int]] = []
+    candidates: list[tuple[float, int, int, int]] = []
     for line in np.flatnonzero(steps.sum(axis=1) * ALONG >= FILL * MIN_LENGTH):
-        where = np.flatnonzero(steps[line])
-        for run in np.split(where, np.flatnonzero(np.diff(where) * ALONG > GAP) + 1):
+        filled = np.flatnonzero(steps[line])
+        for run in np.split(filled, np.flatnonzero(np.diff(filled) * ALONG > GAP) + 1):
             length = (run[-1] - run[0] + 1) * ALONG
             if length >= MIN_LENGTH and len(run) * ALONG >= FILL * length:
                 mass = float(weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum())
-                found.append((len(run) + mass / (1 + mass), int(line), int(run[0]), int(run[-1])))
-    lines = _joined(_strongest(found), weight > 0)
+                candidates.append((len(run) + mass / (1 + mass), int(line), int(run[0]), int(run[-1])))
+    lines = _joined(_strongest(candidates), weight > 0)
     order = np.argsort(v, kind="stable")
     out = []
     for top, below, first, last in lines:
         start, stop = np.searchsorted(v[order], [low_v + (top - 1.5) * across, low_v + (below + 0.5) * across])
-        own = order[start:stop]
-        own = own[(u[own] >= low_u + first * ALONG) & (u[own] < low_u + (last + 1) * ALONG)]
-        if len(own) and float(np.ptp(u[own])) >= MIN_LENGTH:
-            low, high = float(u[own].min()), float(u[own].max())
-            filled = len(np.unique(i[own])) * ALONG / (high - low)
-            out.append(Row(float(v[own].mean()), low, high, min(1.0, filled), (below - top + 1) * across))
+        members = order[start:stop]
+        members = members[(u[members] >= low_u + first * ALONG) & (u[members] < low_u + (last + 1) * ALONG)]
+        if len(members) and float(np.ptp(u[members])) >= MIN_LENGTH:
+            low, high = float(u[members].min()), float(u[members].max())
+            fill = len(np.unique(i[members])) * ALONG / (high - low)
+            out.append(Row(float(v[members].mean()), low, high, min(1.0, fill), (below - top + 1) * across))
     return sorted(out, key=lambda row: row.v)
 
 
-def _strongest(found: list[tuple[float, int, int, int]]) -> list[tuple[int, int, int]]:
+def _strongest(candidates: list[tuple[float, int, int, int]]) -> list[tuple[int, int, int]]:
     """Return (line, first, last) of the segments beside which there is no stronger one, in the order of lines."""
     taken: list[tuple[int, int, int]] = []
-    for _, line, first, last in sorted(found, reverse=True):
+    for _, line, first, last in sorted(candidates, reverse=True):
         if not any(abs(line - k) <= 2 and min(last, b) >= max(first, a) for k, a, b in taken):
             taken.append((line, first, last))
     return sorted(taken)
