@@ -53,6 +53,9 @@ STRICT = 0.6
 
 BED = 3.0
 
+MIN_CONTRAST = 0.35
+"""Minimum contrast between rows and aisles; scattered cells have 0."""
+
 SIMILAR, BESIDE = 0.4, 0.5
 """Minimum ratio of a row's length to the median, and minimum share of a row that lies beside its neighbour."""
 
@@ -192,8 +195,22 @@ def _best_in(xy: Array, yaw: float, across: float) -> RowField | None:
     """Return the best field of a direction. across: distance of the lines on which rows are looked for, in metres."""
     lines = _segments(xy, yaw, across)
     fields = [one for one in (_field(yaw, chain) for chain in _chains(lines)) if one is not None]
-    fields = [replace(one, score=one.score * _emptiness(one, xy)) for one in fields]
+    fields = [replace(one, score=one.score * _emptiness(one, xy) * _contrast(one, xy, across)) for one in fields]
     return max(fields, key=_score, default=None)
+
+
+def _contrast(field: RowField, xy: Array, across: float) -> float:
+    """Return how much more of a field's cells its rows hold than of its area, from 0 to 1; 0 below MIN_CONTRAST."""
+    u, v = _turned(xy, field.yaw)
+    low, high = min(row.low for row in field.rows), max(row.high for row in field.rows)
+    inside = (u >= low) & (u <= high) & (v >= field.rows[0].v) & (v <= field.rows[-1].v)
+    lines = np.array([row.v for row in field.rows])
+    half = np.array([row.width / 2 + across for row in field.rows])
+    nearest = np.abs(v[inside][:, None] - lines[None]) <= half[None]
+    held = float(nearest.any(axis=1).mean()) if inside.any() else 0.0
+    area = min(1.0, float(2 * half[:-1].sum()) / max(float(lines[-1] - lines[0]), 1e-9))
+    contrast = (held - area) / max(1.0 - area, 1e-9)
+    return contrast if contrast >= MIN_CONTRAST else 0.0
 
 
 def _emptiness(field: RowField, xy: Array) -> float:

@@ -23,6 +23,9 @@ from app.parameters import parameter
 
 KINDS = ("row", "tree_row")
 
+MAX_NODES = 200_000
+"""Maximum number of nodes of a network."""
+
 PARALLEL = 10.0
 """Maximum difference of rows of one field in direction, in degrees."""
 
@@ -116,6 +119,16 @@ def _row_field(rows: list[tuple[NDArray[np.float64], Mapping[str, Any]]]) -> Row
     return RowField(yaw, tuple(sorted(out, key=lambda row: row.v)))
 
 
+def _low_end(a: Row, b: Row) -> float:
+    """Return where the longer of two rows begins."""
+    return min(a.low, b.low)
+
+
+def _high_end(a: Row, b: Row) -> float:
+    """Return where the longer of two rows ends."""
+    return max(a.high, b.high)
+
+
 @dataclass(slots=True)
 class _Network:
     """Network that grows field by field. blocked: number of edges that meet occupied cells."""
@@ -135,8 +148,12 @@ class _Network:
             if free < 2 * parameters.robot_radius or min(a.high, b.high) - max(a.low, b.low) <= 0:
                 continue
             middle = (a.v + a.width / 2 + b.v - b.width / 2) / 2
+            if len(self.nodes) + (_high_end(a, b) - _low_end(a, b)) / parameters.node_spacing > MAX_NODES:
+                raise CannotConvert(
+                    f"the network would have more than {MAX_NODES} nodes: set a larger node_spacing, or fewer rows"
+                )
             # beside the end of the longer row there is no passage to the next aisle
-            low, high = min(a.low, b.low) - parameters.turn, max(a.high, b.high) + parameters.turn
+            low, high = _low_end(a, b) - parameters.turn, _high_end(a, b) + parameters.turn
             stops = [
                 self._node(f"{prefix}r{number}.5-{suffix}", one.to_local(u, middle))
                 for suffix, u in stop_positions(low, high, parameters.turn, parameters.node_spacing)

@@ -16,7 +16,7 @@ from app.derive._rows import find_fields
 from app.errors import CannotConvert, CannotDerive, MissingLayer
 from app.model.aisles import stop_positions
 from app.model.features import Features, features
-from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, Part, PartKey
 from tests.derive.pictures import local
@@ -77,6 +77,28 @@ def test_walls_of_a_room_are_no_rows() -> None:
     with pytest.raises(CannotDerive, match="no parallel rows"):
         derived("occupancy_to_rows", grid(drawn(room)))
     assert find_fields(np.zeros((50, 50), bool), 0.1, 0.0, 0.0) == []
+
+
+def test_scattered_cells_and_full_ground_are_no_rows() -> None:
+    noise = np.random.default_rng(0).random((400, 400))
+    for mask in (noise < 0.02, noise < 0.2, np.ones((100, 100), bool)):
+        assert find_fields(mask, 0.05, 0.0, 0.0) == []
+
+
+def test_strange_input_gives_clear_problem() -> None:
+    unknown = OccupancyGrid(np.full((50, 50), UNKNOWN, np.uint8), SIZE)
+    with pytest.raises(CannotDerive, match="no parallel rows"):
+        derived("occupancy_to_rows", Layers({PartKey("occupancy", "ground", MAP): unknown}))
+    for pixels in (np.full((1, 1, 3), 7, np.uint8), np.full((60, 60, 1), 120, np.uint8)):
+        with pytest.raises(CannotDerive, match="no parallel rows"):
+            derived("imagery_to_rows", Layers({PartKey("imagery", "ground", "satellite"): local(pixels)}))
+    long = [(f"r{k}", shapely.LineString([(0, k * 2), (9e5, k * 2)]), {"kind": "row"}) for k in range(2)]
+    with pytest.raises(CannotDerive, match="more than 200000 nodes"):
+        derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(long, "local")}))
+    odd = [shapely.Point(1, 1), shapely.LineString(), shapely.LineString([(0, 0, 1), (9, 0, 2)])]
+    rows = [(f"r{k}", g, {"kind": "row", "field": [], "row_width": "wide"}) for k, g in enumerate(odd)]
+    with pytest.raises(CannotDerive, match="fits between no two rows"):
+        derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")}))
 
 
 def test_network_of_aisles_follows_rows() -> None:
