@@ -207,9 +207,9 @@ def _contrast(field: RowField, xy: Array, across: float) -> float:
     lines = np.array([row.v for row in field.rows])
     half = np.array([row.width / 2 + across for row in field.rows])
     nearest = np.abs(v[inside][:, None] - lines[None]) <= half[None]
-    held = float(nearest.any(axis=1).mean()) if inside.any() else 0.0
+    share = float(nearest.any(axis=1).mean()) if inside.any() else 0.0
     area = min(1.0, float(2 * half[:-1].sum()) / max(float(lines[-1] - lines[0]), 1e-9))
-    contrast = (held - area) / max(1.0 - area, 1e-9)
+    contrast = (share - area) / max(1.0 - area, 1e-9)
     return contrast if contrast >= MIN_CONTRAST else 0.0
 
 
