@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+import numpy as np
+
 from app.derive import DerivationNotes, _model, _plans
+from app.derive._colour import segments
 from app.derive._pictures import GroundImage, infrared_band
-from app.derive._segments import METHOD_PARAMETERS, Segmentation, Segments, segments
+from app.derive._segments import METHOD_PARAMETERS, MIN_CONFIDENCE, Segmentation, Segments, doubt
 from app.errors import Invalid, Problem
 from app.model.geodesy import LocalFrame
 from app.model.grid import OccupancyGrid
@@ -53,8 +56,20 @@ def segment_picture(
                 [Problem("missing: segmentation=model needs the name of a model", where="model")],
             )
         return _model.segments(on, how, notes, name)
-    nir = infrared_band(picture, how.near_infrared, name) if method == "index" else None
-    return segments(on, how, method, nir, notes, name)
+    nir = infrared_band(picture, how.near_infrared, name)
+    out = segments(on, how, method, nir, notes, name)
+    doubt(out, MIN_CONFIDENCE if how.confidence is None else how.confidence)
+    _report_unknown(out, on, notes, name)
+    return out
+
+
+def _report_unknown(out: Segments, on: GroundImage, notes: DerivationNotes, name: str) -> None:
+    """Warn of the share of an image that is unknown."""
+    is_area = np.array([False, *(region.kind == "area" for region in out.regions)])
+    unknown = on.valid & (((out.label == 0) & ~out.open_) | is_area[out.label])
+    share = float(unknown.sum()) / float(on.valid.sum())
+    if share > 0:
+        notes.warn(f"{share:.0%} of {name} is unknown: colour and shape do not tell what is there")
 
 
 def plan_to_grid(

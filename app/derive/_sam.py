@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from app.derive import DerivationNotes
 from app.derive._onnx import Array, LoadedModel, ModelFiles, load_session, square, starts
 from app.derive._pictures import GroundImage
-from app.derive._segments import ColourRules, Region, Segments
+from app.derive._regions import ColourRules
+from app.derive._segments import Region, Segments
 from app.errors import CannotConvert
 
 DEFAULT_SIDE = 1024

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from app.derive import DerivationNotes
 from app.derive._onnx import Array, LoadedModel, ModelFiles, classes, input_side, starts
 from app.derive._pictures import GroundImage
-from app.derive._segments import Region, Segments, way_attributes
+from app.derive._regions import way_attributes
+from app.derive._segments import Region, Segments
 from app.errors import CannotConvert
 
 SIDE = 640

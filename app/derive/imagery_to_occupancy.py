@@ -9,27 +9,35 @@ import numpy as np
 from app.derive import DerivationNotes, derives
 from app.derive._picture_methods import choose_method, plan_to_grid, segment_picture
 from app.derive._pictures import ground, picture_label, select_pictures
-from app.derive._segments import Segmentation
+from app.derive._segments import OBSTACLES, Segmentation, probability_cells
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import LOCAL
 from app.model.layers import MAP, Layers, Part, PartKey
+from app.parameters import parameter
 
-OBSTACLES = frozenset({"tree", "vegetation", "building"})
+PROBABILITY = "probability"
+"""Name of the grid of probabilities."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters(Segmentation):
     """Parameters of imagery_to_occupancy."""
 
+    probabilities: bool = parameter(
+        False,
+        "colour, index, model: whether there is also a grid `probability`, whose cells are the probability in percent "
+        "that they are occupied",
+    )
 
-@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0)
+
+@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0, version=2)
 def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
-    """Occupancy grid from an image: trees, vegetation, buildings and walls are occupied.
+    """Occupancy grid from an image: trees, vegetation, buildings, water and walls are occupied.
 
-    Fields, paths, roads and a plan's rooms are free, everything else (also a model's ``area``) is unknown. The origin
-    is a multiple of the resolution, yaw 0. Raises CannotConvert if nothing is recognised in the image, MissingDatum if
-    it is anchored in WGS 84 and there is no datum.
+    Fields, paths, roads and a plan's rooms are free, everything else is unknown: also regions below ``confidence``. The
+    origin is a multiple of the resolution, yaw 0. Raises CannotConvert if nothing is recognised in the image,
+    MissingDatum if it is anchored in WGS 84 and there is no datum.
     """
     parts: dict[PartKey, Part] = {}
     for key, picture in select_pictures(layers, parameters.picture).items():
@@ -50,6 +58,9 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
             bottom = on.top - on.resolution * len(cells)
             origin = (round(on.left, 9), round(bottom, 9), 0.0)
             grid = OccupancyGrid(np.ascontiguousarray(cells[::-1]), on.resolution, origin)
+            if parameters.probabilities:
+                chance = np.ascontiguousarray(probability_cells(segments)[::-1])
+                parts[PartKey("occupancy", key.level, PROBABILITY)] = OccupancyGrid(chance, on.resolution, origin)
         if not (grid.cells == FREE).any():
             raise CannotConvert(f"{name} shows no free ground: no field, path, road or room was detected")
         notes.warn("the grid was detected automatically in an image: review it before robots use it", where=key.name)

@@ -20,6 +20,7 @@ import shapely
 from app.generate._shapes import angle, mm, rectangle, round_geometry
 from app.generate._site import MAX_NODES, SLACK, Site, SiteOptions, invalid_option_error
 from app.generate._variety import drawn
+from app.model.aisles import stop_positions
 from app.parameters import parameter
 
 MIN_AISLE_METRES = 2.0
@@ -551,19 +552,9 @@ def _cross(out: Field, layout: Layout) -> None:
 
 
 def stops(out: Field, aisle: Aisle) -> list[tuple[str, float]]:
-    """Return an aisle's nodes and their u: headland, row's end, along the row, row's end, headland."""
-    turn = out.options.headland / 2
-    first, last = aisle.low + turn, aisle.high - turn
-    steps = max(1, round((last - first) / out.options.node_spacing))
-    inner = [(f"c{k - 1}", first + (last - first) * k / steps) for k in range(1, steps)]
-    inner += [(f"x{k}", u) for k, u in aisle.crossings.items()]
-    return [
-        ("ca", aisle.low),
-        ("cb", first),
-        *sorted(inner, key=lambda stop: stop[1]),
-        ("cy", last),
-        ("cz", aisle.high),
-    ]
+    """Return an aisle's nodes and their u: headland, row's end, along the row, row's end, headland, and cross-aisles."""
+    regular = stop_positions(aisle.low, aisle.high, out.options.headland / 2, out.options.node_spacing)
+    return sorted([*regular, *((f"x{k}", u) for k, u in aisle.crossings.items())], key=lambda stop: stop[1])
 
 
 def ground(out: Field, *, field_colour: str, lane_colour: str = "path") -> None:

@@ -188,7 +188,8 @@ def test_vegetation_by_index() -> None:
     assert len(of(part, "tree")) == len(TREES)
     assert notes.template[0].subject == "threshold"
     g = grid(layers(local(farm())), segmentation="index")
-    assert (at(g, *TREES[0]), at(g, 41, 29), at(g, 50, 5)) == (OCCUPIED, FREE, FREE), "a roof does not grow"
+    assert (at(g, *TREES[0]), at(g, 50, 5)) == (OCCUPIED, FREE)
+    assert at(g, 41, 29) == UNKNOWN, "a roof does not grow, but is no ground"
 
 
 def test_near_infrared_band_gives_ndvi() -> None:
@@ -215,6 +216,62 @@ def test_near_infrared_band_gives_ndvi() -> None:
         objects(layers(untagged), segmentation="colour")
     with pytest.raises(CannotConvert, match="no band 9"):
         objects(layers(unsaid), segmentation="index", near_infrared=9)
+
+
+def lake() -> np.ndarray[Any, Any]:
+    """Turf with a dark smooth lake of 30 × 30 m, and grey ground without a shape: uint8 [400, 600, 3]."""
+    image = np.full((400, 600, 3), (110, 150, 80), np.uint8)
+    image[50:350, 50:350] = (30, 45, 60)
+    cv2.fillPoly(image, [np.array([[400, 60], [590, 200], [400, 340]])], (150,) * 3)
+    shaken = image + np.random.default_rng(4).normal(0.0, 2.0, image.shape)
+    return np.clip(np.round(shaken), 0, 255).astype(np.uint8)
+
+
+def test_lake_is_occupied_and_what_colour_does_not_tell_is_unknown() -> None:
+    notes = DerivationNotes()
+    content = layers(local(lake()))
+    g = grid(content, notes)
+    assert (at(g, 20, 20), at(g, 3, 3)) == (OCCUPIED, FREE)
+    assert at(g, 45, 20) == UNKNOWN, "a roof, or a car park"
+    (warning,) = [w.problem for w in notes.warnings if "is unknown" in w.problem]
+    share = float((g.cells == UNKNOWN).mean())
+    assert warning.startswith(f"{share:.0%} of the image 'satellite'")
+    (water,) = of(objects(content), "water")
+    assert overlap(water, shapely.box(5, 5, 35, 35)) > 0.9
+    guessed = [f.properties for f in objects(content) if f.properties["kind"] == "area"]
+    assert guessed
+    assert all(p["confidence"] < 0.5 and p["guess"] in ("field", "path", "road", "building") for p in guessed)
+
+
+def test_confidence_decides_what_is_unknown() -> None:
+    content = layers(local(lake()))
+    counts = [int((grid(content, confidence=c).cells == UNKNOWN).sum()) for c in (0.05, 0.5, 0.95)]
+    assert counts[0] < counts[1] < counts[2]
+
+
+def test_probabilities_are_a_second_grid() -> None:
+    content = layers(local(lake()))
+    parts = imagery_to_occupancy(content, Parameters(probabilities=True), DerivationNotes()).grids()
+    assert {key.name for key in parts} == {MAP, "probability"}
+    chance, g = (parts[PartKey("occupancy", "ground", name)] for name in ("probability", MAP))
+    assert at(chance, 20, 20) > 50 > at(chance, 3, 3)
+    assert 50 < at(chance, 45, 20) < 100, "probably no ground"
+    assert (g.origin, g.resolution, g.cells.shape) == (chance.origin, chance.resolution, chance.cells.shape)
+    with pytest.raises(Invalid, match="applies only to segmentation=colour"):
+        grid(layers(local(plan())), probabilities=True)
+
+
+def test_near_infrared_tells_water_from_bare_ground() -> None:
+    """Muddy water and bare ground of one colour: only near infrared tells them apart."""
+    rgb = np.full((300, 300, 3), (90, 80, 70), np.uint8)
+    rgb[:40] = (110, 150, 80)
+    nir = np.full((300, 300, 1), 100, np.uint8)
+    nir[:40] = 220
+    nir[150:] = 15
+    bands = [*({"colour": c} for c in ("red", "green", "blue")), {"colour": "undefined", "description": "nir"}]
+    shaken = np.concatenate([rgb, nir], axis=2) + np.random.default_rng(5).normal(0.0, 2.0, (300, 300, 4))
+    g = grid(layers(local(np.clip(shaken, 0, 255).astype(np.uint8), 2.0, bands=bands)))
+    assert (at(g, 300, 150), at(g, 300, 400), at(g, 300, 560)) == (OCCUPIED, FREE, FREE)
 
 
 def test_floor_plan_gives_walls_rooms_and_outside() -> None:

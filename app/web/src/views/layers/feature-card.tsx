@@ -9,7 +9,7 @@ import { metres } from "../../ui/text";
 export function FeatureCard({ site, map, feature }: { site: Site; map: SiteMap; feature: Feature }) {
   const [x, y] = centreOf(feature.geometry);
   const earth = site.frame.value?.toWgs84([x, y]);
-  const { kind, source, target, name: _, ...rest } = feature.properties;
+  const { kind, source, target, name: _, confidence, guess, ...rest } = feature.properties;
   const length = linesOf(feature.geometry).reduce((sum, line) => sum + lengthOf(line), 0);
   return (
     <article class="feature-card" aria-label={`Selected: ${nameOf(feature)}`}>
@@ -55,6 +55,15 @@ export function FeatureCard({ site, map, feature }: { site: Site; map: SiteMap; 
             <dt>lat, lon</dt>
             <dd>
               {earth[1].toFixed(8)}, {earth[0].toFixed(8)}
+            </dd>
+          </>
+        )}
+        {typeof confidence === "number" && (
+          <>
+            <dt>guessed</dt>
+            <dd>
+              {typeof guess === "string" ? `perhaps ${guess}` : String(kind ?? "this")}, {Math.round(confidence * 100)}{" "}
+              % sure
             </dd>
           </>
         )}

@@ -1,0 +1,350 @@
+"""Find parallel rows (trees, vines, crops, posts) in a mask of plants or obstacles.
+
+Directions come from projections of the mask: along rows, its cells fall onto few lines (the Radon transform, as in
+Rovira-Más et al. 2005). In each of the best directions, lines with cells at short distances become segments, each the
+strongest of its neighbourhood. Segments side by side at regular distances are a field. A single line, such as a wall,
+and lines without regularity are none: this is what a Hough transform alone does not tell.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MAX_CELLS = 2**21
+"""Maximum number of cells of a mask; larger ones are coarsened."""
+
+SAMPLE = 40_000
+"""Maximum number of cells from which directions are computed."""
+
+ALONG = 1.0
+"""Length of a step along a row in metres: a step with any cell counts once, so that walls weigh no more than trees."""
+
+FINE = 0.05
+"""Minimum distance of the fine lines on which rows are looked for, in metres; of the coarse ones it is twice that."""
+
+GAP = 4.0
+"""Maximum gap in a row, in metres: posts of tunnels stand 3 m apart."""
+
+FILL = 0.25
+"""Minimum share of a row's steps that have a cell."""
+
+MIN_LENGTH, MIN_ROWS = 5.0, 3
+"""Minimum length of a row in metres, and minimum number of rows of a field."""
+
+MIN_SCORE, MIN_SHARE = 100.0, 0.15
+"""Minimum score of a field (three rows of 20 m have 134), and its minimum share of the best field's."""
+
+DIRECTIONS, FINE_DIRECTIONS = 6, 3
+"""Number of directions in which rows are looked for, on coarse and on fine lines."""
+
+REGULAR, MISSING = 0.25, 2
+"""Tolerated deviation from the distance of rows, as a share of it, and maximum multiple of it at missing rows."""
+
+STRICT = 0.6
+"""Minimum share of regular distances of a field; else its rows may stand in beds, at up to BED times their distance."""
+
+BED = 3.0
+
+MIN_CONTRAST = 0.35
+"""Minimum contrast between rows and aisles; scattered cells have 0."""
+
+SIMILAR, BESIDE = 0.4, 0.5
+"""Minimum ratio of a row's length to the median, and minimum share of a row that lies beside its neighbour."""
+
+VALLEY = 0.5
+"""Maximum ratio of the cells between two rows to those of the rows: more, and they are one thick row."""
+
+MAX_SPACING = 15.0
+"""Maximum distance of rows in metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Row at a distance v across the rows' direction, from low to high along it, in metres.
+
+    fill: share of its length that has plants, up to 1. width: of its plants, in metres.
+    """
+
+    v: float
+    low: float
+    high: float
+    fill: float = 1.0
+    width: float = 0.0
+
+    @property
+    def length(self) -> float:
+        """Length in metres."""
+        return self.high - self.low
+
+
+@dataclass(frozen=True, slots=True)
+class RowField:
+    """Field of parallel rows.
+
+    Attributes:
+        yaw: direction of the rows in radians from the local x axis, see ``half_turn``.
+        rows: in the order of v.
+        regular: share of the distances of rows that are regular.
+        score: support of the field, for comparing fields.
+    """
+
+    yaw: float
+    rows: tuple[Row, ...]
+    regular: float = 1.0
+    score: float = 0.0
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of rows in metres."""
+        return float(np.median(np.diff([row.v for row in self.rows])))
+
+    def to_local(self, u: float, v: float) -> tuple[float, float]:
+        """Return a position along and across the rows in local metres."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return round(c * u - s * v, 6), round(s * u + c * v, 6)
+
+
+def half_turn(yaw: float) -> float:
+    """Return a line's direction from -pi/4 to 3 pi/4: rows are then numbered from south to north, or east to west."""
+    return (yaw + math.pi / 4) % math.pi - math.pi / 4
+
+
+def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float, limit: int = 8) -> list[RowField]:
+    """Return the fields of rows in a mask [h, w], row 0 at the bottom, the best first.
+
+    size: metres of a cell. left, bottom: local metres of its lower left corner. limit: maximum number of fields.
+    """
+    filled, crossed = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(filled):
+        return []
+    mask = mask[filled[0] : filled[-1] + 1, crossed[0] : crossed[-1] + 1]
+    left, bottom = left + int(crossed[0]) * size, bottom + int(filled[0]) * size
+    mask, size = _coarse(mask, size)
+    rows, columns = np.nonzero(mask)
+    xy = np.column_stack([left + (columns + 0.5) * size, bottom + (rows + 0.5) * size])
+    out: list[RowField] = []
+    while len(xy) >= 2 * MIN_ROWS and len(out) < limit:
+        best = max(_candidates(xy, size), key=_score, default=None)
+        if best is None or best.score < max(MIN_SCORE, MIN_SHARE * out[0].score if out else 0.0):
+            break
+        out.append(best)
+        xy = xy[~_covered(best, xy)]
+    return out
+
+
+def _score(one: RowField | None) -> float:
+    return 0.0 if one is None else one.score
+
+
+def _coarse(mask: NDArray[np.bool_], size: float) -> tuple[NDArray[np.bool_], float]:
+    """Return the mask with at most MAX_CELLS cells; a coarse cell is set if any of its own is."""
+    step = max(1, math.ceil(math.sqrt(mask.size / MAX_CELLS)))
+    if step == 1:
+        return mask, size
+    high, wide = (math.ceil(n / step) * step for n in mask.shape)
+    padded = np.zeros((high, wide), bool)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    return np.asarray(padded.reshape(high // step, step, wide // step, step).any(axis=(1, 3))), size * step
+
+
+def _turned(xy: Array, yaw: float) -> tuple[Array, Array]:
+    c, s = math.cos(yaw), math.sin(yaw)
+    return c * xy[:, 0] + s * xy[:, 1], c * xy[:, 1] - s * xy[:, 0]
+
+
+def _energy(xy: Array, yaw: float, across: float) -> float:
+    """Return how unevenly the lines of a direction hold the cells: squared deviation of their numbers of steps."""
+    u, v = _turned(xy, yaw)
+    i = np.floor((u - u.min()) / ALONG).astype(np.int64)
+    j = np.floor((v - v.min()) / across).astype(np.int64)
+    cells = np.unique(j * (int(i.max()) + 1) + i)
+    counts = np.bincount(cells // (int(i.max()) + 1)).astype(np.float64)
+    return float(((counts - counts.mean()) ** 2).sum())
+
+
+def _directions(xy: Array, size: float) -> list[float]:
+    """Return the directions with the highest energy, refined to a tenth of a degree."""
+    few = xy[:: max(1, len(xy) // SAMPLE)]
+    across = max(2 * size, 0.2)
+    energy = np.array([_energy(few, math.radians(k / 2), across) for k in range(360)])
+    peaks = [k for k in range(360) if energy[k] >= max(energy[k - 1], energy[(k + 1) % 360])]
+    out = []
+    for k in sorted(peaks, key=lambda k: -energy[k])[:DIRECTIONS]:
+        near = [math.radians(k / 2 + tenth / 10) for tenth in range(-5, 6)]
+        out.append(half_turn(max(near, key=lambda yaw: _energy(few, yaw, across))))
+    return out
+
+
+def _candidates(xy: Array, size: float) -> Iterator[RowField | None]:
+    """Yield the best field of each likely direction, on coarse lines, and of the likeliest ones on fine lines."""
+    directions = _directions(xy, size)
+    for across, count in ((max(2 * size, 2 * FINE), DIRECTIONS), (max(size, FINE), FINE_DIRECTIONS)):
+        for yaw in directions[:count]:
+            yield _best_in(xy, yaw, across)
+
+
+def _best_in(xy: Array, yaw: float, across: float) -> RowField | None:
+    """Return the best field of a direction. across: distance of the lines on which rows are looked for, in metres."""
+    lines = _segments(xy, yaw, across)
+    fields = [one for one in (_field(yaw, chain) for chain in _chains(lines)) if one is not None]
+    fields = [replace(one, score=one.score * _emptiness(one, xy) * _contrast(one, xy, across)) for one in fields]
+    return max(fields, key=_score, default=None)
+
+
+def _contrast(field: RowField, xy: Array, across: float) -> float:
+    """Return how much more of a field's cells its rows hold than of its area, from 0 to 1; 0 below MIN_CONTRAST."""
+    u, v = _turned(xy, field.yaw)
+    low, high = min(row.low for row in field.rows), max(row.high for row in field.rows)
+    inside = (u >= low) & (u <= high) & (v >= field.rows[0].v) & (v <= field.rows[-1].v)
+    lines = np.array([row.v for row in field.rows])
+    half = np.array([row.width / 2 + across for row in field.rows])
+    nearest = np.abs(v[inside][:, None] - lines[None]) <= half[None]
+    share = float(nearest.any(axis=1).mean()) if inside.any() else 0.0
+    area = min(1.0, float(2 * half[:-1].sum()) / max(float(lines[-1] - lines[0]), 1e-9))
+    contrast = (share - area) / max(1.0 - area, 1e-9)
+    return contrast if contrast >= MIN_CONTRAST else 0.0
+
+
+def _emptiness(field: RowField, xy: Array) -> float:
+    """Return the share of the aisles' steps in whose middle quarter nothing is, to the second power."""
+    u, v = _turned(xy, field.yaw)
+    full = total = 0
+    for a, b in itertools.pairwise(field.rows):
+        low, high = max(a.low, b.low), min(a.high, b.high)
+        edge = (b.v - a.v) * 3 / 8
+        inside = (v > a.v + edge) & (v < b.v - edge) & (u > low) & (u < high)
+        full += len(np.unique(np.floor((u[inside] - low) / ALONG)))
+        total += max(1, int((high - low) / ALONG))
+    return (1.0 - min(full / total, 1.0)) ** 2
+
+
+def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
+    """Return the segments along a direction, each the strongest of its neighbourhood, in the order of v."""
+    u, v = _turned(xy, yaw)
+    low_u, low_v = float(u.min()), float(v.min())
+    i = np.floor((u - low_u) / ALONG).astype(np.int64)
+    j = np.floor((v - low_v) / across).astype(np.int64)
+    weight = np.zeros((int(j.max()) + 3, int(i.max()) + 1))
+    np.add.at(weight, (j + 1, i), 1.0)
+    steps = weight > 0
+    # three bins together: a row is not exactly on one line
+    steps[1:-1] |= steps[:-2] | steps[2:]
+    candidates: list[tuple[float, int, int, int]] = []
+    for line in np.flatnonzero(steps.sum(axis=1) * ALONG >= FILL * MIN_LENGTH):
+        filled = np.flatnonzero(steps[line])
+        for run in np.split(filled, np.flatnonzero(np.diff(filled) * ALONG > GAP) + 1):
+            length = (run[-1] - run[0] + 1) * ALONG
+            if length >= MIN_LENGTH and len(run) * ALONG >= FILL * length:
+                mass = float(weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum())
+                candidates.append((len(run) + mass / (1 + mass), int(line), int(run[0]), int(run[-1])))
+    lines = _joined(_strongest(candidates), weight > 0)
+    order = np.argsort(v, kind="stable")
+    out = []
+    for top, below, first, last in lines:
+        start, stop = np.searchsorted(v[order], [low_v + (top - 1.5) * across, low_v + (below + 0.5) * across])
+        members = order[start:stop]
+        members = members[(u[members] >= low_u + first * ALONG) & (u[members] < low_u + (last + 1) * ALONG)]
+        if len(members) and float(np.ptp(u[members])) >= MIN_LENGTH:
+            low, high = float(u[members].min()), float(u[members].max())
+            fill = len(np.unique(i[members])) * ALONG / (high - low)
+            out.append(Row(float(v[members].mean()), low, high, min(1.0, fill), (below - top + 1) * across))
+    return sorted(out, key=lambda row: row.v)
+
+
+def _strongest(candidates: list[tuple[float, int, int, int]]) -> list[tuple[int, int, int]]:
+    """Return (line, first, last) of the segments beside which there is no stronger one, in the order of lines."""
+    taken: list[tuple[int, int, int]] = []
+    for _, line, first, last in sorted(candidates, reverse=True):
+        if not any(abs(line - k) <= 2 and min(last, b) >= max(first, a) for k, a, b in taken):
+            taken.append((line, first, last))
+    return sorted(taken)
+
+
+def _joined(lines: list[tuple[int, int, int]], full: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
+    """Join segments of one thick row: crowns are several lines wide, and no line between is empty.
+
+    Returns (first line, last line, first step, last step). full: bool [lines, steps].
+    """
+    groups: list[tuple[int, int, int, int]] = []
+    for line, first, last in lines:
+        for k in range(len(groups) - 1, -1, -1):
+            top, below, a, b = groups[k]
+            shared = min(last, b) - max(first, a) + 1
+            if line - below > 6 or shared < BESIDE * min(last - first + 1, b - a + 1):
+                continue
+            part = full[below - 1 : line + 2, max(first, a) : min(last, b) + 1].mean(axis=1)
+            if part[2:-2].min(initial=1.0) >= VALLEY * min(part[:3].max(), part[-3:].max()):
+                groups[k] = (top, line, min(a, first), max(b, last))
+                break
+        else:
+            groups.append((line, line, first, last))
+    return groups
+
+
+def _beside(a: Row, b: Row) -> float:
+    """Return the share of the shorter row that lies beside the other one."""
+    return max(0.0, min(a.high, b.high) - max(a.low, b.low)) / max(min(a.length, b.length), 1e-9)
+
+
+def _chains(rows: list[Row]) -> list[list[Row]]:
+    """Return sequences of rows side by side."""
+    chains: list[list[Row]] = []
+    for row in rows:
+        near = [c for c in chains if row.v - c[-1].v <= MAX_SPACING and _beside(row, c[-1]) >= BESIDE]
+        if near:
+            max(near, key=lambda c: min(row.high, c[-1].high) - max(row.low, c[-1].low)).append(row)
+        else:
+            chains.append([row])
+    return [chain for chain in chains if len(chain) >= MIN_ROWS]
+
+
+def _field(yaw: float, chain: list[Row]) -> RowField | None:
+    """Return the most regular part of a sequence of rows as a field, or None."""
+    length = float(np.median([row.length for row in chain]))
+    chain = [row for row in chain if row.length >= SIMILAR * length]
+    if len(chain) < MIN_ROWS:
+        return None
+    best: RowField | None = None
+    distances = np.diff([row.v for row in chain])
+    for spacing in np.unique(np.round(distances, 2)):
+        if spacing <= 0:
+            continue
+        ratio = distances / spacing
+        near = np.abs(ratio - np.clip(np.round(ratio), 1, MISSING)) <= REGULAR * np.clip(np.round(ratio), 1, MISSING)
+        once = np.abs(ratio - 1.0) <= REGULAR
+        in_beds = (ratio >= 1 - REGULAR) & (ratio <= BED)
+        for fits, factor in ((near, 1.0), (in_beds, 0.7)):
+            for part in _runs(fits):
+                rows = chain[part[0] : part[1] + 1]
+                regular = float(once[part[0] : part[1]].mean())
+                if len(rows) < MIN_ROWS or (factor < 1.0 and regular < STRICT):
+                    continue
+                support = sum(row.fill * row.length for row in rows) * math.sqrt(length)
+                score = support * factor * regular * min(1.0, (len(rows) - 1) / 4)
+                if best is None or score > best.score:
+                    best = RowField(yaw, tuple(rows), regular, score)
+    return best
+
+
+def _runs(fits: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the runs of true values, as (first, one past the last)."""
+    padded = np.concatenate([[False], fits, [False]])
+    change = np.flatnonzero(padded[1:] != padded[:-1])
+    return [(int(a), int(b)) for a, b in zip(change[::2], change[1::2], strict=True)]
+
+
+def _covered(field: RowField, xy: Array) -> NDArray[np.bool_]:
+    """Return which positions lie within a field."""
+    u, v = _turned(xy, field.yaw)
+    margin = field.spacing / 2
+    inside = (v >= field.rows[0].v - margin) & (v <= field.rows[-1].v + margin)
+    low, high = min(row.low for row in field.rows), max(row.high for row in field.rows)
+    return np.asarray(inside & (u >= low - ALONG) & (u <= high + ALONG))

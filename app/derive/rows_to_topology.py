@@ -1,0 +1,201 @@
+"""Rows -> topology: network of the aisles between parallel rows, as people draw it in polytunnels and vineyards."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import DerivationNotes, derives
+from app.derive._rows import Row, RowField, half_turn
+from app.errors import CannotConvert, Invalid, MissingLayer
+from app.model.aisles import stop_positions
+from app.model.features import Features, concatenate, features
+from app.model.grid import OCCUPIED, OccupancyGrid
+from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
+from app.parameters import parameter
+
+KINDS = ("row", "tree_row")
+
+MAX_NODES = 200_000
+"""Maximum number of nodes of a network."""
+
+PARALLEL = 10.0
+"""Maximum difference of rows of one field in direction, in degrees."""
+
+Item = tuple[str, Any, dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Parameters of rows_to_topology."""
+
+    robot_radius: float = parameter(
+        0.3, "radius of the robot; edges keep this distance from obstacles", minimum=0.0, maximum=100.0, unit="m"
+    )
+    turn: float = parameter(
+        2.25,
+        "distance from the rows' ends at which robots change from one aisle to the next",
+        minimum=0.1,
+        maximum=25.0,
+        unit="m",
+    )
+    node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
+
+
+@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}))
+def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
+    """Network of the aisles between rows: nodes along each aisle, at its ends and in the headlands.
+
+    Rows are lines of kind ``row`` or ``tree_row``: from ``imagery_to_rows`` and ``occupancy_to_rows``, or drawn. Nodes
+    are named as in Riseholme's polytunnels: ``r1.5-ca`` in the headland, ``-cb`` at the row's end, ``-c0`` … between,
+    ``-cy`` and ``-cz`` at the other end. Edges along a row have the action ``row_traversal``, others ``row_change``.
+    Edges that meet occupied cells of a stored grid ``map`` are left out. Raises MissingLayer if there are no rows,
+    CannotConvert if the robot fits between none.
+    """
+    parts: dict[PartKey, Part] = {}
+    by_level: dict[str, list[Features]] = {}
+    for key, part in layers.vector("objects").items():
+        chosen = part.select_kinds(*KINDS)
+        if len(chosen):
+            by_level.setdefault(key.level, []).append(chosen)
+    if not by_level:
+        raise MissingLayer(
+            f"the stored objects have no rows: derive them (imagery_to_rows, occupancy_to_rows), or draw lines of kind "
+            f"{' or '.join(KINDS)}"
+        )
+    for level, drawn in by_level.items():
+        grid = layers.grids().get(PartKey("occupancy", level, MAP))
+        fields = _fields(concatenate(drawn), layers)
+        network = _Network(parameters, grid)
+        for number, one in enumerate(fields, 1):
+            network.add(one, "" if len(fields) == 1 else f"f{number}-")
+        if not network.nodes:
+            raise CannotConvert(
+                f"a robot of radius {parameters.robot_radius:g} m fits between no two rows: use a smaller robot_radius"
+            )
+        notes.drop("edges", network.blocked, "they would meet occupied cells of the stored grid")
+        parts[PartKey("topology", level, NETWORK)] = features([*network.nodes, *network.edges], "local")
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _fields(drawn: Features, layers: Layers) -> list[RowField]:
+    """Group rows by their field, or by direction if they state none."""
+    try:
+        metres = drawn.in_local(layers.frame)
+    except Invalid as error:  # too far from the datum
+        raise CannotConvert(error.detail, error.problems) from error
+    groups: dict[Any, list[tuple[NDArray[np.float64], Mapping[str, Any]]]] = {}
+    for geometry, properties in zip(metres, drawn.properties, strict=True):
+        if geometry.geom_type != "LineString" or geometry.length == 0:
+            continue
+        ends = shapely.get_coordinates(geometry)[[0, -1], :2]
+        angle = math.degrees(math.atan2(*(ends[1] - ends[0])[::-1])) % 180.0
+        name = properties.get("field")
+        near = (k for k in groups if isinstance(k, float) and abs((k - angle + 90) % 180 - 90) <= PARALLEL)
+        group = name if isinstance(name, int | str) and not isinstance(name, bool) else next(near, float(angle))
+        groups.setdefault(group, []).append((ends, properties))
+    return [_row_field(rows) for rows in groups.values() if len(rows) > 1]
+
+
+def _row_field(rows: list[tuple[NDArray[np.float64], Mapping[str, Any]]]) -> RowField:
+    """Return drawn rows as a field."""
+    steps = np.array([ends[1] - ends[0] for ends, _ in rows])
+    double = 2 * np.arctan2(steps[:, 1], steps[:, 0])
+    yaw = half_turn(math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2)
+    c, s = math.cos(yaw), math.sin(yaw)
+    out = []
+    for ends, properties in rows:
+        along, across = ends @ np.array([c, s]), ends @ np.array([-s, c])
+        width = properties.get("row_width", properties.get("width"))
+        thick = float(width) if isinstance(width, int | float) and not isinstance(width, bool) else 0.0
+        out.append(Row(float(across.mean()), float(along.min()), float(along.max()), width=thick))
+    return RowField(yaw, tuple(sorted(out, key=lambda row: row.v)))
+
+
+def _low_end(a: Row, b: Row) -> float:
+    """Return where the longer of two rows begins."""
+    return min(a.low, b.low)
+
+
+def _high_end(a: Row, b: Row) -> float:
+    """Return where the longer of two rows ends."""
+    return max(a.high, b.high)
+
+
+@dataclass(slots=True)
+class _Network:
+    """Network that grows field by field. blocked: number of edges that meet occupied cells."""
+
+    parameters: Parameters
+    grid: OccupancyGrid | None
+    nodes: list[Item] = field(default_factory=list)
+    edges: list[Item] = field(default_factory=list)
+    blocked: int = 0
+
+    def add(self, one: RowField, prefix: str) -> None:
+        """Add the aisles of a field, and the changes between them."""
+        parameters = self.parameters
+        before: tuple[Item, Item] | None = None
+        for number, (a, b) in enumerate(itertools.pairwise(one.rows), 1):
+            free = b.v - a.v - (a.width + b.width) / 2
+            if free < 2 * parameters.robot_radius or min(a.high, b.high) - max(a.low, b.low) <= 0:
+                continue
+            middle = (a.v + a.width / 2 + b.v - b.width / 2) / 2
+            if len(self.nodes) + (_high_end(a, b) - _low_end(a, b)) / parameters.node_spacing > MAX_NODES:
+                raise CannotConvert(
+                    f"the network would have more than {MAX_NODES} nodes: set a larger node_spacing, or fewer rows"
+                )
+            # beside the end of the longer row there is no passage to the next aisle
+            low, high = _low_end(a, b) - parameters.turn, _high_end(a, b) + parameters.turn
+            stops = [
+                self._node(f"{prefix}r{number}.5-{suffix}", one.to_local(u, middle))
+                for suffix, u in stop_positions(low, high, parameters.turn, parameters.node_spacing)
+            ]
+            for start, end in itertools.pairwise(stops):
+                self._edge(start, end, "row_traversal", free)
+            if before is not None:
+                for start, end in zip(before, (stops[0], stops[-1]), strict=True):
+                    self._edge(start, end, "row_change", None)
+            before = stops[0], stops[-1]
+
+    def _node(self, name: str, at: tuple[float, float]) -> Item:
+        node: Item = (name, shapely.Point(at), {"kind": "node", "name": name})
+        self.nodes.append(node)
+        return node
+
+    def _edge(self, a: Item, b: Item, action: str, width: float | None) -> None:
+        """Add an edge in both directions, unless it meets occupied cells."""
+        line = shapely.LineString([a[1], b[1]])
+        if self.grid is not None and _meets(self.grid, line, self.parameters.robot_radius):
+            self.blocked += 2
+            return
+        for start, end, way in ((a[0], b[0], line), (b[0], a[0], shapely.reverse(line))):
+            properties: dict[str, Any] = {"kind": "edge", "source": start, "target": end, "action": action}
+            if width is not None:
+                properties["width"] = round(width, 3)
+            self.edges.append((f"{start}_{end}", way, properties))
+
+
+def _meets(grid: OccupancyGrid, line: Any, radius: float) -> bool:
+    """Return whether a robot that follows a line touches the centre of an occupied cell."""
+    x, y, yaw = grid.origin
+    low_x, low_y, high_x, high_y = line.buffer(radius).bounds
+    corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)]) - (x, y)
+    c, s = math.cos(yaw), math.sin(yaw)
+    turned = np.column_stack([c * corners[:, 0] + s * corners[:, 1], c * corners[:, 1] - s * corners[:, 0]])
+    first = np.maximum(np.floor(turned.min(axis=0) / grid.resolution).astype(int), 0)
+    last = np.ceil(turned.max(axis=0) / grid.resolution).astype(int)
+    part = grid.cells[first[1] : max(last[1], 0), first[0] : max(last[0], 0)]
+    rows, columns = np.nonzero(part == OCCUPIED)
+    if not len(rows):
+        return False
+    u, v = (columns + first[0] + 0.5) * grid.resolution, (rows + first[1] + 0.5) * grid.resolution
+    places = shapely.points(x + c * u - s * v, y + s * u + c * v)
+    return bool((shapely.distance(places, line) <= radius).any())

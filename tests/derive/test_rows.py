@@ -1,0 +1,173 @@
+"""Rows in pictures and grids, and the network of their aisles: drawn rows with known truth."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import DerivationNotes, all_derivations, run
+from app.derive._rows import find_fields
+from app.errors import CannotConvert, CannotDerive, MissingLayer
+from app.model.aisles import stop_positions
+from app.model.features import Features, features
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.imagery import GeoImage
+from app.model.layers import MAP, Layers, Part, PartKey
+from tests.derive.pictures import local
+
+SIZE = 0.1
+
+
+def lines(yaw: float, count: int = 5, spacing: float = 2.5, length: float = 16.0, step: float = 0.0) -> list[Any]:
+    """Return rows around (12, 12), as lines or, with a step, as points."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    out = []
+    for k in range(count):
+        v = (k - (count - 1) / 2) * spacing
+        ends = [(12 + c * u - s * v, 12 + s * u + c * v) for u in (-length / 2, length / 2)]
+        line = shapely.LineString(ends)
+        out.append(line if not step else shapely.MultiPoint([line.interpolate(d) for d in np.arange(0, length, step)]))
+    return out
+
+
+def drawn(rows: list[Any], radius: float = 0.15) -> NDArray[np.bool_]:
+    """Draw rows on 24 × 24 m, row 0 at the bottom."""
+    ys, xs = np.indices((240, 240))
+    where = shapely.points((xs.ravel() + 0.5) * SIZE, (ys.ravel() + 0.5) * SIZE)
+    shape = shapely.union_all(rows).buffer(radius)
+    shapely.prepare(shape)
+    return np.asarray(shapely.contains(shape, where)).reshape(240, 240)
+
+
+def grid(mask: NDArray[np.bool_]) -> Layers:
+    cells = np.where(mask, OCCUPIED, FREE).astype(np.uint8)
+    return Layers({PartKey("occupancy", "ground", MAP): OccupancyGrid(cells, SIZE)})
+
+
+def derived(name: str, layers: Layers) -> Layers:
+    return run([all_derivations()[name].step()], layers, DerivationNotes())
+
+
+def of(layers: Layers, layer: str, kind: str) -> list[tuple[Any, Any]]:
+    (part,) = layers.vector(layer).values()  # type: ignore[arg-type]
+    return [(g, p) for g, p in zip(part.geometry, part.properties, strict=True) if p["kind"] == kind]
+
+
+@pytest.mark.parametrize(("yaw", "step"), [(0.0, 0.0), (0.35, 0.0), (1.9, 3.0)])
+def test_rows_of_lines_and_posts_are_found_in_grid(yaw: float, step: float) -> None:
+    rows = lines(yaw, step=step)
+    found = of(derived("occupancy_to_rows", grid(drawn(rows))), "objects", "row")
+    assert len(found) == 5
+    for line in lines(yaw):
+        assert min(line.interpolate(0.5, normalized=True).distance(g) for g, _ in found) < 0.15
+    assert all(p["row_spacing"] == pytest.approx(2.5, abs=0.05) for _, p in found)
+    turn = (np.array([p["direction"] for _, p in found]) - math.degrees(yaw) + 90) % 180 - 90
+    assert np.abs(turn).max() < 1.0
+    assert all(0.5 <= p["confidence"] < 1.0 for _, p in found)
+
+
+def test_walls_of_a_room_are_no_rows() -> None:
+    room = [shapely.box(3, 3, 20, 15).exterior, shapely.LineString([(9, 3), (9, 15)])]
+    with pytest.raises(CannotDerive, match="no parallel rows"):
+        derived("occupancy_to_rows", grid(drawn(room)))
+    assert find_fields(np.zeros((50, 50), bool), 0.1, 0.0, 0.0) == []
+
+
+def test_scattered_cells_and_full_ground_are_no_rows() -> None:
+    noise = np.random.default_rng(0).random((400, 400))
+    for mask in (noise < 0.02, noise < 0.2, np.ones((100, 100), bool)):
+        assert find_fields(mask, 0.05, 0.0, 0.0) == []
+
+
+def test_strange_input_gives_clear_problem() -> None:
+    unknown = OccupancyGrid(np.full((50, 50), UNKNOWN, np.uint8), SIZE)
+    with pytest.raises(CannotDerive, match="no parallel rows"):
+        derived("occupancy_to_rows", Layers({PartKey("occupancy", "ground", MAP): unknown}))
+    for pixels in (np.full((1, 1, 3), 7, np.uint8), np.full((60, 60, 1), 120, np.uint8)):
+        with pytest.raises(CannotDerive, match="no parallel rows"):
+            derived("imagery_to_rows", Layers({PartKey("imagery", "ground", "satellite"): local(pixels)}))
+    long = [(f"r{k}", shapely.LineString([(0, k * 2), (9e5, k * 2)]), {"kind": "row"}) for k in range(2)]
+    with pytest.raises(CannotDerive, match="more than 200000 nodes"):
+        derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(long, "local")}))
+    odd = [shapely.Point(1, 1), shapely.LineString(), shapely.LineString([(0, 0, 1), (9, 0, 2)])]
+    rows = [(f"r{k}", g, {"kind": "row", "field": [], "row_width": "wide"}) for k, g in enumerate(odd)]
+    with pytest.raises(CannotDerive, match="fits between no two rows"):
+        derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")}))
+
+
+def test_network_of_aisles_follows_rows() -> None:
+    site = derived("rows_to_topology", derived("occupancy_to_rows", grid(drawn(lines(0.0)))))
+    nodes = {p["name"]: g for g, p in of(site, "topology", "node")}
+    assert {name.split("-")[0] for name in nodes} == {"r1.5", "r2.5", "r3.5", "r4.5"}
+    for number, y in enumerate((8.25, 10.75, 13.25, 15.75), 1):
+        assert all(abs(g.y - y) < 0.3 for name, g in nodes.items() if name.startswith(f"r{number}.5"))
+    assert nodes["r1.5-ca"].x == pytest.approx(4 - 2.25, abs=0.3)
+    assert nodes["r1.5-cz"].x == pytest.approx(20 + 2.25, abs=0.3)
+    edges = of(site, "topology", "edge")
+    assert {p["action"] for _, p in edges} == {"row_traversal", "row_change"}
+    assert sum(p["action"] == "row_change" for _, p in edges) == 2 * 2 * 3
+    ends = {(p["source"], p["target"]) for _, p in edges}
+    assert ends == {(b, a) for a, b in ends}
+    rows = shapely.union_all([g for g, _ in of(site, "objects", "row")])
+    assert min(rows.distance(g) for g, _ in edges) > 0.6
+
+
+def test_edges_through_occupied_cells_are_left_out() -> None:
+    mask = drawn(lines(0.0))
+    mask[120:130, 15:20] = True  # a box in the headland before the third aisle
+    notes = DerivationNotes()
+    rows = derived("occupancy_to_rows", grid(drawn(lines(0.0))))
+    blocked = Layers({**rows.parts, **grid(mask).parts})
+    site = run([all_derivations()["rows_to_topology"].step()], blocked, notes)
+    assert any(d.subject == "edges" and d.count > 0 for d in notes.dropped)
+    box = shapely.box(1.5, 12.0, 2.0, 13.0)
+    assert min(g.distance(box) for g, _ in of(site, "topology", "edge")) > 0.2
+
+
+def test_drawn_rows_give_network_and_narrow_ones_none() -> None:
+    def site(kind: str, spacing: float) -> Layers:
+        rows = [(f"r{k}", line, {"kind": kind}) for k, line in enumerate(lines(0.3, spacing=spacing))]
+        parts: dict[PartKey, Part] = {PartKey("objects", "ground", "drawn"): features(rows, "local")}
+        return Layers(parts)
+
+    assert len(of(derived("rows_to_topology", site("tree_row", 3.0)), "topology", "node")) > 8
+    with pytest.raises(CannotDerive, match="fits between no two rows"):
+        derived("rows_to_topology", site("row", 0.5))
+    with pytest.raises(CannotDerive, match="have no rows"):
+        derived("rows_to_topology", site("wall", 3.0))
+    assert issubclass(MissingLayer, CannotConvert)
+
+
+@pytest.mark.parametrize("anchor", ["local", "EPSG:4326"])
+def test_rows_of_trees_are_found_in_picture(anchor: str) -> None:
+    image = np.full((240, 240, 3), (120, 150, 90), np.uint8)
+    for row in lines(0.2, count=4, spacing=4.0, step=1.8):
+        for point in row.geoms:
+            cv2.circle(image, (round(point.x / SIZE), 240 - round(point.y / SIZE)), 7, (45, 80, 40), -1)
+    shaken = np.random.default_rng(2).normal(0, 4, image.shape)
+    image = np.clip(image + shaken, 0, 255).astype(np.uint8)
+    picture = local(image)
+    if anchor != "local":
+        picture = GeoImage(image, (1.5e-6, 0.0, 0.5, 0.0, -0.9e-6, 53.0), anchor)
+    site = derived("imagery_to_rows", Layers({PartKey("imagery", "ground", "satellite"): picture}))
+    (part,) = site.vector("objects").values()
+    assert isinstance(part, Features)
+    assert len(of(site, "objects", "row")) == 4
+    assert len(of(site, "objects", "headland")) == 2
+    assert bool(part.local.all()) == (anchor == "local")
+
+
+def test_picture_without_rows_raises() -> None:
+    noise = np.random.default_rng(1).integers(90, 110, (200, 200, 3)).astype(np.uint8)
+    with pytest.raises(CannotDerive, match="no parallel rows"):
+        derived("imagery_to_rows", Layers({PartKey("imagery", "ground", "satellite"): local(noise)}))
+
+
+def test_stop_positions_name_the_nodes_of_an_aisle() -> None:
+    assert stop_positions(0.0, 14.0, 2.0, 5.0) == [("ca", 0.0), ("cb", 2.0), ("c0", 7.0), ("cy", 12.0), ("cz", 14.0)]
