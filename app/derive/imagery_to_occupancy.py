@@ -23,7 +23,7 @@ class Parameters(Segmentation):
     """Parameters of imagery_to_occupancy."""
 
 
-@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0)
+@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0, version=2)
 def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Occupancy grid from an image: trees, vegetation, buildings and walls are occupied.
 
@@ -38,7 +38,7 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
             raise MissingDatum('a grid needs a datum: PATCH the environment with {"datum": {…}}')
         method = choose_method(picture, parameters)
         if method == "plan":
-            grid = plan_to_grid(picture, layers.frame, parameters, notes, name)
+            grid, _ = plan_to_grid(picture, layers.frame, parameters, notes, name)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
             segments = segment_picture(on, picture, parameters, method, notes, name)

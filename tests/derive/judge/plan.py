@@ -14,8 +14,8 @@ Keys of a label file of kind ``plan``, all positions in pixels of the plan (x to
     floor, outside       points on the floor of the building, and points outside of it
 
 Recall: share of the length of labelled walls within ``tolerance`` of an occupied cell. Precision: share of occupied
-cells within ``tolerance`` of a labelled wall; cells on unclear lines and areas do not count. ``strict precision`` counts
-them as wrong. Floor: share of the floor's points that are free; outside: share of the points outside that are free.
+cells within ``tolerance`` of a labelled wall; cells on unclear lines and areas do not count. ``strict precision``
+counts them as wrong. Floor: share of the points on the floor that are free; outside: share of those outside that are.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _picture(
     pixels: NDArray[np.uint8], value: NDArray[np.uint8], walls: NDArray[np.uint8], unclear: NDArray[np.bool_]
 ) -> Image.Image:
     """Draw the grid over the plan: free green, unknown grey, occupied red; labelled walls blue, unclear ones yellow."""
-    base = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    base: NDArray[Any] = pixels[..., :3] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     if pixels.shape[2] in (2, 4):
         alpha = pixels[..., -1:].astype(np.float64) / 255
         base = base * alpha + 255 * (1 - alpha)
