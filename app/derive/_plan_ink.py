@@ -118,7 +118,7 @@ def read_drawing(rgb: NDArray[np.uint8], grey: NDArray[np.uint8], ink: Mask, siz
     is_thick = bool(ink.any()) and float(thick.sum()) >= THICK * float(ink.sum())
     width = _wall_width(thick) if is_thick else 0.0
     windows = _between(thick, ink & ~thick, width, size) if is_thick else np.zeros_like(ink)
-    kept, symbols, count = _drop_symbols(ink & ~windows, width, size)
+    kept, windows, symbols, count = _drop_symbols(ink & ~windows, windows, width, size)
     thick &= kept
     walls = thick | windows if is_thick else kept
     return Drawing(walls, kept & ~walls, others | symbols, thick, count, is_thick=is_thick, tinted=tinted)
@@ -188,10 +188,11 @@ def _drop_marks(rgb: NDArray[np.uint8], ink: Mask) -> tuple[Mask, Mask]:
     return ink & ~marks, marks
 
 
-def _drop_symbols(ink: Mask, width: float, size: float) -> tuple[Mask, Mask, int]:
-    """Divide ink into (walls and what touches them, separate small pieces with what they enclose, their number).
+def _drop_symbols(ink: Mask, windows: Mask, width: float, size: float) -> tuple[Mask, Mask, Mask, int]:
+    """Divide ink beside windows into walls, with what touches them, and symbols.
 
-    width: of thick walls in pixels; 0 if walls are lines.
+    width: of thick walls in pixels. Returns (ink of walls, windows of walls, separate small pieces with what they
+    enclose, their number).
     """
     import cv2
 
@@ -199,20 +200,40 @@ def _drop_symbols(ink: Mask, width: float, size: float) -> tuple[Mask, Mask, int
     sides = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]] * size
     short = sides.max(axis=1) <= SYMBOL_METRES
     short[0] = False
-    if width:
-        # what is as thick as walls is the corner between two windows
-        depth = np.zeros(len(short), np.float32)
-        np.maximum.at(depth, label[ink].astype(np.intp), _depth(ink)[ink])
-        short &= depth < AS_THICK * width / 2
-    separate = short[label]
+    if windows.any():
+        piers, panes = _chained(ink, np.asarray(label, np.int32), short, windows, width)
+        short &= ~piers
+        ink, windows = ink | (windows & ~panes), panes
+        label = np.where(windows, 0, label)
+    separate = short[label] | (ink & (label == 0))
     contours, _ = cv2.findContours(separate.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     outlines = [contour for contour in contours if not _is_wall_piece(contour, separate, size)]
     filled = np.zeros(ink.shape, np.uint8)
     # one by one: together, overlapping areas would count as holes
     for outline in outlines:
         cv2.drawContours(filled, [outline], -1, 1, cv2.FILLED)
-    symbols = (filled == 1) & ~(ink & ~separate)
-    return ink & ~symbols, symbols, len(outlines)
+    symbols = (filled == 1) & ~(ink & ~separate) & ~windows
+    return ink & ~symbols, windows, symbols, len(outlines)
+
+
+def _chained(
+    ink: Mask, label: NDArray[np.int32], short: NDArray[np.bool_], windows: Mask, width: float
+) -> tuple[NDArray[np.bool_], Mask]:
+    """Return (small pieces as thick as walls in a chain of windows that begins at a wall, those windows)."""
+    import cv2
+
+    depth = np.zeros(len(short), np.float32)
+    np.maximum.at(depth, label[ink].astype(np.intp), _depth(ink)[ink])
+    piers = short & (depth >= AS_THICK * width / 2)
+    wall = ink & ~short[label]
+    chain = cv2.dilate((wall | windows | (piers[label] & ink)).astype(np.uint8), np.ones((3, 3), np.uint8))
+    count, link = cv2.connectedComponents(chain, connectivity=8)
+    begins = np.zeros(count, bool)
+    begins[link[wall]] = True
+    holds = np.zeros(len(short), bool)
+    holds[label[ink & begins[link]]] = True
+    # a pier stands beside a window; what only touches a wall was not separate
+    return piers & holds, windows & begins[link]
 
 
 def _is_wall_piece(contour: Any, ink: Mask, size: float) -> bool:

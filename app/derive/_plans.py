@@ -45,6 +45,9 @@ ROS_UNKNOWN = 205
 ROS_LEVELS = 0.8
 """Share of the image that the three most frequent greys of a ROS map cover."""
 
+MAX_PIXEL_METRES = 0.5
+"""Maximum size of a pixel; a plan without a scale has pixels of a metre."""
+
 CUT = 0.15
 """Maximum share of the outline of floor, and of the edge of the image, along which the image cuts it off."""
 
@@ -120,6 +123,11 @@ def plan_to_grid(
     unknown = _ros_unknown(rgb, grey, level, notes, name)
     a, b, _, d, e, _ = picture.transform
     size = math.sqrt(abs(a * e - b * d))
+    if size > MAX_PIXEL_METRES:
+        raise CannotConvert(
+            f"{name} has pixels of {size:g} m, in which no wall can be seen: upload it with its scale, "
+            "metres_per_pixel or a measurement of the building"
+        )
     frame = _frame(picture, how.resolution or max(RESOLUTION, float(f"{size:.6g}")), name)
     has_unknown = bool(unknown.any())
     drawing = plain_drawing(ink, size) if has_unknown else read_drawing(rgb, grey, ink, size)
@@ -149,9 +157,9 @@ def plan_to_grid(
         cells[paper & ~shaded & ~doubt] = FREE
     cells[inside] = FREE
     cells[others & barrier == 1] = UNKNOWN
-    # dimensions and titles are drawn with lines as thin as walls, unless walls are thick
-    if inside.any() and not (has_unknown or how.outside_free or drawing.is_thick):
-        walls = _drop_far(walls, inside, frame.resolution, notes, name)
+    if inside.any() and not (has_unknown or how.outside_free):
+        # dimensions touch walls where both are lines; thick walls may stand around rooms that are not recognised
+        walls = _drop_far(walls, inside, frame.resolution, notes, name, pieces=drawing.is_thick)
     cells[walls == 1] = OCCUPIED
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0)), np.where(walls == 1, sure, np.float32(0))
 
@@ -194,13 +202,24 @@ def _layers(
 
 
 def _drop_far(
-    walls: NDArray[np.uint8], inside: NDArray[np.bool_], resolution: float, notes: DerivationNotes, name: str
+    walls: NDArray[np.uint8],
+    inside: NDArray[np.bool_],
+    resolution: float,
+    notes: DerivationNotes,
+    name: str,
+    *,
+    pieces: bool,
 ) -> NDArray[np.uint8]:
-    """Drop ink that is far from all rooms."""
+    """Drop ink that is far from all rooms; with ``pieces`` only connected ink all of which is."""
     import cv2
 
     away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     far = (walls == 1) & (away > MAX_ROOM_DISTANCE_METRES / resolution)
+    if pieces:
+        count, label = cv2.connectedComponents(walls, connectivity=8)
+        near = np.zeros(count, bool)
+        near[label[(walls == 1) & ~far]] = True
+        far &= ~near[label]
     notes.drop("cells of ink", int(far.sum()), f"{name}: more than {MAX_ROOM_DISTANCE_METRES:g} m from any room")
     return np.where(far, 0, walls).astype(np.uint8)
 
