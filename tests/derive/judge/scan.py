@@ -10,7 +10,8 @@ Keys of a label file of kind ``scan``, all positions in cells of the picture (x 
 
 Coverage: share of the occupied cells that the objects cover, with a margin of one cell. Count and median length of the
 walls are compared with the labelled ones. Recall: share of the length of labelled walls within 0.15 m of a derived wall
-of the same direction (± 10°). Rounds and tables: share with a round object, or one piece of furniture, in their place.
+of the same direction (± 10°), or of such a side of rectangular furniture: a person draws a pallet with four lines, or
+as a box. Rounds and tables: share with a round object, or one piece of furniture, in their place.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def judge(case: Case) -> Result:
             at_least=1 / FACTOR,
             at_most=FACTOR,
         ),
-        Figure("recall of labelled walls", _recall(labelled, walls), at_least=RECALL),
+        Figure("recall of labelled walls", _recall(labelled, [*walls, *_sides(rows)]), at_least=RECALL),
         *_places(case, rows, size, height),
     ]
     return Result(figures, _picture(grey, rows, labelled, size))
@@ -86,6 +87,16 @@ def _coverage(rows: list[Row], grid: OccupancyGrid) -> float:
     shapely.prepare(ground)
     at = (np.argwhere(grid.cells == OCCUPIED)[:, ::-1] + 0.5) * grid.resolution
     return float(shapely.contains_xy(ground, at[:, 0], at[:, 1]).mean())
+
+
+def _sides(rows: list[Row]) -> list[Any]:
+    """Return the sides of rectangular furniture."""
+    out = []
+    for shape, properties in rows:
+        if properties["kind"] == "furniture" and "radius" not in properties:
+            corners = shapely.get_coordinates(shape)
+            out += list(shapely.linestrings(np.stack([corners[:-1], corners[1:]], axis=1)))
+    return out
 
 
 def _direction(line: Any) -> float:
@@ -154,6 +165,6 @@ def _picture(grey: NDArray[np.uint8], rows: list[Row], labelled: list[Any], size
             for x, y in pixels(shape):
                 cv2.circle(out, (int(x), int(y)), 2, colour, -1)
         else:
-            for ring in shapely.get_parts(shapely.get_rings(shape)):
+            for ring in shapely.get_rings(shapely.get_parts(shape)):
                 cv2.polylines(out, [pixels(ring)], True, colour, 2)
     return Image.fromarray(out)
