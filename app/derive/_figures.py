@@ -44,7 +44,7 @@ FREE_IN_ARC = 0.3
 MIN_RIM = 0.65
 """Minimum share of the sides of a rectangular solid that was seen: three of four."""
 
-OBLIQUE, MAX_OBLIQUE = 2.5, 0.2
+OBLIQUE, MAX_OBLIQUE = 2.0, 0.2
 """Minimum length of an oblique wall in lengths of the shortest wall, and angle in radians from which it is oblique."""
 
 MIN_DIRECTION = 0.3
@@ -102,7 +102,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
             child = int(links[child, 0])
         # a shape larger than a disc or a box, and wider than a wall, is none of these
         small = box.length <= max(sizes.disc, sizes.box) or box.width <= sizes.wall
-        room = small and any(_is_free(contours[c], free) for c in inner)
+        room = small and _is_free([contours[c] for c in inner], free)
         disc = None if room else _disc(points, sides, sizes) or _arc(contours[k], mask, free, sizes)
         if disc is not None:
             shapes.discs.append(disc)
@@ -118,7 +118,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
     if rest.any():
         thin |= _split_others(rest & mask, sizes, shapes)
     shapes = _join(_without_insides(shapes, rims), thin & mask, free, sizes)
-    return _with_tables(replace(shapes, specks=specks), np.array(legs), mask, sizes)
+    return _with_tables(replace(shapes, specks=specks), np.array(legs), free, sizes)
 
 
 def _is_rim(contour: Any, box: Box, mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits) -> bool:
@@ -197,7 +197,10 @@ def _without_insides(shapes: MaskShapes, rims: list[Box]) -> MaskShapes:
 
 def _join(shapes: MaskShapes, thin: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits) -> MaskShapes:
     """Join pieces of walls; what is too short for a wall, or lies beside one, becomes an area."""
-    joined = join_faces(join_walls(shapes.walls, sizes.tolerance + 0.5, sizes.gap), free, sizes.wall)
+    joined = join_walls(shapes.walls, sizes.tolerance + 0.5, sizes.gap, _directions(shapes.walls))
+    # what is longer now has a better direction
+    joined = join_walls(joined, sizes.tolerance + 0.5, sizes.gap, _directions(joined))
+    joined = join_faces(joined, free, sizes.wall)
     walls = [wall for wall in joined if wall.length >= sizes.length]
     main = _directions(walls)
     # across the main directions, what is little longer than clutter is clutter
@@ -237,12 +240,12 @@ def _remains(left: NDArray[np.uint8]) -> list[Any]:
 
 
 def _with_tables(
-    shapes: MaskShapes, legs: NDArray[np.float64], mask: NDArray[np.uint8], sizes: ShapeLimits
+    shapes: MaskShapes, legs: NDArray[np.float64], free: NDArray[np.bool_], sizes: ShapeLimits
 ) -> MaskShapes:
     """Replace four legs that stand in a rectangle by the table that stands on them."""
     if not sizes.table[1] or not len(legs):
         return shapes
-    tables = [table for table, _ in find_tables(legs, mask, sizes.table, _directions(shapes.walls))]
+    tables = list(find_tables(legs, free, sizes.table, _directions(shapes.walls)))
     discs, boxes, areas = shapes.discs, shapes.boxes, shapes.areas
     for table in tables:
         discs = [disc for disc in discs if not _is_in(table, disc.x, disc.y)]
@@ -284,15 +287,19 @@ def _directions(walls: list[Box]) -> list[float]:
     return out
 
 
-def _is_free(contour: Any, free: NDArray[np.bool_]) -> bool:
-    """Return whether most of a hole is free."""
+def _is_free(holes: list[Any], free: NDArray[np.bool_]) -> bool:
+    """Return whether most of the ground in the holes of a piece is free."""
     import cv2
 
-    x, y, w, h = cv2.boundingRect(contour)
-    inside = np.zeros((h, w), np.uint8)
-    cv2.drawContours(inside, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
-    cv2.drawContours(inside, [contour], -1, 0, 1, offset=(-x, -y))
-    return bool((free[y : y + h, x : x + w] & (inside == 1)).sum() > FREE_INSIDE * inside.sum())
+    cells = seen = 0
+    for hole in holes:
+        x, y, w, h = cv2.boundingRect(hole)
+        inside = np.zeros((h, w), np.uint8)
+        cv2.drawContours(inside, [hole], -1, 1, cv2.FILLED, offset=(-x, -y))
+        cv2.drawContours(inside, [hole], -1, 0, 1, offset=(-x, -y))
+        cells += int(inside.sum())
+        seen += int((free[y : y + h, x : x + w] & (inside == 1)).sum())
+    return seen > FREE_INSIDE * cells
 
 
 def pieces(mask: NDArray[np.uint8]) -> int:

@@ -2,9 +2,9 @@
 
 A wall in a recorded grid is broken where the robot's pose, a door frame or a cable moved a beam: its centreline falls
 into pieces of a few decimetres, each with its own direction. Pieces are joined along the line of the longest one, as
-far as their ends stay within the robot's noise of it. ROSE (Kucner et al. 2020) takes the dominant directions of a map
-for this; here a long piece gives the direction of its own wall, so that walls at any angle are joined, and the dominant
-directions decide only what is clutter. All lengths are in cells.
+far as their ends stay within the robot's noise of it. As in ROSE (Kucner et al. 2020), the dominant directions of the
+map straighten what the noise may have turned; a longer piece keeps its own direction, so that walls at any angle are
+joined. All lengths are in cells.
 """
 
 from __future__ import annotations
@@ -52,12 +52,13 @@ class _Line:
     members: list[int]
 
 
-def join_walls(walls: Sequence[Box], noise: float, gap: float) -> list[Box]:
+def join_walls(walls: Sequence[Box], noise: float, gap: float, main: Sequence[float] = ()) -> list[Box]:
     """Join pieces of walls that lie on one line.
 
     Args:
         noise: maximum distance of a piece's ends from the line.
         gap: maximum gap between pieces.
+        main: dominant directions, and those across them, in radians.
 
     Returns walls in the order of their first pieces.
     """
@@ -71,7 +72,7 @@ def join_walls(walls: Sequence[Box], noise: float, gap: float) -> list[Box]:
     for seed in np.lexsort((np.arange(len(walls)), -lengths)):
         if free[seed]:
             free[seed] = False
-            line = _grow(int(seed), walls, ends, tree, free, noise, gap)
+            line = _grow(int(seed), walls, ends, tree, free, noise, gap, main)
             joined.append((min(line.members), _wall_of(line, walls, ends)))
     return [wall for _, wall in sorted(joined, key=lambda item: item[0])]
 
@@ -90,9 +91,10 @@ def _grow(
     free: NDArray[np.bool_],
     noise: float,
     gap: float,
+    main: Sequence[float],
 ) -> _Line:
     """Join to a piece all free pieces on its line, and mark them as not free."""
-    line = _fit([seed], walls, ends)
+    line = _fit([seed], walls, ends, noise, main)
     for _ in range(MAX_ROUNDS):
         a, b = (line.at + line.along * s for s in (line.low - gap, line.high + gap))
         around = shapely.linestrings(np.stack([a, b])).buffer(noise, cap_style="flat")
@@ -101,7 +103,7 @@ def _grow(
         if not new:
             break
         free[new] = False
-        line = _fit([*line.members, *new], walls, ends)
+        line = _fit([*line.members, *new], walls, ends, noise, main)
     return line
 
 
@@ -117,8 +119,10 @@ def _is_on(ends: NDArray[np.float64], wall: Box, line: _Line, noise: float, gap:
     return bool(along.min() <= line.high + gap and along.max() >= line.low - gap)
 
 
-def _fit(members: list[int], walls: Sequence[Box], ends: NDArray[np.float64]) -> _Line:
-    """Fit a line to the ends of pieces, weighted by length."""
+def _fit(
+    members: list[int], walls: Sequence[Box], ends: NDArray[np.float64], noise: float, main: Sequence[float]
+) -> _Line:
+    """Fit a line to the ends of pieces, weighted by length; along a main direction if only noise is between them."""
     points = ends[members].reshape(-1, 2)
     weights = np.repeat([walls[k].length for k in members], 2)
     middle = np.average(points, axis=0, weights=weights)
@@ -128,6 +132,13 @@ def _fit(members: list[int], walls: Sequence[Box], ends: NDArray[np.float64]) ->
     along = vectors[:, 1]
     # the sign of an eigenvector is arbitrary
     along = along if (along[0], along[1]) > (0.0, 0.0) else -along
+    length = float(np.ptp((points - middle) @ along))
+    for direction in main:
+        turn = math.remainder(direction - math.atan2(along[1], along[0]), math.pi / 2)
+        if abs(turn) <= min(MAX_TURN, noise / max(length, 1.0)):
+            c, s = math.cos(turn), math.sin(turn)
+            along = np.array([c * along[0] - s * along[1], s * along[0] + c * along[1]])
+            break
     reach = (points - middle) @ along
     return _Line(middle, along, float(reach.min()), float(reach.max()), members)
 
@@ -135,6 +146,7 @@ def _fit(members: list[int], walls: Sequence[Box], ends: NDArray[np.float64]) ->
 def _wall_of(line: _Line, walls: Sequence[Box], ends: NDArray[np.float64]) -> Box:
     """Return the wall around the pieces of a line; a single piece is unchanged."""
     if len(line.members) == 1:
+        # its own direction covers its cells best
         return walls[line.members[0]]
     across = np.array([-line.along[1], line.along[0]])
     lengths = np.array([walls[k].length for k in line.members])
@@ -216,13 +228,13 @@ def fit_arc(points: NDArray[np.float64], max_radius: float) -> Disc | None:
 
 
 def find_tables(
-    legs: NDArray[np.float64], mask: NDArray[np.uint8], sides: tuple[float, float], directions: Sequence[float]
-) -> Iterator[tuple[Box, list[int]]]:
-    """Yield the tables that stand on four of the legs: (outline, indices of its legs).
+    legs: NDArray[np.float64], free: NDArray[np.bool_], sides: tuple[float, float], directions: Sequence[float]
+) -> Iterator[Box]:
+    """Yield the outlines of tables that stand on four of the legs.
 
     Args:
         legs: float64 [n, 2], middles of small separate pieces.
-        mask: uint8 [height, width], occupied cells; between the legs there are none.
+        free: bool [height, width], cells known to be free; between the legs all are.
         sides: shortest and longest side of a table.
         directions: yaws of the walls; tables stand along them.
 
@@ -237,9 +249,9 @@ def find_tables(
         options += _rectangles(turned, sides, yaw)
     used: set[int] = set()
     for _, corners, yaw in sorted(options, key=lambda option: (option[0], option[1])):
-        if used.isdisjoint(corners) and _is_clear(legs[list(corners)], mask):
+        if used.isdisjoint(corners) and _is_clear(legs[list(corners)], free):
             used.update(corners)
-            yield _outline(legs[list(corners)], yaw), list(corners)
+            yield _outline(legs[list(corners)], yaw)
 
 
 def _rectangles(
@@ -261,13 +273,13 @@ def _rectangles(
     return out
 
 
-def _is_clear(corners: NDArray[np.float64], mask: NDArray[np.uint8]) -> bool:
-    """Return whether the ground between four legs is clear, but for a margin around the legs."""
+def _is_clear(corners: NDArray[np.float64], free: NDArray[np.bool_]) -> bool:
+    """Return whether the ground between four legs is free, but for a margin around the legs."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 3
     x0, y0 = (int(v) + margin for v in low)
     x1, y1 = (int(v) - margin for v in high)
-    return x1 > x0 and y1 > y0 and not mask[y0:y1, x0:x1].any()
+    return x1 > x0 and y1 > y0 and bool(free[y0:y1, x0:x1].all())
 
 
 def _outline(corners: NDArray[np.float64], yaw: float) -> Box:

@@ -4,15 +4,18 @@ A connected piece of occupied cells is
 
 ========= =============================================================================================================
 a post    if it is round (or, among trees, of any shape and no larger than a trunk), its inside unknown or not: a laser
-          scanner sees only the rim
+          scanner sees only the rim, or a part of it
 a wall    if it is a straight piece no thicker than ``wall_width``; of other pieces all parts that are no thicker, each
           straight edge of their centreline within ``tolerance`` one wall
-furniture if it is a rectangle that is thicker, up to the size that the context allows
+furniture if it is a rectangle that is thicker, or the rim of one around ground that was not seen, up to the size that
+          the context allows; in offices also what is round and wider than 0.5 m, and a table on four separate legs
 obstacle  otherwise, as an outline within ``tolerance``
 ========= =============================================================================================================
 
-Pieces around free cells are never solid. Cells count as occupied from the grid's ``occupied_thresh`` on; unknown cells
-are no objects.
+Walls that lie on one line within ``tolerance`` are joined over gaps up to ``wall_gap``, and so are the two faces of a
+wall. What is shorter than ``wall_length`` then, or little longer and oblique to the main directions of the walls, is an
+obstacle. Pieces around free cells are never solid. Cells count as occupied from the grid's ``occupied_thresh`` on;
+unknown cells are no objects.
 """
 
 from __future__ import annotations
@@ -114,7 +117,7 @@ class Parameters:
         0.4, "maximum thickness of a wall; at least three cells", minimum=0.0, maximum=10.0, unit="m"
     )
     wall_length: float = parameter(
-        0.4, "minimum length of a wall; shorter pieces are obstacles", minimum=0.0, maximum=100.0, unit="m"
+        0.5, "minimum length of a wall; shorter pieces are obstacles", minimum=0.0, maximum=100.0, unit="m"
     )
     wall_gap: float = parameter(
         0.25, "maximum gap in a wall that is closed, at least two cells", minimum=0.0, maximum=10.0, unit="m"

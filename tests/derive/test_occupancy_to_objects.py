@@ -199,9 +199,10 @@ def test_rim_around_free_cells_is_room() -> None:
     g = scene(hollow=True)
     cells = g.cells.copy()
     cells[cells == UNKNOWN] = FREE
-    f = find_objects(grid(cells))
+    f = find_objects(grid(cells), wall_length=0.3)
     assert "furniture" not in kinds(f)
-    assert kinds(f)["wall"] >= len(WALLS) + 4 * len(BOXES)
+    sides = [side for _, length, width, _ in BOXES for side in (length, width)]
+    assert kinds(f)["wall"] >= len(WALLS) + 2 * sum(side >= 0.7 for side in sides)
 
 
 def test_specks_are_dropped_with_note() -> None:
