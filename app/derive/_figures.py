@@ -117,7 +117,7 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
             cv2.drawContours(rest, [contours[k], *(contours[c] for c in inner)], -1, 1, cv2.FILLED)
     if rest.any():
         thin |= _split_others(rest & mask, sizes, shapes)
-    shapes = _join(_without_insides(shapes, rims), thin & mask, free, sizes)
+    shapes = _join(_without_insides(shapes, rims, mask.shape), thin & mask, free, sizes)
     return _with_tables(replace(shapes, specks=specks), np.array(legs), free, sizes)
 
 
@@ -184,11 +184,15 @@ def _corners(box: Box) -> NDArray[np.float64]:
     return middle + np.stack([-along - across, along - across, along + across, across - along])
 
 
-def _without_insides(shapes: MaskShapes, rims: list[Box]) -> MaskShapes:
+def _without_insides(shapes: MaskShapes, rims: list[Box], shape: tuple[int, ...]) -> MaskShapes:
     """Add solids of which the rim was seen, and drop what was seen within them."""
+    if not rims:
+        return shapes
+    inside = _painted(rims, shape, 0.0)
 
-    def is_outside(shape: Disc | Box) -> bool:
-        return not any(_is_in(rim, shape.x, shape.y, 0.0) for rim in rims)
+    def is_outside(figure: Disc | Box) -> bool:
+        row, column = min(int(figure.y), shape[0] - 1), min(int(figure.x), shape[1] - 1)
+        return not inside[max(row, 0), max(column, 0)]
 
     boxes = [box for box in shapes.boxes if is_outside(box)]
     walls = [wall for wall in shapes.walls if is_outside(wall)]
@@ -205,20 +209,20 @@ def _join(shapes: MaskShapes, thin: NDArray[np.uint8], free: NDArray[np.bool_], 
     main = _directions(walls)
     # across the main directions, what is little longer than clutter is clutter
     walls = [wall for wall in walls if not main or wall.length >= OBLIQUE * sizes.length or _is_along(wall, main)]
-    left = thin & (1 - _painted(walls, thin.shape))
+    left = thin & (1 - _painted(walls, thin.shape, 1.0))
     return replace(shapes, walls=walls, areas=[*shapes.areas, *_remains(left)])
 
 
-def _painted(walls: list[Box], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return the cells of walls with a margin of one cell."""
+def _painted(boxes: list[Box], shape: tuple[int, ...], margin: float) -> NDArray[np.uint8]:
+    """Return the cells of boxes with a margin around them."""
     import cv2
 
     out = np.zeros(shape, np.uint8)
-    for wall in walls:
-        along = np.array([math.cos(wall.yaw), math.sin(wall.yaw)])
-        across = np.array([-along[1], along[0]]) * (wall.width / 2 + 1)
-        along = along * (wall.length / 2 + 1)
-        middle = np.array([wall.x - 0.5, wall.y - 0.5])
+    for box in boxes:
+        along = np.array([math.cos(box.yaw), math.sin(box.yaw)])
+        across = np.array([-along[1], along[0]]) * (box.width / 2 + margin)
+        along = along * (box.length / 2 + margin)
+        middle = np.array([box.x - 0.5, box.y - 0.5])
         corners = np.stack([middle - along - across, middle + along - across, middle + along + across])
         corners = np.vstack([corners, middle - along + across])
         cv2.fillPoly(out, [np.round(corners * 16).astype(np.int32)], 1, shift=4)
@@ -272,18 +276,19 @@ def _directions(walls: list[Box]) -> list[float]:
         return []
     turns = np.array([wall.yaw % (math.pi / 2) for wall in walls])
     lengths = np.array([wall.length for wall in walls])
+    # length by degrees, and within three degrees of each
+    degrees = np.floor(np.degrees(turns)).astype(np.int64) % 90
+    weight = np.bincount(degrees, weights=lengths, minlength=90)
     out: list[float] = []
-    left = lengths.copy()
     while len(out) < 2:
-        # the direction with most length within three degrees
-        near = np.abs(np.remainder(turns[:, None] - turns + math.pi / 4, math.pi / 2) - math.pi / 4) <= math.radians(3)
-        weight = near @ left
-        best = int(weight.argmax())
-        if weight[best] < MIN_DIRECTION * lengths.sum():
+        sums = sum((np.roll(weight, k) for k in range(-3, 4)), np.zeros(90))
+        best = int(sums.argmax())
+        if sums[best] < MIN_DIRECTION * lengths.sum():
             break
-        away = np.remainder(turns[near[best]] - turns[best] + math.pi / 4, math.pi / 2) - math.pi / 4
-        out.append(float(turns[best] + np.average(away, weights=lengths[near[best]])))
-        left[near[best]] = 0.0
+        away = np.remainder(turns - math.radians(best + 0.5) + math.pi / 4, math.pi / 2) - math.pi / 4
+        near = np.abs(away) <= math.radians(3.5)
+        out.append(float(math.radians(best + 0.5) + np.average(away[near], weights=lengths[near])))
+        weight[(best + np.arange(-3, 4)) % 90] = 0.0
     return out
 
 

@@ -61,7 +61,7 @@ def test_scanned_room_has_few_long_walls(seed: int, yaw: float) -> None:
     part = objects(scanned_room(seed, yaw))
     walls = sorted((f.geometry.length for f in part if f.properties["kind"] == "wall"), reverse=True)
     assert 4 <= len(walls) <= 7, "of a dozen pieces on each side"
-    assert sum(walls) == pytest.approx(28.0, abs=2.0)
+    assert sum(walls) == pytest.approx(28.0, abs=3.0), "the rest is short, oblique or in a gap"
     assert walls[3] > 3.5
 
 
