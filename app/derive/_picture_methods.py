@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, _model, _plans
 from app.derive._colour import segments
@@ -74,8 +75,8 @@ def _report_unknown(out: Segments, on: GroundImage, notes: DerivationNotes, name
 
 def plan_to_grid(
     picture: GeoImage, frame: LocalFrame | None, how: Segmentation, notes: DerivationNotes, name: str
-) -> OccupancyGrid:
-    """Convert a floor plan to a grid."""
+) -> tuple[OccupancyGrid, NDArray[np.float32]]:
+    """Convert a floor plan to a grid, and the probability of each cell that it is a wall, float32 [rows, columns]."""
     upright = picture if picture.crs == LOCAL else resample(picture, frame, crs=LOCAL)
     speck = 0.05 if how.minimum_area is None else how.minimum_area
     return _plans.plan_to_grid(

@@ -51,8 +51,8 @@ def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Derivation
         name = picture_label(key)
         method = choose_method(picture, parameters)
         if method == "plan":
-            grid = plan_to_grid(picture, layers.frame, parameters, notes, name)
-            on, rows = None, _plan(grid, parameters)
+            grid, confidence = plan_to_grid(picture, layers.frame, parameters, notes, name)
+            on, rows = None, _plan(grid, confidence, parameters)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
             rows = _regions(segment_picture(on, picture, parameters, method, notes, name), on, parameters)
@@ -138,8 +138,8 @@ def _middles(segments: Segments, on: GroundImage) -> list[Row]:
     return rows
 
 
-def _plan(grid: OccupancyGrid, parameters: Parameters) -> list[Row]:
-    """Return the walls and the floors of a floor plan's grid."""
+def _plan(grid: OccupancyGrid, confidence: NDArray[np.float32], parameters: Parameters) -> list[Row]:
+    """Return the walls, with the mean confidence of their cells, and the floors of a floor plan's grid."""
     x, y, _ = grid.origin
     r = grid.resolution
     tolerance = r / 2 if parameters.outline_tolerance is None else parameters.outline_tolerance
@@ -149,6 +149,10 @@ def _plan(grid: OccupancyGrid, parameters: Parameters) -> list[Row]:
 
         connectivity = 4
         _, label = cv2.connectedComponents((grid.cells == value).astype(np.uint8), connectivity=connectivity)
+        cells, sure = np.bincount(label.ravel()), np.bincount(label.ravel(), weights=confidence.ravel())
         for k, area in sorted(polygons(label.astype(np.int32), (r, 0.0, x, 0.0, r, y), tolerance).items()):
-            rows.append((f"{kind}/{k}", area, {"kind": kind}))
+            properties = (
+                {"kind": kind, "confidence": round(float(sure[k] / cells[k]), 2)} if kind == "wall" else {"kind": kind}
+            )
+            rows.append((f"{kind}/{k}", area, properties))
     return rows

@@ -46,7 +46,7 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
             raise MissingDatum('a grid needs a datum: PATCH the environment with {"datum": {…}}')
         method = choose_method(picture, parameters)
         if method == "plan":
-            grid = plan_to_grid(picture, layers.frame, parameters, notes, name)
+            grid, _ = plan_to_grid(picture, layers.frame, parameters, notes, name)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
             segments = segment_picture(on, picture, parameters, method, notes, name)

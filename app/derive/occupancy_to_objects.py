@@ -4,15 +4,18 @@ A connected piece of occupied cells is
 
 ========= =============================================================================================================
 a post    if it is round (or, among trees, of any shape and no larger than a trunk), its inside unknown or not: a laser
-          scanner sees only the rim
+          scanner sees only the rim, or a part of it
 a wall    if it is a straight piece no thicker than ``wall_width``; of other pieces all parts that are no thicker, each
           straight edge of their centreline within ``tolerance`` one wall
-furniture if it is a rectangle that is thicker, up to the size that the context allows
+furniture if it is a rectangle that is thicker, or the rim of one around ground that was not seen, up to the size that
+          the context allows; in offices also what is round and wider than 0.5 m, and a table on four separate legs
 obstacle  otherwise, as an outline within ``tolerance``
 ========= =============================================================================================================
 
-Pieces around free cells are never solid. Cells count as occupied from the grid's ``occupied_thresh`` on; unknown cells
-are no objects.
+Walls that lie on one line within ``tolerance`` are joined over gaps up to ``wall_gap``, and so are the two faces of a
+wall. What is shorter than ``wall_length`` then, or little longer and oblique to the main directions of the walls, is an
+obstacle. Pieces around free cells are never solid. Cells count as occupied from the grid's ``occupied_thresh`` on;
+unknown cells are no objects.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._figures import MAX_FIGURES, Box, Disc, MaskShapes, ShapeLimits, figures
+from app.derive._figures import MAX_FIGURES, figures
+from app.derive._shapes import Box, Disc, MaskShapes, ShapeLimits
 from app.errors import CannotConvert, TooLarge
 from app.model.features import features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -41,12 +45,19 @@ NAME = "occupancy"
 CELLS = 2**29
 """Maximum number of cells that are processed."""
 
+LEG = 0.25
+"""Maximum size of a table's leg in metres."""
+
 Row = tuple[str, Any, dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Typical sizes in a context, in metres: heights, the widest post, the longest furniture, the largest trunk."""
+    """Typical sizes in a context, in metres.
+
+    heights of kinds; widest: post; longest: furniture; trunk: largest; round_furniture: diameter from which a disc is
+    furniture, not a post; table: shortest and longest side of a table of which only legs are seen.
+    """
 
     post: str
     furniture: str
@@ -54,12 +65,22 @@ class Context:
     widest: float
     longest: float
     trunk: float = 0.0
+    round_furniture: float = math.inf
+    table: tuple[float, float] = (0.0, 0.0)
 
 
 CONTEXTS: Mapping[str, Context] = {
     "forest": Context("tree", "rock", {"tree": 15.0, "rock": 1.0, "wall": 1.5, "obstacle": 1.5}, 3.0, 3.0, 1.0),
     "orchard": Context("tree", "crate", {"tree": 3.0, "crate": 1.0, "wall": 2.0, "obstacle": 2.0}, 4.0, 3.0, 0.6),
-    "office": Context("post", "furniture", {"post": 2.5, "furniture": 0.8, "wall": 2.5, "obstacle": 2.5}, 1.5, 4.0),
+    "office": Context(
+        "post",
+        "furniture",
+        {"post": 2.5, "furniture": 0.8, "wall": 2.5, "obstacle": 2.5},
+        1.5,
+        4.0,
+        round_furniture=0.5,
+        table=(0.4, 2.4),
+    ),
     "warehouse": Context("post", "rack", {"post": 5.0, "rack": 3.0, "wall": 5.0, "obstacle": 5.0}, 1.5, 20.0),
 }
 
@@ -95,9 +116,15 @@ class Parameters:
     wall_width: float = parameter(
         0.4, "maximum thickness of a wall; at least three cells", minimum=0.0, maximum=10.0, unit="m"
     )
+    wall_length: float = parameter(
+        0.5, "minimum length of a wall; shorter pieces are obstacles", minimum=0.0, maximum=100.0, unit="m"
+    )
+    wall_gap: float = parameter(
+        0.25, "maximum gap in a wall that is closed, at least two cells", minimum=0.0, maximum=10.0, unit="m"
+    )
 
 
-@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=2)
+@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=3)
 def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Objects from a grid: posts or trees, walls and furniture by shape, with heights of a context.
 
@@ -143,6 +170,10 @@ def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: D
         wall=max(parameters.wall_width / cell, 3.0) + 1e-6,
         small=context.trunk / cell,
         tolerance=1.5 if parameters.tolerance is None else parameters.tolerance / cell,
+        length=parameters.wall_length / cell,
+        gap=max(parameters.wall_gap / cell, 2.0),
+        leg=LEG / cell,
+        table=(context.table[0] / cell, context.table[1] / cell),
     )
     limit = sizes.speck * cell
     try:
@@ -204,14 +235,18 @@ def _rows(shapes: MaskShapes, grid: OccupancyGrid, context: Context, height: flo
         return {"kind": kind, "pose": pose, "size": [*size, h], "height": h, "shapes": [solid]}
 
     rows: list[Row] = []
-    for k, disc in enumerate(shapes.discs, 1):
-        kind, radius = context.post, round(disc.radius * cell, 6)
+    numbers = dict.fromkeys((context.post, context.furniture), 0)
+    for disc in shapes.discs:
+        radius = round(disc.radius * cell, 6)
+        kind = context.furniture if 2 * radius >= context.round_furniture else context.post
+        numbers[kind] += 1
+        k = numbers[kind]
         turn = np.arange(24) * (math.tau / 24)
         ring = np.stack([disc.x + disc.radius * np.cos(turn), disc.y + disc.radius * np.sin(turn)], axis=1)
         properties = body(kind, disc, [2 * radius] * 2, {"type": "cylinder", "radius": radius, "length": high(kind)})
         rows.append((f"{kind}/{k}", shapely.Polygon(placed(ring)), {**properties, "radius": radius}))
     for kind, boxes in (("wall", shapes.walls), (context.furniture, shapes.boxes)):
-        for k, box in enumerate(boxes, 1):
+        for k, box in enumerate(boxes, numbers.get(kind, 0) + 1):
             size = [round(box.length * cell, 6), round(box.width * cell, 6)]
             properties = body(kind, box, size, {"type": "box", "size": [*size, high(kind)]})
             along, across = _axes(box)

@@ -24,6 +24,12 @@ MAX_SIDE_CELLS = 32767
 MAX_OCCUPIED_SHARE = 0.95
 """Share of occupied cells from which on the floor probably counts as an obstacle."""
 
+BAND_METRES = 2.0
+"""Height above a recorded floor up to which voxels are obstacles, by default."""
+
+FLOOR_FACTOR, FLOOR_SHARE = 3.0, 0.3
+"""Area of a floor, in those of the layers above it, and in that of the largest layer."""
+
 RANK = np.array([1, 0, 2], np.uint8)
 """Rank of unknown, free, occupied: a coarser cell has the highest rank that it covers, as in ``occupancy_grid``."""
 
@@ -40,7 +46,8 @@ class Parameters:
 
     band: tuple[float, float] | None = parameter(
         None,
-        "height range low,high above the level's floor; default: the full height",
+        "height range low,high above the level's floor; default: from the floor, if one was recorded, to 2 m above it "
+        "or to the ceiling, else the full height",
         minimum=-1e5,
         maximum=1e5,
         unit="m",
@@ -54,13 +61,14 @@ class Parameters:
     )
 
 
-@derives(gives="occupancy", needs={"voxels"}, parameters=Parameters, cost=2.0)
+@derives(gives="occupancy", needs={"voxels"}, parameters=Parameters, cost=2.0, version=2)
 def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Projection of a height band: occupied if any voxel of the column is, free if all known ones are.
 
-    Each voxel map becomes one grid of the same name; it covers all voxels whatever the band, so that the frame does not
-    change with the band; yaw 0, the origin a multiple of the resolution. Raises MissingLayer if no voxel is in the
-    band, CannotConvert if the grid would be too large or the band is not ascending.
+    Without a band, a recorded floor and what is above 2 m, or a ceiling below, are left out. Each voxel map becomes one
+    grid of the same name; it covers all voxels whatever the band, so that the frame does not change with the band; its
+    yaw is 0, its origin a multiple of the resolution. Raises MissingLayer if no voxel is in the band, CannotConvert if
+    the grid would be too large or the band is not ascending.
     """
     if parameters.band is not None and not parameters.band[0] < parameters.band[1]:
         low, high = parameters.band
@@ -70,7 +78,13 @@ def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivatio
     for key, part in layers.parts_of("voxels").items():
         if not isinstance(part, VoxelMap) or not len(part):
             continue
-        grid = _project(part, parameters, layers.elevation(key.level))
+        floor = layers.elevation(key.level)
+        band = parameters.band or _band_above_floor(part, floor)
+        if band is not None and parameters.band is None:
+            notes.fill(
+                "band", f"{band[0]:g},{band[1]:g}", f"{key.name}: heights above the floor that was recorded", "band"
+            )
+        grid = _project(part, band, parameters.resolution, floor)
         if grid is None:
             z = part.bounds()
             seen.append(f"{key.name} from {z[2]:g} to {z[5]:g} m above the local origin" if z else key.name)
@@ -97,20 +111,62 @@ def _report_doubts(
         notes.warn(f"{key.name}: the voxels contain no free space; all cells that are not occupied are unknown")
 
 
-def _project(voxels: VoxelMap, parameters: Parameters, floor: float) -> OccupancyGrid | None:
+def _band_above_floor(voxels: VoxelMap, floor: float) -> tuple[float, float] | None:
+    """Return the heights between a recorded floor and 2 m above it or a ceiling; None if no floor was recorded.
+
+    A floor is the lowest layer of voxels that covers much of the ground, and much more of it than the layers above do,
+    with those that continue it; a ceiling likewise. floor: of the level, metres above the local origin; the result is
+    above it.
+    """
+    edge = voxels.resolution
+    occupied = voxels.log_odds >= 0
+    low, high = (z[occupied].astype(np.int64) for z in voxels.axis(2))
+    if not len(low) or int(high.max() - low.min()) > MAX_SIDE_CELLS:
+        return None
+    bottom = int(low.min())
+    areas = (high - low).astype(np.float64) ** 2
+    change = np.zeros(int(high.max()) - bottom + 1)
+    np.add.at(change, low - bottom, areas)
+    np.add.at(change, high - bottom, -areas)
+    layers = np.cumsum(change)[:-1]
+    reach = max(2, round(BAND_METRES / edge))
+    usual = np.array(
+        [np.median(layers[k + 1 : k + 1 + reach]) if k + 1 < len(layers) else np.inf for k in range(len(layers))]
+    )
+    # walls and racks repeat in each layer; what is under the floor is noise
+    ground = layers.max()
+    is_floor = (layers >= FLOOR_FACTOR * usual) & (layers >= FLOOR_SHARE * ground)
+    if not is_floor.any():
+        return None
+    first = int(is_floor.argmax())
+    last = first
+    while last + 1 < len(layers) and is_floor[last + 1]:
+        last += 1
+    top = last + 1 + reach
+    above = layers[last + 1 : top]
+    ceiling = np.flatnonzero(above >= FLOOR_FACTOR * max(float(np.median(above)), 1.0))
+    ceiling = ceiling[ceiling >= reach // 2]
+    if len(ceiling):
+        top = last + 1 + int(ceiling[0])
+    return round((last + 1 + bottom) * edge - floor, 6), round((top + bottom) * edge - floor, 6)
+
+
+def _project(
+    voxels: VoxelMap, band: tuple[float, float] | None, resolution: float | None, floor: float
+) -> OccupancyGrid | None:
     """Convert a voxel map to a grid; None if nothing is in the band. floor: metres above the local origin."""
     edge = voxels.resolution
     bounds = [(int(low.min()), int(high.max())) for low, high in (voxels.axis(0), voxels.axis(1))]
     _check_size([high - low for low, high in bounds], edge, "upload voxels of a coarser resolution or a smaller area")
     inside = np.ones(len(voxels), bool)
-    if parameters.band is not None:
+    if band is not None:
         low, high = voxels.axis(2)
-        bottom, top = ((floor + v) / edge for v in parameters.band)
+        bottom, top = ((floor + v) / edge for v in band)
         inside = (high > _snap_to_integer(bottom)) & (low < _snap_to_integer(top))
         if not inside.any():
             return None
     state = _columns(voxels, inside, bounds)
-    size = parameters.resolution or edge
+    size = resolution or edge
     if abs(size - edge) <= 1e-9 * edge:
         cells = VALUE[RANK][state]
         first = [bounds[0][0], bounds[1][0]]

@@ -552,7 +552,7 @@ def _cross(out: Field, layout: Layout) -> None:
 
 
 def stops(out: Field, aisle: Aisle) -> list[tuple[str, float]]:
-    """Return an aisle's nodes and their u: headland, row's end, along the row, row's end, headland, and cross-aisles."""
+    """Return an aisle's nodes and their u: headland, row's end, along the row, row's end, headland; cross-aisles."""
     regular = stop_positions(aisle.low, aisle.high, out.options.headland / 2, out.options.node_spacing)
     return sorted([*regular, *((f"x{k}", u) for k, u in aisle.crossings.items())], key=lambda stop: stop[1])
 

@@ -283,7 +283,7 @@ def test_floor_plan_gives_walls_rooms_and_outside() -> None:
     assert (at(g, 1, 6), at(g, 13, 11), at(g, 1, 11.2)) == (UNKNOWN, UNKNOWN, UNKNOWN), "outside, and the title"
     rooms = 9.6 * 7.6 - 0.1 * 6.6
     assert (g.cells == FREE).sum() * 0.0025 == pytest.approx(rooms, rel=0.03)
-    assert any(d.subject == "cells of ink" for d in notes.dropped)
+    assert any(d.subject == "symbols" for d in notes.dropped), "the letters of the title"
     part = objects(layers(local(plan(), 0.02)))
     walls, floors = shapely.union_all(of(part, "wall")), shapely.union_all(of(part, "floor"))
     assert walls.area == pytest.approx(10 * 8 - 9.6 * 7.6 - 0.2 + 0.66, rel=0.1)

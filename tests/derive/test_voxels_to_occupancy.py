@@ -40,6 +40,9 @@ def tree(path: Path) -> VoxelMap:
     return part
 
 
+FULL = (-1e5, 1e5)
+
+
 def leaves(*rows: tuple[int, int, float], resolution: float = 0.5) -> VoxelMap:
     """(depth, code, log-odds) each, in any order."""
     order = sorted(rows, key=lambda r: r[1] << 3 * (16 - r[0]))
@@ -79,7 +82,7 @@ def test_real_trees_are_projected_at_full_height(
 ) -> None:
     path = shared / "data" / "octomap" / name
     expected = facts_json[f"octomap/{name}"]["facts"]["projection_xy_full_height"]
-    grid, _ = project(tree(path))
+    grid, _ = project(tree(path), band=FULL)
     counts = grid.counts()
     assert (grid.width, grid.height) == (expected["width_cells"], expected["height_cells"])
     assert (counts["occupied"], counts["free"], counts["unknown"]) == (
@@ -170,8 +173,48 @@ def test_resampling_loses_no_obstacle(shared: Path, size: float) -> None:
             assert grid.cells[row, column] == fine.cells[min(y, fine.height - 1), min(x, fine.width - 1)]
 
 
+@pytest.mark.parametrize(
+    ("name", "band"),
+    [
+        ("rotors_power_plant/power_plant.bt", "0.25,2.25"),
+        ("geb079/geb079.bt", "0,2"),
+        ("joctomap_ecmrv4/ecmrv4_withfree.ot", None),
+    ],
+)
+def test_recorded_floor_is_left_out(shared: Path, name: str, band: str | None) -> None:
+    """The heights as seen in the trees: a floor of one layer, one of two with a ceiling at 2.6 m, walls only."""
+    grid, notes = project(tree(shared / "data/octomap" / name))
+    assert [t.value for t in notes.template] == ([band] if band else [])
+    counts = grid.counts()
+    assert counts["free"] > counts["occupied"], "the ground is no obstacle"
+    same, _ = project(tree(shared / "data/octomap" / name), band=tuple(map(float, band.split(","))) if band else FULL)
+    assert np.array_equal(grid.cells, same.cells)
+
+
+def test_low_ceiling_ends_the_band_and_level_moves_it() -> None:
+    """A room of 40 × 40 voxels of 0.1 m and of 1.5 m height, with walls, on a floor at 1 m."""
+
+    def code(x: int, y: int, z: int) -> int:
+        return sum(
+            1 << 3 * k + b for b, v in enumerate((HALF + x, HALF + y, HALF + z)) for k in range(16) if v >> k & 1
+        )
+
+    side = range(40)
+    walls = {(x, y, z) for z in range(10, 26) for x in side for y in (0, 39)}
+    walls |= {(x, y, z) for z in range(10, 26) for y in side for x in (0, 39)}
+    plates = {(x, y, z) for x in side for y in side for z in (10, 25)}
+    voxels = leaves(*((16, code(*at), 1.0) for at in sorted(walls | plates)), resolution=0.1)
+    grid, notes = project(voxels, elevation=1.0)
+    assert [t.value for t in notes.template] == ["0.1,1.5"]
+    assert grid.counts()["occupied"] == 4 * 39
+    _, notes = project(leaves(*((16, code(*at), 1.0) for at in sorted(walls)), resolution=0.1))
+    assert not notes.template, "walls alone are no floor"
+
+
 def test_doubtful_projections_are_warned_of(shared: Path) -> None:
-    _, notes = project(tree(shared / "data/octomap/rotors_power_plant/power_plant.bt"))
+    plate = [(16, sum(1 << 3 * k + b for b, v in enumerate((x, y, 0)) for k in range(16) if v >> k & 1), 1.0)
+             for x in range(8) for y in range(8)]  # fmt: skip
+    _, notes = project(leaves(*plate))
     assert any("probably by the floor" in w.problem for w in notes.warnings)
     _, notes = project(leaves((16, 5, 1.0)))
     assert any("no free space" in w.problem for w in notes.warnings)
