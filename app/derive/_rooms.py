@@ -1,0 +1,331 @@
+"""Rooms, corridors and doors of a grid: basins of the distance to walls, divided at narrow necks.
+
+Steps, after the methods compared by Bormann et al. (Room segmentation: survey, implementation, and analysis, ICRA
+2016), MAORIS (Mielle et al., ICRA 2018) and ROSE² (Luperto et al., IROS 2022):
+
+1. *Declutter.* Isolated pieces of occupied cells up to ``CLUTTER`` across (legs, chairs, posts) are not walls, nor are
+   pockets of unknown cells up to ``POCKET`` across (what furniture hides).
+2. *Basins.* Ground is flooded from the places farthest from walls. Basins that meet are one room unless they meet in a
+   neck, narrower than both.
+3. *Doors.* A neck is a door if its jambs are walls, it is as wide as a door and as short as a wall is thick.
+   Basins that meet elsewhere are joined.
+4. *Corridors* are parts of a basin that are much narrower than it, and long; and long basins.
+5. Basins that walls do not enclose (fields, yards, fringes of a scan) are no rooms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Mask = NDArray[np.bool_]
+Labels = NDArray[np.int32]
+Distance = NDArray[np.float32]
+
+CLUTTER = 1.0
+"""Maximum size of isolated obstacles that are furniture, in metres."""
+
+ISLAND = 6.0
+BULK = 0.5
+"""Maximum size of isolated obstacles that are furniture if they are no thin walls, in metres, and the share of their
+smallest rectangle that they then fill."""
+
+POCKET = 1.6
+"""Maximum width of unknown ground that counts as part of the room around it, in metres."""
+
+NECK = 0.85
+WIDE_NECK = 0.65
+"""Ratios of a neck's width to that of the smaller basin, above which both are one room: for necks as wide as a door,
+and for wider ones."""
+
+MAX_DOOR = 2.3
+MIN_DOOR = 0.5
+"""Width of doors in metres: from a narrow leaf to a double door."""
+
+JAMB = 0.5
+"""Minimum length of the walls that a door's gap continues, as a share of its width."""
+
+MIN_ROOM_WIDTH = 1.0
+MIN_ROOM_AREA = 1.5
+"""Smallest room, in metres and square metres."""
+
+THIN = 0.6
+"""Ratio of a corridor's width to that of the room that it leaves."""
+
+LONG = 3.0
+"""Minimum ratio of a corridor's length to its width."""
+
+MAX_CORRIDOR = 4.0
+"""Maximum width of a corridor in metres."""
+
+ENCLOSED = 0.6
+"""Minimum share of a room's outline that is wall or leads to another room."""
+
+RAYS = 72
+
+
+@dataclass(frozen=True, slots=True)
+class Door:
+    """Passage between two areas. ends: float64 [2, 2] x, y of its jambs in cells; sides: labels of the areas; is_wide:
+    whether it is too wide for a door; confidence: share of its width that walls continue."""
+
+    ends: NDArray[np.float64]
+    sides: tuple[int, int]
+    is_wide: bool
+    confidence: float
+
+    @property
+    def width(self) -> float:
+        """Return its width in cells."""
+        return float(np.hypot(*(self.ends[1] - self.ends[0])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rooms:
+    """Areas of a grid.
+
+    Attributes:
+        labels: int32 [h, w], 0 for none.
+        kinds: ``room`` or ``corridor``, by label.
+        widths: diameter in cells of the largest circle of ground in each.
+        enclosed: share of each outline that is wall or leads to another area.
+        doors: gaps between them.
+    """
+
+    labels: Labels
+    kinds: dict[int, str]
+    widths: dict[int, float]
+    enclosed: dict[int, float]
+    doors: list[Door]
+
+
+def rooms(free: Mask, occupied: Mask, cell: float) -> Rooms:
+    """Divide the free ground of a grid into rooms and corridors. cell: metres; grids have row 0 at the bottom."""
+    ground, wall = declutter(free, occupied, cell)
+    distance = cv2.distanceTransform(ground.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    labels = basins(distance, cell)
+    labels, doors = _join(labels, distance, wall, cell)
+    labels = _cut_corridors(labels, ground, distance, cell)
+    return _enclosed(labels, doors, ground, distance, wall, cell)
+
+
+def declutter(free: Mask, occupied: Mask, cell: float) -> tuple[Mask, Mask]:
+    """Return the ground and the walls, without furniture and small unknown pockets.
+
+    The masks must have a margin of unknown cells that is wider than a pocket.
+    """
+    furniture = _furniture(occupied, cell)
+    wall = occupied & ~furniture
+    unknown = ~free & ~occupied & ~furniture
+    depth = cv2.distanceTransform(unknown.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    core = (depth > POCKET / 2 / cell).astype(np.uint8)
+    if core.any():
+        wide = cv2.distanceTransform(1 - core, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        unknown &= wide <= POCKET / 2 / cell
+    return ~wall & ~unknown, wall
+
+
+def _furniture(occupied: Mask, cell: float) -> Mask:
+    """Return the cells of isolated obstacles that are no walls, with what they enclose."""
+    out = np.zeros(occupied.shape, np.uint8)
+    contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    for contour in contours:
+        _, sides, _ = cv2.minAreaRect(contour)
+        length, width = (max(sides) + 1.0) * cell, (min(sides) + 1.0) * cell
+        fills = (cv2.contourArea(contour) * cell * cell + 1e-9) / (length * width)
+        if np.hypot(length, width) <= CLUTTER or (length <= ISLAND and width > CLUTTER / 2 and fills >= BULK):
+            cv2.drawContours(out, [contour], -1, 1, cv2.FILLED)
+    return out == 1
+
+
+def basins(distance: Distance, cell: float) -> Labels:
+    """Label the basins of the distance to walls (cells), divided at necks."""
+    from app.derive import _kernels_rooms as kernels
+
+    inside = np.flatnonzero(distance > 0)
+    order = inside[np.argsort(-distance.ravel()[inside], kind="stable")]
+    labels = np.zeros(distance.shape, np.int32)
+    peak = np.zeros(len(order) + 2)
+    ratios = np.array([NECK, WIDE_NECK])
+    kernels.flood(distance, order, MAX_DOOR / 2 / cell, ratios, MIN_ROOM_WIDTH / 2 / cell, labels, peak)
+    return labels
+
+
+def _join(labels: Labels, distance: Distance, wall: Mask, cell: float) -> tuple[Labels, list[Door]]:
+    """Join basins that meet elsewhere than at a door; return the labels and the doors."""
+    parent = np.arange(int(labels.max()) + 1)
+
+    def top(k: int) -> int:
+        while parent[k] != k:
+            k = int(parent[k])
+        return k
+
+    candidates: list[Door] = []
+    for a, b, seam in _seams(labels):
+        door = _door(seam, distance, wall, cell, (a, b))
+        if door is None:
+            low, high = sorted((top(a), top(b)))
+            parent[high] = low
+        else:
+            candidates.append(door)
+    final = np.array([top(k) for k in range(len(parent))], np.int32)
+    doors = [
+        Door(d.ends, (int(final[d.sides[0]]), int(final[d.sides[1]])), d.is_wide, d.confidence) for d in candidates
+    ]
+    return final[labels], [d for d in doors if d.sides[0] != d.sides[1] and not d.is_wide]
+
+
+def _seams(labels: Labels) -> list[tuple[int, int, NDArray[np.int64]]]:
+    """Return the connected pieces of the lines where two basins meet: both labels, and cells [n, 2] (row, column)."""
+    cells: dict[tuple[int, int], list[NDArray[np.int64]]] = {}
+    for dy, dx in ((0, 1), (1, 0)):
+        first, second = labels[: len(labels) - dy, : labels.shape[1] - dx], labels[dy:, dx:]
+        met = np.argwhere((first != second) & (first > 0) & (second > 0))
+        pairs = np.sort(np.stack([first[tuple(met.T)], second[tuple(met.T)]], axis=1), axis=1)
+        for pair in np.unique(pairs, axis=0):
+            cells.setdefault((int(pair[0]), int(pair[1])), []).append(met[(pairs == pair).all(axis=1)])
+    out = []
+    for (a, b), pieces in sorted(cells.items()):
+        points = np.unique(np.concatenate(pieces), axis=0)
+        low = points.min(axis=0)
+        canvas = np.zeros(points.max(axis=0) - low + 1, np.uint8)
+        canvas[tuple((points - low).T)] = 1
+        _, piece = cv2.connectedComponents(cv2.dilate(canvas, np.ones((3, 3), np.uint8)), connectivity=8)
+        index = piece[tuple((points - low).T)]
+        out += [(a, b, points[index == k]) for k in np.unique(index)]
+    return out
+
+
+def _door(seam: NDArray[np.int64], distance: Distance, wall: Mask, cell: float, sides: tuple[int, int]) -> Door | None:
+    """Return the door at a seam, None if it is no door."""
+    row, column = seam[int(np.argmax(distance[tuple(seam.T)]))]
+    half = float(distance[row, column])
+    hits, ends = _rays(wall, int(row), int(column), int(max(MAX_DOOR / cell, 2.5 * half)))
+    pairs = hits[:, None] + hits[None, :]
+    turn = np.abs(np.arange(RAYS)[:, None] - np.arange(RAYS)[None, :])
+    opposite = np.abs(turn - RAYS // 2) <= RAYS // 8
+    pairs = np.where(opposite, pairs, np.inf)
+    i, k = np.unravel_index(int(np.argmin(pairs)), pairs.shape)
+    jambs = ends[[i, k]]
+    width = float(np.hypot(*(jambs[1] - jambs[0])))
+    if not np.isfinite(pairs[i, k]) or width * cell < MIN_DOOR:
+        return None
+    walls = _jambs(wall, jambs, width, cell) / width
+    if walls < JAMB:
+        return None
+    reach = half + 0.7 / cell
+    y0, y1 = max(0, int(row - reach)), int(row + reach) + 1
+    x0, x1 = max(0, int(column - reach)), int(column + reach) + 1
+    near = distance[y0:y1, x0:x1]
+    rows, columns = np.mgrid[y0 : y0 + near.shape[0], x0 : x0 + near.shape[1]]
+    along = (jambs[1] - jambs[0]) / max(width, 1e-9)
+    across = (rows - row) * along[0] - (columns - column) * along[1]
+    wider = (near > 1.15 * half) & (np.hypot(rows - row, columns - column) <= reach)
+    if not ((wider & (across > 0)).any() and (wider & (across < 0)).any()):
+        return None
+    return Door(jambs, sides, width * cell > MAX_DOOR, min(1.0, walls))
+
+
+def _jambs(wall: Mask, ends: NDArray[np.float64], width: float, cell: float) -> float:
+    """Return the length of the walls that continue the line of a gap, on both sides, in cells."""
+    along = (ends[1] - ends[0]) / width
+    reach = max(1, round(0.15 / cell))
+    aside = np.arange(-reach, reach + 1)[:, None] * np.array([-along[1], along[0]])
+    total = 0.0
+    for end, direction in ((ends[0], -along), (ends[1], along)):
+        steps = np.arange(int(2 * width) + 1)[:, None, None] * direction
+        at = np.rint(end + steps + aside).astype(int)
+        x, y = np.clip(at[..., 0], 0, wall.shape[1] - 1), np.clip(at[..., 1], 0, wall.shape[0] - 1)
+        gone = ~wall[y, x].any(axis=1)
+        total += float(np.argmax(gone)) if gone.any() else float(len(gone))
+    return total
+
+
+def _rays(wall: Mask, row: int, column: int, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return for rays from a cell the distance to the first wall (inf if none), and its position x, y [RAYS, 2]."""
+    angle = np.arange(RAYS) * (2 * np.pi / RAYS)
+    step = np.arange(1, length + 1)
+    y = np.rint(row + np.sin(angle)[:, None] * step).astype(int)
+    x = np.rint(column + np.cos(angle)[:, None] * step).astype(int)
+    inside = (y >= 0) & (y < wall.shape[0]) & (x >= 0) & (x < wall.shape[1])
+    hit = np.zeros(inside.shape, bool)
+    hit[inside] = wall[y[inside], x[inside]]
+    first = hit.argmax(axis=1)
+    some = hit.any(axis=1)
+    rays = np.arange(RAYS)
+    ends = np.stack([x[rays, first], y[rays, first]], axis=1).astype(np.float64)
+    return np.where(some, step[first].astype(np.float64), np.inf), ends
+
+
+def thickness(ground: Mask, distance: Distance) -> Distance:
+    """Return for each cell the radius of the largest disc of ground that covers it, in steps of a tenth."""
+    out = np.minimum(distance, 1.0).astype(np.float32)
+    radius, largest = 2.0, float(distance.max())
+    while radius < largest:
+        outside = (distance < radius).astype(np.uint8)
+        if not outside.all():
+            covered = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) < radius
+            out[covered & ground] = radius
+        radius *= 1.1
+    return out
+
+
+def _cut_corridors(labels: Labels, ground: Mask, distance: Distance, cell: float) -> Labels:
+    """Give long parts of a basin that are much narrower than it a label of their own."""
+    labels = labels.copy()
+    thick = thickness(ground, distance)
+    count = int(labels.max())
+    peak = np.zeros(count + 1)
+    np.maximum.at(peak, labels.ravel(), thick.ravel())
+    thin = (labels > 0) & (thick < THIN * peak[labels]) & (thick * cell >= 0.3) & (thick * cell <= MAX_CORRIDOR / 2)
+    for basin in range(1, count + 1):
+        part = (thin & (labels == basin)).astype(np.uint8)
+        if not part.any():
+            continue
+        pieces, piece, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
+        for k in range(1, pieces):
+            chosen = piece == k
+            area = float(stats[k, cv2.CC_STAT_AREA])
+            wide = 2.0 * float(np.median(thick[chosen]))
+            if area / wide < LONG * wide / 1.5 or area * cell * cell < MIN_ROOM_AREA:
+                continue
+            beside = cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
+            contact = np.count_nonzero(beside & ~chosen & (labels == basin))
+            if contact > 2.6 * wide:  # a strip along a room's side, not a corridor out of it
+                continue
+            count += 1
+            labels[chosen] = count
+    return labels
+
+
+def _enclosed(labels: Labels, doors: list[Door], ground: Mask, distance: Distance, wall: Mask, cell: float) -> Rooms:
+    """Drop basins that walls do not enclose or that are too small; classify the others."""
+    thick = thickness(ground, distance)
+    solid = cv2.dilate(wall.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
+    kinds: dict[int, str] = {}
+    widths: dict[int, float] = {}
+    enclosed: dict[int, float] = {}
+    count = int(labels.max())
+    for k, extent in enumerate(ndimage.find_objects(labels, count), 1):
+        if extent is None:
+            continue
+        y, x = extent
+        window = (slice(y.start - 1, y.stop + 1), slice(x.start - 1, x.stop + 1))  # labels keep off the border
+        chosen = labels[window] == k
+        area = np.count_nonzero(chosen) * cell * cell
+        wide = 2.0 * float(distance[window][chosen].max()) * cell
+        if area < MIN_ROOM_AREA or wide < 0.8 * MIN_ROOM_WIDTH:
+            continue
+        ring = (cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & ~chosen
+        share = np.count_nonzero(ring & (solid | (labels > 0))[window]) / np.count_nonzero(ring)
+        if share < ENCLOSED:
+            continue
+        middle = 2.0 * float(np.median(thick[window][chosen])) * cell
+        is_long = area / middle >= LONG * middle and max(middle, wide) <= MAX_CORRIDOR
+        kinds[k], widths[k], enclosed[k] = ("corridor" if is_long else "room"), wide / cell, share
+    kept = np.where(np.isin(labels, list(kinds)), labels, 0).astype(np.int32)
+    return Rooms(kept, kinds, widths, enclosed, [d for d in doors if {*d.sides} & kinds.keys()])
