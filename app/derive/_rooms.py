@@ -29,10 +29,14 @@ Distance = NDArray[np.float32]
 CLUTTER = 1.0
 """Maximum size of isolated obstacles that are furniture, in metres."""
 
-ISLAND = 6.0
+ISLAND = 8.0
+ISLAND_AREA = 15.0
 BULK = 0.5
-"""Maximum size of isolated obstacles that are furniture if they are no thin walls, in metres, and the share of their
-smallest rectangle that they then fill."""
+"""Isolated obstacles that are furniture if they are no thin walls and no rooms: maximum size in metres and square
+metres, and the minimum share of their smallest rectangle that they fill."""
+
+DASH = 0.1
+"""Gaps in metres within the outline of a piece of furniture."""
 
 POCKET = 1.6
 """Maximum width of unknown ground that counts as part of the room around it, in metres."""
@@ -64,6 +68,9 @@ MAX_CORRIDOR = 4.0
 
 ENCLOSED = 0.6
 """Minimum share of a room's outline that is wall or leads to another room."""
+
+SEEN = 0.25
+"""Minimum share of a room's cells that are free: less was not seen, or is the inside of an obstacle."""
 
 RAYS = 72
 
@@ -109,8 +116,11 @@ def rooms(free: Mask, occupied: Mask, cell: float) -> Rooms:
     distance = cv2.distanceTransform(ground.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     labels = basins(distance, cell)
     labels, doors = _join(labels, distance, wall, cell)
-    labels = _cut_corridors(labels, ground, distance, cell)
-    return _enclosed(labels, doors, ground, distance, wall, cell)
+    labels = _enclosed(labels, free, wall, distance, cell)
+    thick = thickness(ground, distance)
+    rooms_only = int(labels.max())
+    labels = _cut_corridors(labels, thick, cell)
+    return _classified(labels, doors, wall, distance, thick, cell, rooms_only)
 
 
 def declutter(free: Mask, occupied: Mask, cell: float) -> tuple[Mask, Mask]:
@@ -118,28 +128,48 @@ def declutter(free: Mask, occupied: Mask, cell: float) -> tuple[Mask, Mask]:
 
     The masks must have a margin of unknown cells that is wider than a pocket.
     """
-    furniture = _furniture(occupied, cell)
+    furniture = _furniture(occupied, free, cell)
     wall = occupied & ~furniture
     unknown = ~free & ~occupied & ~furniture
     depth = cv2.distanceTransform(unknown.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    core = (depth > POCKET / 2 / cell).astype(np.uint8)
-    if core.any():
-        wide = cv2.distanceTransform(1 - core, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        unknown &= wide <= POCKET / 2 / cell
+    count, piece = cv2.connectedComponents(unknown.astype(np.uint8), connectivity=4)
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, piece.ravel(), depth.ravel())
+    unknown &= (deepest > POCKET / 2 / cell)[piece]
     return ~wall & ~unknown, wall
 
 
-def _furniture(occupied: Mask, cell: float) -> Mask:
+def _furniture(occupied: Mask, free: Mask, cell: float) -> Mask:
     """Return the cells of isolated obstacles that are no walls, with what they enclose."""
     out = np.zeros(occupied.shape, np.uint8)
-    contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    for contour in contours:
+    size = 2 * max(1, round(DASH / 2 / cell)) + 1
+    joined = cv2.morphologyEx(occupied.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    for contour in outer_contours(joined):
         _, sides, _ = cv2.minAreaRect(contour)
         length, width = (max(sides) + 1.0) * cell, (min(sides) + 1.0) * cell
-        fills = (cv2.contourArea(contour) * cell * cell + 1e-9) / (length * width)
-        if np.hypot(length, width) <= CLUTTER or (length <= ISLAND and width > CLUTTER / 2 and fills >= BULK):
+        area = cv2.contourArea(contour) * cell * cell + 1e-9
+        is_bulky = length <= ISLAND and area <= ISLAND_AREA and width > CLUTTER / 2 and area >= BULK * length * width
+        if np.hypot(length, width) <= CLUTTER or (is_bulky and not _has_room(contour, free)):
             cv2.drawContours(out, [contour], -1, 1, cv2.FILLED)
     return out == 1
+
+
+def outer_contours(mask: NDArray[np.uint8]) -> list[NDArray[np.int32]]:
+    """Return the outer outline of each piece of a mask, also of those inside others."""
+    contours, tree = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    return (
+        [np.asarray(c, np.int32) for c, links in zip(contours, tree[0], strict=True) if links[3] < 0]
+        if len(contours)
+        else []
+    )
+
+
+def _has_room(contour: NDArray[np.int32], free: Mask) -> bool:
+    """Return whether most of what an obstacle encloses is free."""
+    x, y, width, height = cv2.boundingRect(contour)
+    inside = np.zeros((height, width), np.uint8)
+    cv2.drawContours(inside, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
+    return 2 * np.count_nonzero((inside == 1) & free[y : y + height, x : x + width]) > np.count_nonzero(inside)
 
 
 def basins(distance: Distance, cell: float) -> Labels:
@@ -274,10 +304,9 @@ def thickness(ground: Mask, distance: Distance) -> Distance:
     return out
 
 
-def _cut_corridors(labels: Labels, ground: Mask, distance: Distance, cell: float) -> Labels:
-    """Give long parts of a basin that are much narrower than it a label of their own."""
+def _cut_corridors(labels: Labels, thick: Distance, cell: float) -> Labels:
+    """Give long parts of a basin that are much narrower than it a label of their own, above the others."""
     labels = labels.copy()
-    thick = thickness(ground, distance)
     count = int(labels.max())
     peak = np.zeros(count + 1)
     np.maximum.at(peak, labels.ravel(), thick.ravel())
@@ -295,37 +324,67 @@ def _cut_corridors(labels: Labels, ground: Mask, distance: Distance, cell: float
                 continue
             beside = cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
             contact = np.count_nonzero(beside & ~chosen & (labels == basin))
-            if contact > 2.6 * wide:  # a strip along a room's side, not a corridor out of it
+            if contact > 3.6 * wide:  # a strip along a room's side, not a corridor out of it
                 continue
             count += 1
             labels[chosen] = count
     return labels
 
 
-def _enclosed(labels: Labels, doors: list[Door], ground: Mask, distance: Distance, wall: Mask, cell: float) -> Rooms:
-    """Drop basins that walls do not enclose or that are too small; classify the others."""
-    thick = thickness(ground, distance)
+def _enclosed(labels: Labels, free: Mask, wall: Mask, distance: Distance, cell: float) -> Labels:
+    """Drop basins that are too small, hidden, or enclosed neither by walls nor by other basins that stay."""
+    labels = labels.copy()
+    solid = cv2.dilate(wall.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
+    dropped = True
+    while dropped:
+        dropped = False
+        for k, window in _windows(labels):
+            chosen = labels[window] == k
+            area = np.count_nonzero(chosen)
+            wide = 2.0 * float(distance[window][chosen].max())
+            if (
+                area * cell * cell < MIN_ROOM_AREA
+                or wide * cell < 0.8 * MIN_ROOM_WIDTH
+                or np.count_nonzero(chosen & free[window]) < SEEN * area
+                or _enclosure(chosen, solid[window] | (labels[window] > 0)) < ENCLOSED
+            ):
+                labels[window][chosen] = 0
+                dropped = True
+    return labels
+
+
+def _windows(labels: Labels) -> list[tuple[int, tuple[slice, slice]]]:
+    """Return each label with a window around its cells; labels must keep off the border."""
+    return [
+        (k, (slice(e[0].start - 1, e[0].stop + 1), slice(e[1].start - 1, e[1].stop + 1)))
+        for k, e in enumerate(ndimage.find_objects(labels), 1)
+        if e is not None
+    ]
+
+
+def _enclosure(chosen: Mask, border: Mask) -> float:
+    """Return the share of an area's outer outline that is border."""
+    filled = ndimage.binary_fill_holes(chosen)  # what stands inside encloses nothing
+    ring = (cv2.dilate(filled.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & ~filled
+    return np.count_nonzero(ring & border) / max(1, np.count_nonzero(ring))
+
+
+def _classified(
+    labels: Labels, doors: list[Door], wall: Mask, distance: Distance, thick: Distance, cell: float, last_room: int
+) -> Rooms:
+    """Return the areas with their kinds: a corridor is long, and leads on at two places or more."""
     solid = cv2.dilate(wall.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
     kinds: dict[int, str] = {}
     widths: dict[int, float] = {}
     enclosed: dict[int, float] = {}
-    count = int(labels.max())
-    for k, extent in enumerate(ndimage.find_objects(labels, count), 1):
-        if extent is None:
-            continue
-        y, x = extent
-        window = (slice(y.start - 1, y.stop + 1), slice(x.start - 1, x.stop + 1))  # labels keep off the border
+    for k, window in _windows(labels):
         chosen = labels[window] == k
-        area = np.count_nonzero(chosen) * cell * cell
-        wide = 2.0 * float(distance[window][chosen].max()) * cell
-        if area < MIN_ROOM_AREA or wide < 0.8 * MIN_ROOM_WIDTH:
-            continue
-        ring = (cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & ~chosen
-        share = np.count_nonzero(ring & (solid | (labels > 0))[window]) / np.count_nonzero(ring)
-        if share < ENCLOSED:
-            continue
-        middle = 2.0 * float(np.median(thick[window][chosen])) * cell
-        is_long = area / middle >= LONG * middle and max(middle, wide) <= MAX_CORRIDOR
-        kinds[k], widths[k], enclosed[k] = ("corridor" if is_long else "room"), wide / cell, share
-    kept = np.where(np.isin(labels, list(kinds)), labels, 0).astype(np.int32)
-    return Rooms(kept, kinds, widths, enclosed, [d for d in doors if {*d.sides} & kinds.keys()])
+        widths[k] = 2.0 * float(distance[window][chosen].max())
+        enclosed[k] = _enclosure(chosen, solid[window] | (labels[window] > 0))
+        middle = 2.0 * float(np.median(thick[window][chosen]))
+        is_long = np.count_nonzero(chosen) >= LONG * middle**2 and max(middle, widths[k]) * cell <= MAX_CORRIDOR
+        beside = (cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & (labels[window] > 0) & ~chosen
+        exits, _ = cv2.connectedComponents(beside.astype(np.uint8), connectivity=8)
+        ways = max(exits - 1, sum(k in door.sides for door in doors))
+        kinds[k] = "corridor" if k > last_room or (is_long and ways > 1) else "room"
+    return Rooms(labels, kinds, widths, enclosed, [d for d in doors if {*d.sides} & kinds.keys()])

@@ -10,10 +10,14 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+
+from app.derive._rooms import outer_contours
 
 Mask = NDArray[np.bool_]
 Points = NDArray[np.float64]
@@ -45,6 +49,15 @@ OVERLAP = 0.6
 
 CLEAR = 0.97
 """Minimum share of a strip's cells that are not occupied."""
+
+JOIN = 0.2
+"""Gaps in metres within one obstacle: scans draw outlines in dashes."""
+
+ALIKE = 0.12
+"""Maximum deviation of a step from that of another chain, as a share of it."""
+
+NEAREST = 10
+"""Number of nearest obstacles among which neighbours in a chain are sought."""
 
 MAX_PIECES = 20_000
 """Maximum number of small obstacles in which chains are sought."""
@@ -79,18 +92,27 @@ def strips(occupied: Mask, free: Mask, cell: float) -> list[Strip]:
     out = []
     for one, other in itertools.combinations(lines, 2):
         strip = _strip(one, other, cell)
-        if strip is not None and _is_clear(strip, occupied, free):
+        if strip is not None and _is_clear(strip, occupied, free) and not _is_divided(strip, lines, (one, other)):
             out.append(strip)
     return out
 
 
+def _is_divided(strip: Strip, lines: list[Line], flanks: tuple[Line, Line]) -> bool:
+    """Return whether another line runs along a strip."""
+    inner = shapely.Polygon(strip.corners)
+    length = float(np.hypot(*(strip.corners[3] - strip.corners[0])))
+    others = [shapely.LineString(line.ends) for line in lines if line is not flanks[0] and line is not flanks[1]]
+    return any(line.intersection(inner).length > length / 4 for line in others)
+
+
 def obstacle_lines(occupied: Mask, cell: float) -> list[Line]:
     """Return the lines of obstacles, the longest first."""
-    contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    size = 2 * max(1, round(JOIN / 2 / cell)) + 1
+    joined = cv2.morphologyEx(occupied.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
     out: list[Line] = []
     middles: list[Points] = []
     sizes: list[float] = []
-    for contour in contours:
+    for contour in outer_contours(joined):
         box = cv2.minAreaRect(contour)
         length, width = max(box[1]) + 1.0, min(box[1]) + 1.0
         corners = cv2.boxPoints(box).astype(np.float64)
@@ -101,49 +123,119 @@ def obstacle_lines(occupied: Mask, cell: float) -> list[Line]:
             order = corners if np.hypot(*(corners[1] - corners[0])) <= width else np.roll(corners, 1, axis=0)
             out.append(Line(np.array([order[:2].mean(axis=0), order[2:].mean(axis=0)]), width))
     if CHAIN <= len(middles) <= MAX_PIECES:
-        out += _chains(np.array(middles), np.array(sizes), cell)
+        out += _chains(*_outermost(np.array(middles), np.array(sizes)), cell)
     return sorted(out, key=lambda line: (-line.length, *line.ends.ravel().tolist()))
 
 
-def _chains(middles: Points, sizes: NDArray[np.float64], cell: float) -> list[Line]:
-    """Return the chains of small obstacles, the longest first; each obstacle is in one."""
+def _outermost(middles: Points, sizes: NDArray[np.float64]) -> tuple[Points, NDArray[np.float64]]:
+    """Drop obstacles that lie within a larger one's circle: goods on a pallet, legs of a shelf."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(middles)
-    near = tree.query_pairs(PITCH / cell, output_type="ndarray")
-    near = near[np.lexsort((near[:, 1], near[:, 0]))]
-    alike = np.maximum(sizes[near[:, 0]], sizes[near[:, 1]]) <= 2.5 * np.minimum(*sizes[near].T) + 0.2 / cell
-    found: list[list[int]] = []
+    stays = np.ones(len(middles), bool)
+    for k in np.argsort(-sizes, kind="stable").tolist():
+        if stays[k]:
+            inside = [n for n in tree.query_ball_point(middles[k], sizes[k] / 2) if n != k and sizes[n] <= sizes[k]]
+            stays[inside] = False
+    return middles[stays], sizes[stays]
+
+
+def _chains(middles: Points, sizes: NDArray[np.float64], cell: float) -> list[Line]:
+    """Return the chains of small obstacles, the longest first; each obstacle is in one.
+
+    Chains are sought between nearest neighbours; then, since other obstacles may stand between, also between farther
+    ones, in the directions and with the steps of the chains that were found.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(middles)
+    close = _neighbours(tree, middles, sizes, cell)
+    chains = _longest(_walks(tree, middles, sizes, close, cell), middles, set(), cell)
+    steps = [np.median(np.diff(middles[chain], axis=0), axis=0) for chain in chains]
+    used = {k for chain in chains for k in chain}
+    if steps:
+        pairs = tree.query_pairs(PITCH / cell, output_type="ndarray")
+        pairs = pairs[~np.isin(pairs, list(used)).any(axis=1)]
+        pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+        apart = middles[pairs[:, 1]] - middles[pairs[:, 0]]
+        alike = np.zeros(len(pairs), bool)
+        for step in steps:
+            off = np.minimum(np.hypot(*(apart - step).T), np.hypot(*(apart + step).T))
+            alike |= off <= ALIKE * float(np.hypot(*step))
+        chains += _longest(_walks(tree, middles, sizes, pairs[alike], cell), middles, used, cell)
+    return [Line(middles[[chain[0], chain[-1]]], float(np.median(sizes[chain]))) for chain in chains]
+
+
+def _walks(
+    tree: Any, middles: Points, sizes: NDArray[np.float64], pairs: NDArray[np.int64], cell: float
+) -> list[list[int]]:
+    """Return the chains that begin with pairs of obstacles of like size."""
+    alike = _are_alike(sizes[pairs[:, 0]], sizes[pairs[:, 1]], cell)
+    out: list[list[int]] = []
     seen: set[tuple[int, int]] = set()
-    for a, b in near[alike].tolist():
-        if (a, b) in seen:
-            continue
-        chain = [*_walk(tree, middles, b, a, cell)[::-1], *_walk(tree, middles, a, b, cell)]
-        seen.update((min(p), max(p)) for p in itertools.pairwise(chain))
-        if len(chain) >= CHAIN:
-            found.append(chain)
-    out: list[Line] = []
-    used: set[int] = set()
-    for chain in sorted(found, key=lambda c: (-float(np.hypot(*(middles[c[-1]] - middles[c[0]]))), c)):
-        length = float(np.hypot(*(middles[chain[-1]] - middles[chain[0]])))
-        if length < MIN_LENGTH / cell or len(used.intersection(chain)) > len(chain) / 4:
-            continue
-        used.update(chain)
-        out.append(Line(middles[[chain[0], chain[-1]]], float(np.median(sizes[chain]))))
+    for a, b in pairs[alike].tolist():
+        if (a, b) not in seen:
+            chain = [*_walk(tree, middles, sizes, b, a, cell)[::-1], *_walk(tree, middles, sizes, a, b, cell)]
+            seen.update((min(p), max(p)) for p in itertools.pairwise(chain))
+            out.append(chain)
     return out
 
 
-def _walk(tree: object, middles: Points, first: int, second: int, cell: float) -> list[int]:
+def _longest(chains: list[list[int]], middles: Points, used: set[int], cell: float) -> list[list[int]]:
+    """Return the longest chains that hardly share obstacles."""
+    used = set(used)
+    out = []
+    lengths = [float(np.hypot(*(middles[chain[-1]] - middles[chain[0]]))) for chain in chains]
+    for length, chain in sorted(zip(lengths, chains, strict=True), key=lambda item: (-item[0], item[1])):
+        if len(chain) >= CHAIN and length >= MIN_LENGTH / cell and len(used.intersection(chain)) <= len(chain) / 4:
+            used.update(chain)
+            out.append(chain)
+    return out
+
+
+def _are_alike(one: NDArray[np.float64], other: NDArray[np.float64], cell: float) -> NDArray[np.bool_]:
+    """Return where two sizes may be those of the same kind of obstacle."""
+    return np.asarray(np.maximum(one, other) <= 2.0 * np.minimum(one, other) + 0.1 / cell)
+
+
+def _neighbours(tree: Any, middles: Points, sizes: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
+    """Return the pairs within reach of which no third obstacle of their size is nearer to both: int64 [n, 2].
+
+    The relative neighbourhood graph (Toussaint, 1980): in a lattice its sides, and not its diagonals.
+    """
+    count = min(NEAREST + 1, len(middles))
+    distance, index = tree.query(middles, k=count)
+    near = np.stack([np.repeat(np.arange(len(middles)), count - 1), index[:, 1:].ravel()], axis=1)
+    length = distance[:, 1:].ravel()
+    near, length = near[length <= PITCH / cell], length[length <= PITCH / cell]
+    pairs, first = np.unique(np.sort(near, axis=1), axis=0, return_index=True)
+    length = length[first]
+    good = np.ones(len(pairs), bool)
+    for side in (0, 1):
+        witness = index[pairs[:, side], 1:]
+        to_own, to_other = (
+            distance[pairs[:, side], 1:],
+            np.hypot(*np.moveaxis(middles[witness] - middles[pairs[:, 1 - side]][:, None], 2, 0)),
+        )
+        alike = _are_alike(sizes[witness], sizes[pairs[:, side]][:, None], cell)
+        good &= ~((to_own < 0.98 * length[:, None]) & (to_other < 0.98 * length[:, None]) & alike).any(axis=1)
+    return np.asarray(pairs[good])
+
+
+def _walk(tree: Any, middles: Points, sizes: NDArray[np.float64], first: int, second: int, cell: float) -> list[int]:
     """Continue from a pair of obstacles in equal steps; return those from the second on."""
     out = [second]
     step = middles[second] - middles[first]
     at = second
     while True:
-        distance, k = tree.query(middles[at] + step)  # type: ignore[attr-defined]
-        if distance > 0.12 * float(np.hypot(*step)) + 0.05 / cell or k in out or k == first:
+        tolerance = ALIKE * float(np.hypot(*step)) + 0.05 / cell + sizes[at] / 4
+        for times in (1, 2):  # one of them may not have been seen
+            distance, k = tree.query(middles[at] + times * step)
+            if distance <= times * tolerance and k not in out and k != first:
+                break
+        else:
             return out
-        made = middles[k] - middles[at]
-        step = 0.7 * step + 0.3 * made
+        step = 0.7 * step + 0.3 * (middles[k] - middles[at]) / times
         out.append(int(k))
         at = int(k)
 
@@ -192,6 +284,7 @@ def _is_clear(strip: Strip, occupied: Mask, free: Mask) -> bool:
     high = np.ceil(strip.corners.max(axis=0)).astype(int) + 1
     mask = np.zeros((high - low)[::-1], np.uint8)
     cv2.fillPoly(mask, [np.rint(strip.corners - low).astype(np.int32)], 1)
+    mask = cv2.erode(mask, np.ones((5, 5), np.uint8))  # the lines beside it are as wide as their cells, or a step more
     window = (slice(low[1], high[1]), slice(low[0], high[0]))
     inside = mask[: occupied[window].shape[0], : occupied[window].shape[1]] == 1
     count = np.count_nonzero(inside)

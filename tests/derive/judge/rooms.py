@@ -147,12 +147,13 @@ def _iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
 
 def _room_figures(labels: Mapping[str, Any], found: list[Area], grid: OccupancyGrid) -> Iterable[Figure]:
     wanted = [_cells(shapely.Polygon(a["outline"]), grid) for a in labels.get("areas", [])]
-    derived = [a for a in found if a.kind in AREA_KINDS]
-    ignored = [_cells(shapely.Polygon(outline), grid) for outline in labels.get("ignore", [])]
-    counted = [a for a in derived if not any(_share(a.cells, there) > 0.5 for there in ignored)]
+    derived = [a for a in found if a.kind in ("room", "corridor")]
+    ignored = np.zeros(grid.cells.shape, bool)
+    for outline in labels.get("ignore", []):
+        ignored |= _cells(shapely.Polygon(outline), grid)
+    counted = [a for a in derived if _share(a.cells, ignored) <= 0.5]
     if not wanted:
-        rooms = sum(a.kind in ("room", "corridor") for a in counted)
-        yield Figure("false rooms", rooms, at_most=0)
+        yield Figure("false rooms", len(counted), at_most=0)
         return
     pairs = {(i, k): _iou(cells, a.cells) for i, cells in enumerate(wanted) for k, a in enumerate(derived)}
     matched = [pair for pair, iou in pairs.items() if iou >= IOU]  # above a half, so each is in one pair only
@@ -206,9 +207,10 @@ def _door_figures(labels: Mapping[str, Any], found: list[Area]) -> Iterable[Figu
 
 def _line_figures(labels: Mapping[str, Any], found: list[Area]) -> Iterable[Figure]:
     lines = [shapely.LineString(one["line"]) for one in labels.get("lines", [])]
-    if not lines:
-        return
     derived = [a for a in found if a.kind in ("aisle", "row")]
+    if not lines:
+        yield Figure("false aisles and rows", len(derived), at_most=0)
+        return
     shares = np.array([[a.shape.intersection(line).length / line.length for a in derived] for line in lines])
     covers = shares.reshape(len(lines), len(derived)) >= COVERED
     alone = covers & (covers.sum(axis=0) == 1)
