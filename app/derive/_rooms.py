@@ -143,7 +143,9 @@ def _furniture(occupied: Mask, free: Mask, cell: float) -> Mask:
     """Return the cells of isolated obstacles that are no walls, with what they enclose."""
     out = np.zeros(occupied.shape, np.uint8)
     size = 2 * max(1, round(DASH / 2 / cell)) + 1
-    joined = cv2.morphologyEx(occupied.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    joined = np.asarray(
+        cv2.morphologyEx(occupied.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)), np.uint8
+    )
     for contour in outer_contours(joined):
         _, sides, _ = cv2.minAreaRect(contour)
         length, width = (max(sides) + 1.0) * cell, (min(sides) + 1.0) * cell

@@ -108,7 +108,9 @@ def _is_divided(strip: Strip, lines: list[Line], flanks: tuple[Line, Line]) -> b
 def obstacle_lines(occupied: Mask, cell: float) -> list[Line]:
     """Return the lines of obstacles, the longest first."""
     size = 2 * max(1, round(JOIN / 2 / cell)) + 1
-    joined = cv2.morphologyEx(occupied.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    joined = np.asarray(
+        cv2.morphologyEx(occupied.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)), np.uint8
+    )
     out: list[Line] = []
     middles: list[Points] = []
     sizes: list[float] = []
@@ -163,7 +165,17 @@ def _chains(middles: Points, sizes: NDArray[np.float64], cell: float) -> list[Li
             off = np.minimum(np.hypot(*(apart - step).T), np.hypot(*(apart + step).T))
             alike |= off <= ALIKE * float(np.hypot(*step))
         chains += _longest(_walks(tree, middles, sizes, pairs[alike], cell), middles, used, cell)
-    return [Line(middles[[chain[0], chain[-1]]], float(np.median(sizes[chain]))) for chain in chains]
+    return [_chain_line(middles[chain], sizes[chain]) for chain in chains]
+
+
+def _chain_line(middles: Points, sizes: NDArray[np.float64]) -> Line:
+    """Return the line that fits a chain best, from the outer side of its first obstacle to that of its last."""
+    centre = middles.mean(axis=0)
+    along = np.linalg.svd(middles - centre)[2][0]
+    along = along if along @ (middles[-1] - middles[0]) > 0 else -along
+    begin = (middles[0] - centre) @ along - sizes[0] / 2
+    end = (middles[-1] - centre) @ along + sizes[-1] / 2
+    return Line(np.array([centre + begin * along, centre + end * along]), float(np.median(sizes)))
 
 
 def _walks(
@@ -193,7 +205,7 @@ def _longest(chains: list[list[int]], middles: Points, used: set[int], cell: flo
     return out
 
 
-def _are_alike(one: NDArray[np.float64], other: NDArray[np.float64], cell: float) -> NDArray[np.bool_]:
+def _are_alike(one: Any, other: Any, cell: float) -> NDArray[np.bool_]:
     """Return where two sizes may be those of the same kind of obstacle."""
     return np.asarray(np.maximum(one, other) <= 2.0 * np.minimum(one, other) + 0.1 / cell)
 
@@ -231,7 +243,8 @@ def _walk(tree: Any, middles: Points, sizes: NDArray[np.float64], first: int, se
         tolerance = ALIKE * float(np.hypot(*step)) + 0.05 / cell + sizes[at] / 4
         for times in (1, 2):  # one of them may not have been seen
             distance, k = tree.query(middles[at] + times * step)
-            if distance <= times * tolerance and k not in out and k != first:
+            alike = bool(_are_alike(sizes[at], sizes[k], cell))
+            if alike and distance <= times * tolerance and k not in out and k != first:
                 break
         else:
             return out
