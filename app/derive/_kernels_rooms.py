@@ -38,8 +38,8 @@ def flood(distance: F32, order: I64, door: float, ratios: F64, least: float, lab
     near = np.empty(8, np.int32)
     for cell in order:
         y, x = cell // width, cell % width
-        here = distance[y, x]
-        found = 0
+        depth = distance[y, x]
+        met = 0
         best = 0
         highest = np.float32(-1.0)
         for dy in range(-1, 2):
@@ -50,26 +50,26 @@ def flood(distance: F32, order: I64, door: float, ratios: F64, least: float, lab
                 basin = root(parent, other)
                 if distance[y + dy, x + dx] > highest:
                     highest, best = distance[y + dy, x + dx], basin
-                known = False
-                for k in range(found):
-                    known = known or near[k] == basin
-                if not known:
-                    near[found] = basin
-                    found += 1
-        if found == 0:
+                is_listed = False
+                for k in range(met):
+                    is_listed = is_listed or near[k] == basin
+                if not is_listed:
+                    near[met] = basin
+                    met += 1
+        if met == 0:
             count += 1
             parent[count] = count
-            peak[count] = here
+            peak[count] = depth
             label[y, x] = count
             continue
         label[y, x] = best
-        for k in range(found):
+        for k in range(met):
             for j in range(k):
                 a, b = root(parent, near[j]), root(parent, near[k])
                 if a == b:
                     continue
                 smaller = min(peak[a], peak[b])
-                if here < (ratios[0] if here <= door else ratios[1]) * smaller and smaller >= least:
+                if depth < (ratios[0] if depth <= door else ratios[1]) * smaller and smaller >= least:
                     continue
                 keep, drop = (a, b) if peak[a] >= peak[b] else (b, a)
                 parent[drop] = keep

@@ -113,7 +113,7 @@ class Rooms:
 def rooms(free: Mask, occupied: Mask, cell: float) -> Rooms:
     """Divide the free ground of a grid into rooms and corridors. cell: metres; grids have row 0 at the bottom."""
     ground, wall = declutter(free, occupied, cell)
-    distance = cv2.distanceTransform(ground.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = distances(ground)
     labels = basins(distance, cell)
     labels, doors = _join(labels, distance, wall, cell)
     labels = _enclosed(labels, free, wall, distance, cell)
@@ -121,6 +121,11 @@ def rooms(free: Mask, occupied: Mask, cell: float) -> Rooms:
     rooms_only = int(labels.max())
     labels = _cut_corridors(labels, thick, cell)
     return _classified(labels, doors, wall, distance, thick, cell, rooms_only)
+
+
+def distances(mask: Mask) -> Distance:
+    """Return the distance of each cell of a mask to the nearest other cell, in cells."""
+    return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
 def declutter(free: Mask, occupied: Mask, cell: float) -> tuple[Mask, Mask]:
@@ -131,10 +136,10 @@ def declutter(free: Mask, occupied: Mask, cell: float) -> tuple[Mask, Mask]:
     furniture = _furniture(occupied, free, cell)
     wall = occupied & ~furniture
     unknown = ~free & ~occupied & ~furniture
-    depth = cv2.distanceTransform(unknown.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    count, piece = cv2.connectedComponents(unknown.astype(np.uint8), connectivity=4)
-    deepest = np.zeros(count)
-    np.maximum.at(deepest, piece.ravel(), depth.ravel())
+    depth = distances(unknown)
+    piece, count = ndimage.label(unknown)
+    deepest = np.zeros(count + 1)
+    np.maximum.at(deepest, np.asarray(piece, np.int64).ravel(), depth.ravel())
     unknown &= (deepest > POCKET / 2 / cell)[piece]
     return ~wall & ~unknown, wall
 
@@ -153,7 +158,7 @@ def _furniture(occupied: Mask, free: Mask, cell: float) -> Mask:
         is_bulky = length <= ISLAND and area <= ISLAND_AREA and width > CLUTTER / 2 and area >= BULK * length * width
         if np.hypot(length, width) <= CLUTTER or (is_bulky and not _has_room(contour, free)):
             cv2.drawContours(out, [contour], -1, 1, cv2.FILLED)
-    return out == 1
+    return np.asarray(out == 1)
 
 
 def outer_contours(mask: NDArray[np.uint8]) -> list[NDArray[np.int32]]:
@@ -171,7 +176,8 @@ def _has_room(contour: NDArray[np.int32], free: Mask) -> bool:
     x, y, width, height = cv2.boundingRect(contour)
     inside = np.zeros((height, width), np.uint8)
     cv2.drawContours(inside, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
-    return 2 * np.count_nonzero((inside == 1) & free[y : y + height, x : x + width]) > np.count_nonzero(inside)
+    count = np.count_nonzero((inside == 1) & free[y : y + height, x : x + width])
+    return bool(2 * count > np.count_nonzero(inside))
 
 
 def basins(distance: Distance, cell: float) -> Labels:
@@ -298,9 +304,9 @@ def thickness(ground: Mask, distance: Distance) -> Distance:
     out = np.minimum(distance, 1.0).astype(np.float32)
     radius, largest = 2.0, float(distance.max())
     while radius < largest:
-        outside = (distance < radius).astype(np.uint8)
+        outside = distance < radius
         if not outside.all():
-            covered = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) < radius
+            covered = distances(outside) < radius
             out[covered & ground] = radius
         radius *= 1.1
     return out
@@ -368,7 +374,7 @@ def _enclosure(chosen: Mask, border: Mask) -> float:
     """Return the share of an area's outer outline that is border."""
     filled = ndimage.binary_fill_holes(chosen)  # what stands inside encloses nothing
     ring = (cv2.dilate(filled.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & ~filled
-    return np.count_nonzero(ring & border) / max(1, np.count_nonzero(ring))
+    return float(np.count_nonzero(ring & border)) / max(1.0, float(np.count_nonzero(ring)))
 
 
 def _classified(

@@ -75,10 +75,10 @@ def occupancy_to_zones(layers: Layers, parameters: Parameters, notes: Derivation
     """
     parts: dict[PartKey, Part] = {}
     for key, grid in select_grids(layers, parameters.grid, "areas").items():
-        found = areas(as_planned(grid, grid_label(key), notes.warn), notes, grid_label(key))
-        if found:
+        unnamed = areas(as_planned(grid, grid_label(key), notes.warn), notes, grid_label(key))
+        if unnamed:
             stored = layers.vector("zones", key.level).get(PartKey("zones", key.level, AREAS))
-            rows = keep_names(found, stored, layers.frame)
+            rows = keep_names(unnamed, stored, layers.frame)
             parts[PartKey("zones", key.level, AREAS)] = features(rows, "local")
     if not parts:
         raise CannotConvert(
@@ -93,8 +93,8 @@ def areas(grid: OccupancyGrid, notes: DerivationNotes, called: str) -> list[Area
     """Return the areas of a grid, in metres of the local frame. called: name of the grid for messages."""
     from app.derive import _rooms, _strips
 
-    known = grid.cells <= OCCUPIED
-    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    seen = grid.cells <= OCCUPIED
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     if not len(rows) or not (grid.cells == FREE).any():
         return []
     cells = grid.cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
