@@ -120,11 +120,12 @@ def _node(net: _Net, place: Place, titles: dict[int, str]) -> int | None:
     if place.area is not None:
         distance[~shapely.contains_xy(place.area, xy)] = np.inf
     node = int(np.argmin(distance))
-    if distance[node] > (SNAP if np.isfinite(place.reach) else np.inf) or not np.isfinite(distance[node]):
-        divided = _divide(net, place) if np.isfinite(place.reach) else None
-        if divided is None and not distance[node] <= place.reach:
-            return None
-        node = node if divided is None else divided
+    near = float(distance[node])
+    if near > SNAP and np.isfinite(place.reach):
+        divided = _divide(net, place)
+        node, near = (node, near) if divided is None else (divided, 0.0)
+    if not np.isfinite(near) or near > place.reach:
+        return None
     net.used.add(node)
     titles[node] = place.name
     return node

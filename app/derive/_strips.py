@@ -78,11 +78,11 @@ class Line:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strip:
-    """Free strip. corners: float64 [4, 2] x, y in cells, the first two at one end. flanks: width of the lines beside
-    it. facing: share of the shorter line that it covers."""
+    """Free strip. corners: float64 [4, 2] x, y in cells, the first two at one end. flanks: the lines beside it.
+    facing: share of the shorter line that it covers."""
 
     corners: Points
-    flanks: tuple[float, float]
+    flanks: tuple[Line, Line]
     facing: float
 
 
@@ -92,16 +92,29 @@ def strips(occupied: Mask, free: Mask, cell: float) -> list[Strip]:
     out = []
     for one, other in itertools.combinations(lines, 2):
         strip = _strip(one, other, cell)
-        if strip is not None and _is_clear(strip, occupied, free) and not _is_divided(strip, lines, (one, other)):
+        if strip is not None and _is_clear(strip, occupied, free) and not _is_divided(strip, lines):
             out.append(strip)
     return out
 
 
-def _is_divided(strip: Strip, lines: list[Line], flanks: tuple[Line, Line]) -> bool:
+def flank_cells(aisles: list[Strip], occupied: Mask) -> Mask:
+    """Return the cells of the lines beside strips: racks and plants, which divide no rooms."""
+    mask = np.zeros(occupied.shape, np.uint8)
+    for line in (line for strip in aisles for line in strip.flanks):
+        along = (line.ends[1] - line.ends[0]) / max(line.length, 1e-9)
+        aside = np.array([-along[1], along[0]]) * (line.width / 2 + 1.0)
+        ahead = along * 1.0
+        (a, b) = line.ends
+        corners = np.array([a - ahead - aside, b + ahead - aside, b + ahead + aside, a - ahead + aside])
+        cv2.fillPoly(mask, [np.rint(corners).astype(np.int32)], 1)
+    return np.asarray(mask == 1)
+
+
+def _is_divided(strip: Strip, lines: list[Line]) -> bool:
     """Return whether another line runs along a strip."""
     inner = shapely.Polygon(strip.corners)
     length = float(np.hypot(*(strip.corners[3] - strip.corners[0])))
-    others = [shapely.LineString(line.ends) for line in lines if line is not flanks[0] and line is not flanks[1]]
+    others = [shapely.LineString(line.ends) for line in lines if all(line is not flank for flank in strip.flanks)]
     return any(line.intersection(inner).length > length / 4 for line in others)
 
 
@@ -288,13 +301,13 @@ def _strip(one: Line, other: Line, cell: float) -> Strip | None:
         near = one.ends[0] + along * place + side * across * one.width / 2
         corners.append((near, far) if place == begin else (far, near))
     facing = (end - begin) / min(one.length, other.length)
-    return Strip(np.array([*corners[0], *corners[1]]), (one.width, other.width), min(1.0, facing))
+    return Strip(np.array([*corners[0], *corners[1]]), (one, other), min(1.0, facing))
 
 
 def _is_clear(strip: Strip, occupied: Mask, free: Mask) -> bool:
     """Return whether a strip's cells are free."""
-    low = np.maximum(np.floor(strip.corners.min(axis=0)).astype(int), 0)
-    high = np.ceil(strip.corners.max(axis=0)).astype(int) + 1
+    low = np.maximum(np.floor(strip.corners.min(axis=0)).astype(int) - 2, 0)  # a border, so that erosion begins there
+    high = np.ceil(strip.corners.max(axis=0)).astype(int) + 3
     mask = np.zeros((high - low)[::-1], np.uint8)
     cv2.fillPoly(mask, [np.rint(strip.corners - low).astype(np.int32)], 1)
     mask = cv2.erode(mask, np.ones((5, 5), np.uint8))  # the lines beside it are as wide as their cells, or a step more

@@ -107,12 +107,13 @@ def areas(grid: OccupancyGrid, notes: DerivationNotes, called: str) -> list[Area
     free, occupied = _reduced(cells, factor, grid.occupied_thresh, margin)
     corner = np.array([columns[0] - margin * factor, rows[0] - margin * factor]) * grid.resolution
     place = _Place(grid.origin, corner, cell)
-    rooms = _rooms.rooms(free, occupied, cell)
-    out = [*_room_areas(rooms, place)]
+    aisles = _strips.strips(occupied, free, cell)
+    flanks = _strips.flank_cells(aisles, occupied)
+    out = [*_room_areas(_rooms.rooms(free | flanks, occupied & ~flanks, cell), place)]
     halls = shapely.union_all([shape for _, shape, _ in out])
-    for strip in _strips.strips(occupied, free, cell):
+    for strip in aisles:
         shape = shapely.Polygon(place.metres(strip.corners + 0.5))
-        thin = max(strip.flanks) * cell <= THIN_FLANK
+        thin = max(line.width for line in strip.flanks) * cell <= THIN_FLANK
         kind = "row" if thin and not halls.contains(shapely.centroid(shape)) else "aisle"
         width = 2 * shape.area / (shape.length - 2 * shape.area / _length(shape))
         words = {"width": round(float(width), 2), "confidence": round(strip.facing, 2)}
