@@ -84,3 +84,10 @@ def flood(distance: F32, order: I64, door: float, ratios: F64, least: float, lab
                     number[basin] = used
                 label[y, x] = number[basin]
     return used
+
+
+def compile_all() -> None:
+    """Compile all kernels: call each one once on a tiny grid."""
+    distance = np.zeros((3, 3), np.float32)
+    distance[1, 1] = 1.0
+    flood(distance, np.array([4]), 1.0, np.ones(2), 1.0, np.zeros((3, 3), np.int32), np.zeros(3))

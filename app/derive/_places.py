@@ -26,9 +26,11 @@ ENDS = ("in", "out")
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Point that gets a named node. reach: maximum distance of the network. area: polygon that the node must be in."""
+    """Point that gets a named node. owner: name of its area. reach: maximum distance of the network. area: polygon that
+    the node must be in."""
 
     name: str
+    owner: str
     at: tuple[float, float]
     reach: float
     area: Any = None
@@ -55,7 +57,7 @@ def named(network: Features, layers: Layers, level: str) -> tuple[Features, int]
     if not areas or not len(network):
         return network, 0
     net = _net(network)
-    titles: dict[int, str] = {}
+    titles: dict[int, Place] = {}
     missing = 0
     for kind, name, shape in sorted(areas, key=lambda area: (AREA_KINDS.index(area[0]) < 2, area[1])):
         hits = [node for place in _places(kind, name, shape) if (node := _node(net, place, titles)) is not None]
@@ -84,18 +86,18 @@ def _places(kind: str, name: str, shape: Any) -> list[Place]:
     sides = np.hypot(*np.diff(corners[:4], axis=0, append=corners[:1]).T)
     middle = shapely.centroid(shape)
     if kind == "door":
-        return [Place(name, (middle.x, middle.y), max(SNAP, float(sides.max()) / 2))]
+        return [Place(name, "", (middle.x, middle.y), max(SNAP, float(sides.max()) / 2))]
     if kind not in STRIPS:
         inside = middle if shape.contains(middle) else shapely.point_on_surface(shape)
-        return [Place(name, (inside.x, inside.y), np.inf, shape)]
+        return [Place(name, name, (inside.x, inside.y), np.inf, shape)]
     short = 0 if sides[0] <= sides[1] else 1
     ends = np.array([corners[k : k + 2].mean(axis=0) for k in (short, short + 2)])
     axis = int(np.argmax(np.abs(ends[1] - ends[0])))
     ends = ends[np.argsort(ends[:, axis], kind="stable")]
     reach = max(SNAP, float(sides.min()))
     at = [(float(x), float(y)) for x, y in ends]
-    suffixed = [Place(f"{name}/{end}", place, reach) for end, place in zip(ENDS, at, strict=True)]
-    return [Place(name, (middle.x, middle.y), reach / 2 + SNAP, shape), *suffixed]
+    suffixed = [Place(f"{name}/{end}", name, place, reach) for end, place in zip(ENDS, at, strict=True)]
+    return [Place(name, name, (middle.x, middle.y), reach / 2 + SNAP, shape), *suffixed]
 
 
 def _net(network: Features) -> _Net:
@@ -111,7 +113,7 @@ def _net(network: Features) -> _Net:
     return _Net(xy, [network.ids[k] for k in nodes], edges, set())
 
 
-def _node(net: _Net, place: Place, titles: dict[int, str]) -> int | None:
+def _node(net: _Net, place: Place, titles: dict[int, Place]) -> int | None:
     """Return the node of a place, and note its name; None if the network does not come near."""
     xy = np.array(net.xy)
     at = np.array(place.at)
@@ -127,7 +129,7 @@ def _node(net: _Net, place: Place, titles: dict[int, str]) -> int | None:
     if not np.isfinite(near) or near > place.reach:
         return None
     net.used.add(node)
-    titles[node] = place.name
+    titles[node] = place
     return node
 
 
@@ -160,18 +162,19 @@ def _divide(net: _Net, place: Place) -> int | None:
     return node
 
 
-def _features(net: _Net, titles: dict[int, str], areas: list[tuple[str, str, Any]]) -> Features:
+def _features(net: _Net, titles: dict[int, Place], areas: list[tuple[str, str, Any]]) -> Features:
     """Return the network as features, nodes first."""
     xy = np.array(net.xy)
     inside = _area_names(xy, areas)
     taken = {name for k, name in enumerate(net.ids) if k not in titles}
     ids = list(net.ids)
-    for k, name in zip(titles, unique_ids(titles.values(), taken), strict=True):
+    for k, name in zip(titles, unique_ids([place.name for place in titles.values()], taken), strict=True):
         ids[k] = name
+        inside[k] = titles[k].owner or inside[k]
     properties: list[Properties] = []
     for k, i in enumerate(ids):
         area = {"area": inside[k]} if inside[k] else {}
-        properties.append({"kind": "node", "name": titles.get(k, i), **area})
+        properties.append({"kind": "node", "name": titles[k].name if k in titles else i, **area})
     pairs = sorted(net.edges)
     properties += [{**net.edges[a, b], "source": ids[a], "target": ids[b]} for a, b in pairs]
     lines = shapely.linestrings(xy[np.array(pairs, np.int64).reshape(-1, 2)]) if pairs else np.empty(0, object)
