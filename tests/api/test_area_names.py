@@ -31,7 +31,7 @@ def hall(*, board: bool = False) -> dict[str, bytes]:
 
 
 def areas(api: Api, env: str) -> dict[str, dict[str, Any]]:
-    body = api.get(f"environments/{env}/versions/latest/layers/zones", params={"part": "areas"}).json()
+    body = api.get(f"environments/{env}/versions/latest/layers/zones", params={"name": "areas"}).json()
     return {f["id"]: f for f in body["features"]}
 
 
@@ -71,7 +71,7 @@ def test_renamed_area_keeps_its_word_when_derived_again(api: Api, site: str) -> 
         assert (item["environment"], item["kind"], item["name"]) == (site, "zone", "aisle-2")
     feature = areas(api, site)["aisle-2"]
     renamed = {**feature["properties"], "name": "strawberry lane"}
-    change = {"op": "put", "layer": "zones", "part": "areas", "feature": {**feature, "properties": renamed}}
+    change = {"op": "put", "layer": "zones", "name": "areas", "feature": {**feature, "properties": renamed}}
     api.post(f"environments/{site}/edits", {"changes": [change]})
     api.upload(site, hall(board=True))
     again: dict[str, Any] = {"method": "occupancy_to_zones"}
