@@ -83,3 +83,18 @@ def test_renamed_area_keeps_its_word_when_derived_again(api: Api, site: str) -> 
     items = api.get("search", params={"q": "strawberry lane"}).json()["items"]
     found = {(item["kind"], item["name"]) for item in items}
     assert found >= {("zone", "strawberry lane"), ("node", "strawberry lane"), ("node", "strawberry lane/in")}
+
+
+def test_words_stay_while_the_grid_changes(api: Api, site: str) -> None:
+    """Areas that are stale still name nodes and stand in drawings: only deriving them again replaces them."""
+    api.post("environments", {"name": "changing-hall"})
+    api.upload("changing-hall", hall())
+    api.post("environments/changing-hall/derivations", {"method": "occupancy_to_zones"})
+    head = api.upload("changing-hall", hall(board=True)).json()
+    assert [(s["layer"], s["changed"]) for s in head["stale"]] == [("zones", ["occupancy ground/map"])]
+    tmap = yaml.safe_load(api.get("/maps/changing-hall/tmap2").content)
+    assert "aisle-2/in" in {entry["node"]["name"] for entry in tmap["nodes"]}
+    drawing = json.loads(api.get("/maps/changing-hall/geojson").content)
+    assert "aisle-2" in {f["properties"].get("name") for f in drawing["features"]}
+    body = api.post("environments/changing-hall/derivations", {"method": "occupancy_to_zones"}).json()
+    assert body["stale"] == []
