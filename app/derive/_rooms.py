@@ -15,6 +15,7 @@ Steps, after the methods compared by Bormann et al. (Room segmentation: survey, 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -219,16 +220,20 @@ def _join(labels: Labels, distance: Distance, wall: Mask, cell: float) -> tuple[
 
 def _seams(labels: Labels) -> list[tuple[int, int, NDArray[np.int64]]]:
     """Return the connected pieces of the lines where two basins meet: both labels, and cells [n, 2] (row, column)."""
-    cells: dict[tuple[int, int], list[NDArray[np.int64]]] = {}
+    met, sides = [], []
     for dy, dx in ((0, 1), (1, 0)):
         first, second = labels[: len(labels) - dy, : labels.shape[1] - dx], labels[dy:, dx:]
-        met = np.argwhere((first != second) & (first > 0) & (second > 0))
-        pairs = np.sort(np.stack([first[tuple(met.T)], second[tuple(met.T)]], axis=1), axis=1)
-        for pair in np.unique(pairs, axis=0):
-            cells.setdefault((int(pair[0]), int(pair[1])), []).append(met[(pairs == pair).all(axis=1)])
-    out = []
-    for (a, b), pieces in sorted(cells.items()):
-        points = np.unique(np.concatenate(pieces), axis=0)
+        at = np.argwhere((first != second) & (first > 0) & (second > 0))
+        met.append(at)
+        sides.append(np.sort(np.stack([first[tuple(at.T)], second[tuple(at.T)]], axis=1), axis=1))
+    every, pairs = np.concatenate(met), np.concatenate(sides)
+    order = np.lexsort((every[:, 1], every[:, 0], pairs[:, 1], pairs[:, 0]))
+    every, pairs = every[order], pairs[order]
+    begins = np.flatnonzero(np.concatenate([[True], (np.diff(pairs, axis=0) != 0).any(axis=1)])) if len(pairs) else []
+    out: list[tuple[int, int, NDArray[np.int64]]] = []
+    for begin, end in itertools.pairwise([*begins, len(pairs)]):
+        a, b = pairs[begin].tolist()
+        points = np.unique(every[begin:end], axis=0)
         low = points.min(axis=0)
         canvas = np.zeros(points.max(axis=0) - low + 1, np.uint8)
         canvas[tuple((points - low).T)] = 1

@@ -59,7 +59,7 @@ ALIKE = 0.12
 NEAREST = 10
 """Number of nearest obstacles among which neighbours in a chain are sought."""
 
-MAX_PIECES = 20_000
+MAX_PIECES = 10_000
 """Maximum number of small obstacles in which chains are sought."""
 
 
@@ -89,10 +89,13 @@ class Strip:
 def strips(occupied: Mask, free: Mask, cell: float) -> list[Strip]:
     """Return the strips of a grid. cell: metres."""
     lines = obstacle_lines(occupied, cell)
+    drawn = np.array([shapely.LineString(line.ends) for line in lines], object)
+    tree = shapely.STRtree(drawn)
     out = []
-    for one, other in itertools.combinations(lines, 2):
-        strip = _strip(one, other, cell)
-        if strip is not None and _is_clear(strip, occupied, free) and not _is_divided(strip, lines):
+    pairs = tree.query(drawn, predicate="dwithin", distance=(MAX_GAP + WIDEST_LINE) / cell).T
+    for i, k in sorted(pairs[pairs[:, 0] < pairs[:, 1]].tolist()):
+        strip = _strip(lines[i], lines[k], cell)
+        if strip is not None and _is_clear(strip, occupied, free) and not _is_divided(strip, lines, drawn, tree):
             out.append(strip)
     return out
 
@@ -110,12 +113,12 @@ def flank_cells(aisles: list[Strip], occupied: Mask) -> Mask:
     return np.asarray(mask == 1)
 
 
-def _is_divided(strip: Strip, lines: list[Line]) -> bool:
-    """Return whether another line runs along a strip."""
+def _is_divided(strip: Strip, lines: list[Line], drawn: NDArray[np.object_], tree: Any) -> bool:
+    """Return whether another line runs along a strip. drawn, tree: the lines as geometries, and their index."""
     inner = shapely.Polygon(strip.corners)
     length = float(np.hypot(*(strip.corners[3] - strip.corners[0])))
-    others = [shapely.LineString(line.ends) for line in lines if all(line is not flank for flank in strip.flanks)]
-    return any(line.intersection(inner).length > length / 4 for line in others)
+    near = [k for k in tree.query(inner).tolist() if all(lines[k] is not flank for flank in strip.flanks)]
+    return bool((shapely.length(shapely.intersection(drawn[near], inner)) > length / 4).any())
 
 
 def obstacle_lines(occupied: Mask, cell: float) -> list[Line]:
@@ -300,6 +303,8 @@ def _strip(one: Line, other: Line, cell: float) -> Strip | None:
         far = mates[0] + share * (mates[1] - mates[0]) - side * across * other.width / 2
         near = one.ends[0] + along * place + side * across * one.width / 2
         corners.append((near, far) if place == begin else (far, near))
+    if not shapely.Polygon([*corners[0], *corners[1]]).is_valid:
+        return None  # the lines cross
     facing = (end - begin) / min(one.length, other.length)
     return Strip(np.array([*corners[0], *corners[1]]), (one, other), min(1.0, facing))
 
