@@ -64,6 +64,9 @@ THIN = 0.6
 LONG = 3.0
 """Minimum ratio of a corridor's length to its width."""
 
+MOUTHS = 3.6
+"""Maximum length of the ends at which a corridor meets its room, as a multiple of its width: two, which may widen."""
+
 MAX_CORRIDOR = 4.0
 """Maximum width of a corridor in metres."""
 
@@ -120,7 +123,7 @@ def rooms(free: Mask, occupied: Mask, cell: float) -> Rooms:
     labels = _enclosed(labels, free, wall, distance, cell)
     thick = thickness(ground, distance)
     rooms_only = int(labels.max())
-    labels = _cut_corridors(labels, thick, cell)
+    labels = _cut_corridors(labels, free, thick, cell)
     return _classified(labels, doors, wall, distance, thick, cell, rooms_only)
 
 
@@ -229,7 +232,7 @@ def _seams(labels: Labels) -> list[tuple[int, int, NDArray[np.int64]]]:
     every, pairs = np.concatenate(met), np.concatenate(sides)
     order = np.lexsort((every[:, 1], every[:, 0], pairs[:, 1], pairs[:, 0]))
     every, pairs = every[order], pairs[order]
-    begins = np.flatnonzero(np.concatenate([[True], (np.diff(pairs, axis=0) != 0).any(axis=1)])) if len(pairs) else []
+    begins = np.flatnonzero((np.diff(pairs, axis=0, prepend=-1) != 0).any(axis=1)).tolist()
     out: list[tuple[int, int, NDArray[np.int64]]] = []
     for begin, end in itertools.pairwise([*begins, len(pairs)]):
         a, b = pairs[begin].tolist()
@@ -317,31 +320,35 @@ def thickness(ground: Mask, distance: Distance) -> Distance:
     return out
 
 
-def _cut_corridors(labels: Labels, thick: Distance, cell: float) -> Labels:
+def _cut_corridors(labels: Labels, free: Mask, thick: Distance, cell: float) -> Labels:
     """Give long parts of a basin that are much narrower than it a label of their own, above the others."""
     labels = labels.copy()
     count = int(labels.max())
     peak = np.zeros(count + 1)
     np.maximum.at(peak, labels.ravel(), thick.ravel())
     thin = (labels > 0) & (thick < THIN * peak[labels]) & (thick * cell >= 0.3) & (thick * cell <= MAX_CORRIDOR / 2)
-    for basin in range(1, count + 1):
-        part = (thin & (labels == basin)).astype(np.uint8)
-        if not part.any():
-            continue
-        pieces, piece, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
-        for k in range(1, pieces):
-            chosen = piece == k
-            area = float(stats[k, cv2.CC_STAT_AREA])
-            wide = 2.0 * float(np.median(thick[chosen]))
-            if area / wide < LONG * wide / 1.5 or area * cell * cell < MIN_ROOM_AREA:
-                continue
-            beside = cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
-            contact = np.count_nonzero(beside & ~chosen & (labels == basin))
-            if contact > 3.6 * wide:  # a strip along a room's side, not a corridor out of it
-                continue
-            count += 1
-            labels[chosen] = count
+    for basin, window in _windows(labels):
+        inside = labels[window] == basin
+        part = (thin[window] & inside).astype(np.uint8)
+        _, piece, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
+        for k in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * cell * cell >= MIN_ROOM_AREA).tolist():
+            x, y, width, height, _ = stats[k].tolist()
+            frame = (slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1))
+            chosen = piece[frame] == k
+            if k and _is_corridor(chosen, inside[frame], free[window][frame], thick[window][frame]):
+                count += 1
+                labels[window][frame][chosen] = count
     return labels
+
+
+def _is_corridor(chosen: Mask, basin: Mask, free: Mask, thick: Distance) -> bool:
+    """Return whether a thin part of a basin leads out of it: long, seen, and open at its ends only."""
+    area = float(np.count_nonzero(chosen))
+    wide = 2.0 * float(np.median(thick[chosen]))
+    if area < LONG / 1.5 * wide * wide or np.count_nonzero(chosen & free) < SEEN * area:
+        return False
+    beside = cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
+    return bool(np.count_nonzero(beside & ~chosen & basin) <= MOUTHS * wide)
 
 
 def _enclosed(labels: Labels, free: Mask, wall: Mask, distance: Distance, cell: float) -> Labels:
