@@ -219,7 +219,8 @@ def available_in(layers: Layers) -> AvailableLayers:
 def _pinned_layers(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
     """Find the layers whose parts are all derived and stale: they are derived again with the same steps.
 
-    Layers with edited or uploaded parts stay as they are (the version lists them as stale).
+    Layers with edited or uploaded parts stay as they are (the version lists them as stale), and so do names that a
+    derivation takes over from the parts that it replaces: only to store its result brings new ones.
     """
     stale = version.stale
     derivations = derive.all_derivations()
@@ -230,6 +231,8 @@ def _pinned_layers(version: Version, entries: Sequence[PartEntry]) -> dict[Layer
             steps = [step for e in parts for step in e.provenance.steps]
             if any(step.get("step") not in derivations for step in steps):
                 continue  # fetched online, which a conversion never does
+            if any(layer in derivations[str(step.get("step"))].also for step in steps if step.get("to") == layer):
+                continue
             out[layer] = {str(s["step"]): dict(s.get("parameters") or {}) for s in steps if "step" in s}
     return out
 

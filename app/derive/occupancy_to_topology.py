@@ -22,6 +22,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
+from app.derive._places import named
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Features, Properties, SharedKeyDicts, from_columns, points
 from app.model.grid import OccupancyGrid, unknown_grey, unknown_grey_as_unknown
@@ -129,17 +130,20 @@ class Parameters:
     seed: int = parameter(0, "roadmap: seed of the samples", minimum=0, maximum=2**31 - 1)
 
 
-@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0, version=2)
+@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0, version=2, also=frozenset({"zones"}))
 def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of nodes and directed edges along the paths through a grid's free space.
 
-    One network per level. Raises CannotConvert if a grid has no paths (nothing free, no obstacle, too narrow for the
-    robot), NotFound or Ambiguous if no grid can be selected, Invalid for parameters of another method.
+    One network per level. Stored zones of kind room, corridor, door, aisle and row (drawn, or by occupancy_to_zones)
+    give their names to nodes. Raises CannotConvert if a grid has no paths (nothing free, no obstacle, too narrow for
+    the robot), NotFound or Ambiguous if no grid can be selected, Invalid for parameters of another method.
     """
     _check(parameters)
     parts: dict[PartKey, Part] = {}
     for key, grid in select_grids(layers, parameters.grid, "paths").items():
-        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, grid_label(key))
+        derived, missing = named(network(grid, parameters, notes, grid_label(key)), layers, key.level)
+        notes.drop("names of areas", missing, f"the network of {key.level} does not lead through them")
+        parts[PartKey("topology", key.level, NETWORK)] = derived
     return Layers(parts, layers.datum, layers.levels)
 
 

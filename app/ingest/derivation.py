@@ -72,11 +72,7 @@ def prepare_derivation(
         """Run all steps but the last. Returns the chain, the stored parts it reads, the layers and the notes."""
         needed = {layer for step in steps for layer in step.reads}
         used = {k: e for k, e in stored.items() if k.layer in needed}
-        used |= {
-            k: e
-            for k, e in existing_parts.items()
-            if derivation.gives in needed or (derivation.part_names and k.name == MAP)
-        }
+        used |= {k: e for k, e in existing_parts.items() if _is_read(k, derivation, needed)}
         # Load more than the required layers: a derivation may use optional ones (a fence).
         progress.report(0.0, "reading")
         loaded = store.content.load(base, sorted(used))
@@ -106,10 +102,20 @@ def prepare_derivation(
         None,
         tuple(step.as_dict() for step in chain),
         tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution)),
-        (*(input_line(e) for k, e in sorted(used.items())), frame_input(base.datum, base.levels)),
+        _inputs(base, {k: e for k, e in used.items() if k not in fresh}),
     )
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
     return store.versions.prepare(base, Changes(operations)), notes.as_warnings()
+
+
+def _is_read(key: PartKey, derivation: derive.Derivation, needed: set[Layer]) -> bool:
+    """Return whether a derivation reads a stored part of the layer that it gives.
+
+    One that has its own layer among the optional ones matches its result with the stored parts of the same names.
+    """
+    if derivation.gives in derivation.also:
+        return key.name in derivation.part_names
+    return derivation.gives in needed or bool(derivation.part_names and key.name == MAP)
 
 
 def _last_share(chain: Sequence[Step]) -> float:
@@ -158,6 +164,11 @@ def _check_free(request: DerivationRequest, keys: Any, existing_parts: Mapping[P
         raise Conflict(
             f"the {key.layer} {key.level}/{key.name} {why}: to replace it with a derived one, set replace=true"
         )
+
+
+def _inputs(base: Version, used: Mapping[PartKey, PartEntry]) -> tuple[dict[str, Any], ...]:
+    """Describe the inputs of a derivation. used: without the parts that it replaces, which would make it stale."""
+    return (*(input_line(e) for _, e in sorted(used.items())), frame_input(base.datum, base.levels))
 
 
 def input_line(entry: PartEntry) -> dict[str, Any]:

@@ -13,6 +13,7 @@ all        ``kind``          kind of item: ``node``, ``edge``, ``region``, ``poi
 all        ``name``          the name people and robots use; need not be unique
 topology   ``source``        id of the node an edge starts at (edges only)
 topology   ``target``        id of the node an edge ends at (edges only; an edge is directed)
+topology   ``area``          name of the area that a node is in: a zone of kind ``room``, ``aisle`` …
 topology   ``orientation``   [x, y, z, w], the quaternion of a node's pose in the local frame, as in its source
 topology   ``action``        action of a robot along an edge
 topology   ``speed_limit``   metres per second along an edge

@@ -300,7 +300,7 @@ class Version:
             used = {(n["layer"], n["level"], n["name"]) for n in entry.provenance.inputs if "layer" in n}
             layers = {layer for layer, _, _ in used}
             steps = entry.provenance.steps
-            layers |= {layer for step in steps for layer in step.get("also", ())}
+            layers |= {layer for step in steps for layer in step.get("also", ()) if layer != entry.key.layer}
             if any("location" in step.get("from", ()) for step in steps):
                 layers.add("location")  # the one layer that a step can do without: a datum is sufficient
             identity = (entry.key.layer, entry.key.level, entry.key.name)

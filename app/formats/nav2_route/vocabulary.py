@@ -18,7 +18,7 @@ MAX_USED_ID = 2**16 - 1
 FLOATS = frozenset({"speed_limit", "abs_speed_limit", "penalty", "abs_time_taken"})
 """Metadata that Nav2's own plugins read as floats."""
 
-TEXTS: Mapping[str, str] = {"name": "name", "action": "action"}
+TEXTS: Mapping[str, str] = {"name": "name", "action": "action", "area": "area"}
 NUMBERS: Mapping[str, str] = {"abs_speed_limit": "speed_limit", "width": "width"}
 CANONICAL_METADATA: Mapping[str, str] = {**TEXTS, **NUMBERS}
 """Canonical properties by metadata key, for values that are texts and numbers."""
@@ -47,5 +47,5 @@ _FEATURE = record(
 SHAPE = record(is_open=True, type=OneOf(("FeatureCollection",)), features=[_FEATURE])
 """Shape of a graph. Source: nav2_route, GeoJsonGraphFileLoader; further members belong to GeoJSON or QGIS."""
 
-CANONICAL_NODE = frozenset({"kind", "name", "action", "speed_limit", "width", NAME}) | CROSS_PART_PROPERTIES
+CANONICAL_NODE = frozenset({"kind", "name", "action", "area", "speed_limit", "width", NAME}) | CROSS_PART_PROPERTIES
 CANONICAL_EDGE = CANONICAL_NODE | {"source", "target"}

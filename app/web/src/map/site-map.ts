@@ -38,6 +38,7 @@ import { tileAddress, Tiles } from "./tiles";
 const PICK_PIXELS = 10;
 /** Changes beyond which all features are drawn anew. */
 const MAX_CHANGES = 2000;
+const AREA_KINDS = new Set(["room", "corridor", "door", "aisle", "row"]);
 const Z = { imagery: 0, voxels: 1, occupancy: 2, masks: 3, zones: 10, objects: 11, topology: 12, overlay: 20 };
 
 /** Layers switched off, in the address, so that a link shows the same map. */
@@ -409,8 +410,18 @@ export class SiteMap {
   private style(layer: "zones" | "objects" | "topology" | "location"): FeatureStyle {
     if (layer === "zones") {
       return {
-        classOf: (feature) => (String(feature.properties.kind ?? "").includes("speed") ? "speed" : "keepout"),
+        classOf: ({ properties }) => {
+          const kind = String(properties.kind ?? "");
+          return AREA_KINDS.has(kind) ? "area" : kind.includes("speed") ? "speed" : "keepout";
+        },
         paints: () => ({
+          // Rooms and aisles are names of places, not limits: quiet, and with their names.
+          area: {
+            stroke: colour("object"),
+            fill: `color-mix(in srgb, ${colour("object")} 8%, transparent)`,
+            width: 1,
+            labels: this.resolution.peek() < 0.12,
+          },
           speed: {
             stroke: colour("speed"),
             fill: `color-mix(in srgb, ${colour("speed")} 18%, transparent)`,

@@ -1,0 +1,98 @@
+"""Names of areas: given, kept when derived again, and brought to the nodes of a network."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.model.features import Features
+from app.model.geodesy import LocalFrame
+
+AREAS = "areas"
+"""Name of the part of zones with the areas of a grid."""
+
+AREA_KINDS = ("room", "corridor", "door", "aisle", "row")
+"""Kinds of zones that name places."""
+
+SAME = 0.3
+"""Minimum overlap (intersection over union) of an area with a stored one whose name it keeps."""
+
+SAME_DOOR = 0.75
+"""Maximum distance in metres of a door from a stored one whose name it keeps."""
+
+_NUMBERED = re.compile(r"(?:room|corridor|door|aisle|row)-(\d+)\Z")
+
+Area = tuple[str, Any, dict[str, Any]]
+"""Kind, polygon in metres, properties."""
+
+Row = tuple[str, Any, dict[str, Any]]
+
+
+def keep_names(areas: Sequence[Area], stored: Features | None, frame: LocalFrame | None) -> list[Row]:
+    """Return areas as rows of features: those that match a stored one with its id, name and further properties.
+
+    areas: kind, polygon in metres, properties. Of several matches the largest overlap wins. Other areas are called
+    by their kind and the next numbers, from north to south, then from west to east.
+    """
+    if stored is None or not len(stored):
+        return _numbered(list(areas), {}, [], {})
+    old = stored.in_local(frame)
+    pairs = []
+    tree = shapely.STRtree(old)
+    for i, (kind, shape, _) in enumerate(areas):
+        for k in tree.query(shape.buffer(SAME_DOOR)).tolist():
+            score = _sameness(kind, shape, str(stored.properties[k].get("kind")), old[k])
+            if score > 0.0:
+                pairs.append((-score, i, k))
+    matches: dict[int, int] = {}
+    for _, i, k in sorted(pairs):
+        if i not in matches and k not in matches.values():
+            matches[i] = k
+    names = [(stored.ids[k], stored.properties[k]) for k in range(len(stored))]
+    taken = [i for i, _ in names] + [str(p.get("name", "")) for _, p in names]
+    return _numbered(list(areas), matches, taken, dict(enumerate(names)))
+
+
+def _sameness(kind: str, shape: Any, old_kind: str, old: Any) -> float:
+    """Return how much an area is the stored one: 0 to 1, above 0 if it keeps the name."""
+    places = ("room", "corridor")
+    if kind != old_kind and not (kind in places and old_kind in places):
+        return 0.0
+    if kind == "door":
+        distance = float(shapely.centroid(shape).distance(shapely.centroid(old)))
+        return 1.0 - distance / (2.0 * SAME_DOOR) if distance <= SAME_DOOR else 0.0
+    union = shape.union(old).area
+    overlap = shape.intersection(old).area / union if union else 0.0
+    return overlap if overlap >= SAME else 0.0
+
+
+def _numbered(
+    areas: list[Area], matches: Mapping[int, int], taken: list[str], old: Mapping[int, tuple[str, Mapping[str, Any]]]
+) -> list[Row]:
+    highest = dict.fromkeys(AREA_KINDS, 0)
+    for name in taken:
+        if (m := _NUMBERED.match(name)) is not None:
+            kind = name.rpartition("-")[0]
+            highest[kind] = max(highest[kind], int(m[1]))
+    rows: list[Row] = []
+    for i in sorted(range(len(areas)), key=lambda i: _position(areas[i][1])):
+        kind, shape, words = areas[i]
+        if i in matches:
+            area_id, before = old[matches[i]]
+            kept = {name: value for name, value in before.items() if name not in words}
+            rows.append((area_id, shape, {**kept, **words}))
+            continue
+        highest[kind] += 1
+        name = f"{kind}-{highest[kind]}"
+        rows.append((name, shape, {"kind": kind, "name": name, **words}))
+    return rows
+
+
+def _position(shape: Any) -> tuple[float, float]:
+    """Return the order of numbers: from north to south in bands of a metre, then from west to east."""
+    x, y = shapely.get_coordinates(shapely.centroid(shape))[0]
+    return (-np.floor(y), x)
