@@ -205,7 +205,7 @@ def _contrast(field: RowField, xy: Array, across: float) -> float:
     low, high = min(row.low for row in field.rows), max(row.high for row in field.rows)
     inside = (u >= low) & (u <= high) & (v >= field.rows[0].v) & (v <= field.rows[-1].v)
     lines = np.array([row.v for row in field.rows])
-    half = np.array([row.width / 2 + across for row in field.rows])
+    half = np.array([max(row.width / 2 + across, field.spacing / 4) for row in field.rows])
     nearest = np.abs(v[inside][:, None] - lines[None]) <= half[None]
     share = float(nearest.any(axis=1).mean()) if inside.any() else 0.0
     area = min(1.0, float(2 * half[:-1].sum()) / max(float(lines[-1] - lines[0]), 1e-9))
