@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from app.derive._pictures import GroundImage, infrared_band
 from app.derive._segments import METHOD_PARAMETERS, MIN_CONFIDENCE, Segmentation, Segments, doubt
 from app.errors import Invalid, Problem
 from app.model.geodesy import LocalFrame
-from app.model.grid import OccupancyGrid
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import LOCAL, GeoImage, display_pixels
 from app.model.resampling import resample
 
@@ -76,9 +76,19 @@ def _report_unknown(out: Segments, on: GroundImage, notes: DerivationNotes, name
 def plan_to_grid(
     picture: GeoImage, frame: LocalFrame | None, how: Segmentation, notes: DerivationNotes, name: str
 ) -> tuple[OccupancyGrid, NDArray[np.float32]]:
-    """Convert a floor plan to a grid, and the probability of each cell that it is a wall, float32 [rows, columns]."""
+    """Convert a floor plan to a grid, and the probability of each cell that it is a wall, float32 [rows, columns].
+
+    Walls below ``confidence`` are unknown.
+    """
     upright = picture if picture.crs == LOCAL else resample(picture, frame, crs=LOCAL)
     speck = 0.05 if how.minimum_area is None else how.minimum_area
-    return _plans.plan_to_grid(
-        upright, _plans.FloorPlanOptions(how.gap, speck, how.resolution, how.outside_free), notes, name
-    )
+    options = _plans.FloorPlanOptions(how.gap, speck, how.resolution, how.outside_free)
+    grid, sure = _plans.plan_to_grid(upright, options, notes, name)
+    least = MIN_CONFIDENCE if how.confidence is None else how.confidence
+    walls = grid.cells == OCCUPIED
+    doubtful = walls & (sure < np.float32(least))
+    if doubtful.any():
+        share = float(doubtful.sum()) / float(walls.sum())
+        notes.warn(f"{share:.0%} of the walls of {name} are less sure than confidence={least:g}: unknown")
+        grid = replace(grid, cells=np.where(doubtful, np.uint8(UNKNOWN), grid.cells))
+    return grid, sure

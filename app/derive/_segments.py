@@ -40,8 +40,8 @@ class Segmentation:
     )
     confidence: float | None = parameter(
         None,
-        "minimum confidence of a region; what is less sure is unknown (kind area, with its guess). Default: 0.5, for "
-        "models of the YOLO family 0.25, for Segment-Anything (its predicted IoU) 0.88",
+        "minimum confidence of a region or wall; what is less sure is unknown (a region: kind area, with its guess). "
+        "Default: 0.5, for models of the YOLO family 0.25, for Segment-Anything (its predicted IoU) 0.88",
         minimum=0.01,
         maximum=1.0,
     )
@@ -73,9 +73,7 @@ class Segmentation:
 
 
 METHOD_PARAMETERS = {
-    "probabilities": ("colour", "index", "model"),
     "model": ("model",),
-    "confidence": ("colour", "index", "model"),
     "points": ("model",),
     "stability": ("model",),
     "clusters": ("colour",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,8 +26,7 @@ class Parameters(Segmentation):
 
     probabilities: bool = parameter(
         False,
-        "colour, index, model: whether there is also a grid `probability`, whose cells are the probability in percent "
-        "that they are occupied",
+        "whether there is also a grid `probability`, whose cells are the probability in percent that they are occupied",
     )
 
 
@@ -46,7 +45,9 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
             raise MissingDatum('a grid needs a datum: PATCH the environment with {"datum": {…}}')
         method = choose_method(picture, parameters)
         if method == "plan":
-            grid, _ = plan_to_grid(picture, layers.frame, parameters, notes, name)
+            grid, sure = plan_to_grid(picture, layers.frame, parameters, notes, name)
+            chance = np.where(sure > 0, np.rint(100 * sure).astype(np.uint8), grid.cells)
+            chances = replace(grid, cells=chance)
         else:
             on = ground(picture, layers.frame, parameters.resolution, notes, name)
             segments = segment_picture(on, picture, parameters, method, notes, name)
@@ -58,9 +59,9 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Derivati
             bottom = on.top - on.resolution * len(cells)
             origin = (round(on.left, 9), round(bottom, 9), 0.0)
             grid = OccupancyGrid(np.ascontiguousarray(cells[::-1]), on.resolution, origin)
-            if parameters.probabilities:
-                chance = np.ascontiguousarray(probability_cells(segments)[::-1])
-                parts[PartKey("occupancy", key.level, PROBABILITY)] = OccupancyGrid(chance, on.resolution, origin)
+            chances = replace(grid, cells=np.ascontiguousarray(probability_cells(segments)[::-1]))
+        if parameters.probabilities:
+            parts[PartKey("occupancy", key.level, PROBABILITY)] = chances
         if not (grid.cells == FREE).any():
             raise CannotConvert(f"{name} shows no free ground: no field, path, road or room was detected")
         notes.warn("the grid was detected automatically in an image: review it before robots use it", where=key.name)

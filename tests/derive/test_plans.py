@@ -197,6 +197,30 @@ def test_walls_have_a_confidence() -> None:
     assert 1 > sure[0] > sure[1] > 0.5, "a thick black wall is surer than a thin outline"
 
 
+def test_walls_below_the_confidence_are_unknown() -> None:
+    plan, notes = Plan(*PLANS["black walls, tinted rooms"]), DerivationNotes()
+    plan.furnish()
+
+    def grids(confidence: float | None, notes: DerivationNotes) -> dict[str, NDArray[np.uint8]]:
+        how = Parameters(segmentation="plan", probabilities=True, confidence=confidence)
+        parts = imagery_to_occupancy(layers(plan.pixels), how, notes).parts
+        return {key.name: cells(part) for key, part in parts.items()}
+
+    drawn, doubted = grids(None, DerivationNotes()), grids(0.95, notes)
+    every, some, chance = drawn["map"], doubted["map"], drawn["probability"]
+    assert (chance == doubted["probability"]).all()
+    assert (chance[every == OCCUPIED] > 50).all()
+    assert (chance[every == FREE] == 0).all()
+    assert (some[every == OCCUPIED] == UNKNOWN).all()
+    assert (some == every)[every != OCCUPIED].all()
+    assert any("of the walls of" in w.problem and "confidence=0.95: unknown" in w.problem for w in notes.warnings)
+
+
+def cells(part: object) -> NDArray[np.uint8]:
+    assert isinstance(part, OccupancyGrid)
+    return part.cells
+
+
 def test_plan_derivation_is_repeatable() -> None:
     plan = Plan(*PLANS["thin outlines of tints on cream"])
     plan.furnish()
