@@ -21,6 +21,12 @@ Array = NDArray[np.float64]
 MAX_CELLS = 2**21
 """Maximum number of cells of a mask; larger ones are coarsened."""
 
+MAX_CELL = 2.0
+"""Largest cell in metres in which rows can be told apart."""
+
+MAX_STEPS = 2**25
+"""Maximum number of steps on all lines of a direction: those across a mask of many kilometres have more."""
+
 SAMPLE = 40_000
 """Maximum number of cells from which directions are computed."""
 
@@ -117,19 +123,27 @@ def half_turn(yaw: float) -> float:
     return (yaw + math.pi / 4) % math.pi - math.pi / 4
 
 
-def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float, limit: int = 8) -> list[RowField]:
+def find_fields(
+    mask: NDArray[np.bool_], size: float, left: float, bottom: float, yaw: float = 0.0, limit: int = 8
+) -> list[RowField]:
     """Return the fields of rows in a mask [h, w], row 0 at the bottom, the best first.
 
-    size: metres of a cell. left, bottom: local metres of its lower left corner. limit: maximum number of fields.
+    size: metres of a cell. left, bottom: local metres of its lower left corner. yaw: rotation of the mask around that
+    corner in radians. limit: maximum number of fields.
     """
+    corner = np.array([left, bottom])
     filled, crossed = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(filled):
         return []
     mask = mask[filled[0] : filled[-1] + 1, crossed[0] : crossed[-1] + 1]
     left, bottom = left + int(crossed[0]) * size, bottom + int(filled[0]) * size
     mask, size = _coarse(mask, size)
+    if size > MAX_CELL:
+        return []
     rows, columns = np.nonzero(mask)
     xy = np.column_stack([left + (columns + 0.5) * size, bottom + (rows + 0.5) * size])
+    if yaw:
+        xy = np.column_stack(_turned(xy - corner, -yaw)) + corner
     out: list[RowField] = []
     while len(xy) >= 2 * MIN_ROWS and len(out) < limit:
         best = max(_candidates(xy, size), key=_score, default=None)
@@ -232,6 +246,8 @@ def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     low_u, low_v = float(u.min()), float(v.min())
     i = np.floor((u - low_u) / ALONG).astype(np.int64)
     j = np.floor((v - low_v) / across).astype(np.int64)
+    if (int(j.max()) + 3) * (int(i.max()) + 1) > MAX_STEPS:
+        return []
     weight = np.zeros((int(j.max()) + 3, int(i.max()) + 1))
     np.add.at(weight, (j + 1, i), 1.0)
     steps = weight > 0
