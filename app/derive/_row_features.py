@@ -44,7 +44,8 @@ def fields_of(
     best = find_fields(masks[clearest], size, *origin) if scores[clearest] else []
     if not best:
         raise CannotConvert(
-            f"{name} shows no parallel rows: at least 3 of 5 m or more are needed, at regular distances up to 15 m"
+            f"{name} shows no parallel rows, at least 3 of 5 m or more at regular distances up to 15 m: draw them as "
+            "lines of kind row"
         )
     if any(field.regular < 1.0 for field in best):
         notes.warn("some rows are missing, or at irregular distances: review them before robots use them", where=name)

@@ -257,7 +257,7 @@ def test_probabilities_are_a_second_grid() -> None:
     assert at(chance, 20, 20) > 50 > at(chance, 3, 3)
     assert 50 < at(chance, 45, 20) < 100, "probably no ground"
     assert (g.origin, g.resolution, g.cells.shape) == (chance.origin, chance.resolution, chance.cells.shape)
-    with pytest.raises(Invalid, match="applies only to segmentation=colour"):
+    with pytest.raises(Invalid, match="applies only to segmentation=colour or index or model, not to plan"):
         grid(layers(local(plan())), probabilities=True)
 
 
