@@ -253,14 +253,17 @@ def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     steps = weight > 0
     # three bins together: a row is not exactly on one line
     steps[1:-1] |= steps[:-2] | steps[2:]
-    candidates: list[tuple[float, int, int, int]] = []
+    candidates: list[tuple[float, float, int, int, int]] = []
     for line in np.flatnonzero(steps.sum(axis=1) * ALONG >= FILL * MIN_LENGTH):
         filled = np.flatnonzero(steps[line])
         for run in np.split(filled, np.flatnonzero(np.diff(filled) * ALONG > GAP) + 1):
             length = (run[-1] - run[0] + 1) * ALONG
             if length >= MIN_LENGTH and len(run) * ALONG >= FILL * length:
-                mass = float(weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum())
-                candidates.append((len(run) + mass / (1 + mass), int(line), int(run[0]), int(run[-1])))
+                around = weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum(axis=1)
+                mass = float(around.sum())
+                # the lines beside a thin row hold as much in their three bins as its own
+                support = len(run) + mass / (1 + mass)
+                candidates.append((support, float(around[1]), int(line), int(run[0]), int(run[-1])))
     lines = _joined(_strongest(candidates), weight > 0)
     order = np.argsort(v, kind="stable")
     out = []
@@ -275,10 +278,10 @@ def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     return sorted(out, key=lambda row: row.v)
 
 
-def _strongest(candidates: list[tuple[float, int, int, int]]) -> list[tuple[int, int, int]]:
+def _strongest(candidates: list[tuple[float, float, int, int, int]]) -> list[tuple[int, int, int]]:
     """Return (line, first, last) of the segments beside which there is no stronger one, in the order of lines."""
     taken: list[tuple[int, int, int]] = []
-    for _, line, first, last in sorted(candidates, reverse=True):
+    for _, _, line, first, last in sorted(candidates, reverse=True):
         if not any(abs(line - k) <= 2 and min(last, b) >= max(first, a) for k, a, b in taken):
             taken.append((line, first, last))
     return sorted(taken)

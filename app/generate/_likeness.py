@@ -185,11 +185,13 @@ def _objects(layers: Layers) -> Rows | None:
 
 def _axis(shape: Any) -> tuple[Array, float] | None:
     """Return (ends, width) of a shape that is longer than wide."""
+    if shape.is_empty:
+        return None
     if shape.geom_type == "LineString":
         ends = shapely.get_coordinates(shape)[[0, -1]]
         long = float(np.hypot(*(ends[1] - ends[0])))
         return (ends, 0.0) if long >= max(MIN_ROW_METRES, 0.9 * shape.length) else None
-    if shape.geom_type != "Polygon" or shape.is_empty:
+    if shape.geom_type != "Polygon":
         return None
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))
     if len(corners) < 5:

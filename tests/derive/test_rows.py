@@ -199,3 +199,12 @@ def test_single_row_has_no_network() -> None:
     row = features([("r1", shapely.LineString([(0, 0), (9, 0)]), {"kind": "row"})], "local")
     with pytest.raises(CannotDerive, match="no two rows are parallel"):
         derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): row}))
+
+
+@pytest.mark.parametrize("thick", [1, 2])
+def test_rows_one_cell_thick_are_found(thick: int) -> None:
+    mask = np.zeros((150, 200), bool)
+    for k in range(5):
+        mask[20 + 25 * k : 20 + 25 * k + thick, 20:180] = True
+    (field,) = find_fields(mask, 0.1, 0.0, 0.0)
+    assert [row.v for row in field.rows] == pytest.approx([2.0 + 2.5 * k + 0.05 * thick for k in range(5)], abs=0.1)
