@@ -61,7 +61,9 @@ class MergeBody(RequestModel):
         description="Where grids disagree: `evidence` counts occupied and free observations of all grids, in doubt "
         "occupied; with `newest` the last of `grids` that knows the cell decides.",
     )
-    drop: bool = Field(False, description="Delete the other grids. Default: they stay as they are.")
+    drop: bool = Field(
+        False, description="Delete the grids that were merged; the result stays. Default: they stay as they are."
+    )
     pairs: dict[str, Annotated[list[tuple[Place, Place]], Field(min_length=2, max_length=1000)]] = Field(
         default_factory=dict,
         max_length=MAX_GRIDS,
@@ -71,11 +73,14 @@ class MergeBody(RequestModel):
     poses: dict[str, tuple[Metres, Metres, Degrees]] = Field(
         default_factory=dict,
         max_length=MAX_GRIDS,
-        description="By grid: rough position [x, y, degrees] of its frame in the first one's. The search is limited "
-        "to `angle` (default: 20) and `reach` (default: 2) around it.",
+        description="By grid: rough position of its frame in the first one's, [x, y] in metres and the rotation in "
+        "degrees. The search is limited to `angle` (default: 20°) and `reach` (default: 2 m) around it.",
     )
     overlap: float = Field(
-        0.1, ge=0, le=1, description="Minimum share of a grid that others must have in common with it, from 0 to 1."
+        0.1,
+        ge=0,
+        le=1,
+        description="Minimum area that a grid has in common with the others: a share of the smaller one, 0 to 1.",
     )
 
 
@@ -181,7 +186,7 @@ def create_alignment(env: EnvironmentPath, body: AlignmentBody, services: Servic
 
 def _alignment_request(body: AlignmentBody) -> AlignmentRequest:
     if (body.onto is None) == (body.pairs is None):
-        reason = "give either onto or pairs, or merge"
+        reason = "give one of onto, pairs and merge"
         raise Invalid(reason, [Problem(reason, where="body.onto")])
     onto = body.onto or OntoBody.model_validate({})
     return AlignmentRequest(

@@ -83,7 +83,7 @@ def align(
     merge: Merge = False,
     name: Name = None,
     seam: Seam = None,
-    drop: Annotated[bool, typer.Option("--drop", help="Delete the other grids after --merge.")] = False,
+    drop: Annotated[bool, typer.Option("--drop", help="Delete the grids that were merged; the result stays.")] = False,
     pose: Pose = None,
     overlap: Overlap = None,
     angle: Annotated[

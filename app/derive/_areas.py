@@ -40,7 +40,7 @@ def keep_names(areas: Sequence[Area], stored: Features | None, frame: LocalFrame
     """
     if stored is None or not len(stored):
         return _numbered(list(areas), {}, [], {})
-    old = stored.in_local(frame)
+    old = shapely.make_valid(stored.in_local(frame))  # drawn outlines may cross themselves
     pairs = []
     tree = shapely.STRtree(old)
     for i, (kind, shape, _) in enumerate(areas):
@@ -49,9 +49,11 @@ def keep_names(areas: Sequence[Area], stored: Features | None, frame: LocalFrame
             if score > 0.0:
                 pairs.append((-score, i, k))
     matches: dict[int, int] = {}
+    used: set[int] = set()
     for _, i, k in sorted(pairs):
-        if i not in matches and k not in matches.values():
+        if i not in matches and k not in used:
             matches[i] = k
+            used.add(k)
     names = [(stored.ids[k], stored.properties[k]) for k in range(len(stored))]
     taken = [i for i, _ in names] + [str(p.get("name", "")) for _, p in names]
     return _numbered(list(areas), matches, taken, dict(enumerate(names)))

@@ -40,7 +40,8 @@ def choose_method(picture: GeoImage, how: Segmentation) -> str:
     wrong = [n for n in changed if method not in METHOD_PARAMETERS.get(n, (method,))]
     if wrong:
         problems = [
-            Problem(f"applies only to segmentation={METHOD_PARAMETERS[n][0]}, not to {method}", where=n) for n in wrong
+            Problem(f"applies only to segmentation={' or '.join(METHOD_PARAMETERS[n])}, not to {method}", where=n)
+            for n in wrong
         ]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
     return method

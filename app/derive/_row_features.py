@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
-from app.derive._rows import RowField, find_fields
+from app.derive._rows import MAX_CELL, RowField, find_fields
 from app.errors import CannotConvert
 
 ROWS = "rows"
@@ -24,21 +24,28 @@ Item = tuple[str, Any, dict[str, Any]]
 
 
 def fields_of(
-    masks: Sequence[NDArray[np.bool_]], size: float, left: float, bottom: float, notes: DerivationNotes, name: str
+    masks: Sequence[NDArray[np.bool_]],
+    size: float,
+    origin: tuple[float, float, float],
+    notes: DerivationNotes,
+    name: str,
 ) -> list[RowField]:
-    """Return the fields in the mask whose rows are clearest. masks: [h, w], row 0 at the bottom, the
-    likeliest first.
+    """Return the fields in the mask whose rows are clearest.
 
-    Raises CannotConvert if no mask has rows.
+    masks: [h, w], row 0 at the bottom, the likeliest first. size: metres of a cell. origin: (x, y, yaw) of the lower
+    left corner, in local metres and radians. Raises CannotConvert if no mask has rows.
     """
-    first = [find_fields(mask, size, left, bottom, limit=1) for mask in masks]
+    if size > MAX_CELL:
+        raise CannotConvert(f"{name} has cells of {size:g} m, too coarse for rows: use one of {MAX_CELL:g} m or finer")
+    first = [find_fields(mask, size, *origin, limit=1) for mask in masks]
     # where plants are dark, the aisles are bright rows, too: a later mask must be clearly better
     scores = [(fields[0].score if fields else 0.0) / CLEARER**k for k, fields in enumerate(first)]
     clearest = int(np.argmax(scores))
-    best = find_fields(masks[clearest], size, left, bottom) if scores[clearest] else []
+    best = find_fields(masks[clearest], size, *origin) if scores[clearest] else []
     if not best:
         raise CannotConvert(
-            f"{name} shows no parallel rows: at least 3 of 5 m or more are needed, at regular distances up to 15 m"
+            f"{name} shows no parallel rows, at least 3 of 5 m or more at regular distances up to 15 m: draw them as "
+            "lines of kind row"
         )
     if any(field.regular < 1.0 for field in best):
         notes.warn("some rows are missing, or at irregular distances: review them before robots use them", where=name)

@@ -21,6 +21,12 @@ Array = NDArray[np.float64]
 MAX_CELLS = 2**21
 """Maximum number of cells of a mask; larger ones are coarsened."""
 
+MAX_CELL = 2.0
+"""Largest cell in metres in which rows can be told apart."""
+
+MAX_STEPS = 2**25
+"""Maximum number of steps on all lines of a direction: those across a mask of many kilometres have more."""
+
 SAMPLE = 40_000
 """Maximum number of cells from which directions are computed."""
 
@@ -117,19 +123,27 @@ def half_turn(yaw: float) -> float:
     return (yaw + math.pi / 4) % math.pi - math.pi / 4
 
 
-def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float, limit: int = 8) -> list[RowField]:
+def find_fields(
+    mask: NDArray[np.bool_], size: float, left: float, bottom: float, yaw: float = 0.0, limit: int = 8
+) -> list[RowField]:
     """Return the fields of rows in a mask [h, w], row 0 at the bottom, the best first.
 
-    size: metres of a cell. left, bottom: local metres of its lower left corner. limit: maximum number of fields.
+    size: metres of a cell. left, bottom: local metres of its lower left corner. yaw: rotation of the mask around that
+    corner in radians. limit: maximum number of fields.
     """
+    corner = np.array([left, bottom])
     filled, crossed = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(filled):
         return []
     mask = mask[filled[0] : filled[-1] + 1, crossed[0] : crossed[-1] + 1]
     left, bottom = left + int(crossed[0]) * size, bottom + int(filled[0]) * size
     mask, size = _coarse(mask, size)
+    if size > MAX_CELL:
+        return []
     rows, columns = np.nonzero(mask)
     xy = np.column_stack([left + (columns + 0.5) * size, bottom + (rows + 0.5) * size])
+    if yaw:
+        xy = np.column_stack(_turned(xy - corner, -yaw)) + corner
     out: list[RowField] = []
     while len(xy) >= 2 * MIN_ROWS and len(out) < limit:
         best = max(_candidates(xy, size), key=_score, default=None)
@@ -232,19 +246,24 @@ def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     low_u, low_v = float(u.min()), float(v.min())
     i = np.floor((u - low_u) / ALONG).astype(np.int64)
     j = np.floor((v - low_v) / across).astype(np.int64)
+    if (int(j.max()) + 3) * (int(i.max()) + 1) > MAX_STEPS:
+        return []
     weight = np.zeros((int(j.max()) + 3, int(i.max()) + 1))
     np.add.at(weight, (j + 1, i), 1.0)
     steps = weight > 0
     # three bins together: a row is not exactly on one line
     steps[1:-1] |= steps[:-2] | steps[2:]
-    candidates: list[tuple[float, int, int, int]] = []
+    candidates: list[tuple[float, float, int, int, int]] = []
     for line in np.flatnonzero(steps.sum(axis=1) * ALONG >= FILL * MIN_LENGTH):
         filled = np.flatnonzero(steps[line])
         for run in np.split(filled, np.flatnonzero(np.diff(filled) * ALONG > GAP) + 1):
             length = (run[-1] - run[0] + 1) * ALONG
             if length >= MIN_LENGTH and len(run) * ALONG >= FILL * length:
-                mass = float(weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum())
-                candidates.append((len(run) + mass / (1 + mass), int(line), int(run[0]), int(run[-1])))
+                around = weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum(axis=1)
+                mass = float(around.sum())
+                # the lines beside a thin row hold as much in their three bins as its own
+                support = len(run) + mass / (1 + mass)
+                candidates.append((support, float(around[1]), int(line), int(run[0]), int(run[-1])))
     lines = _joined(_strongest(candidates), weight > 0)
     order = np.argsort(v, kind="stable")
     out = []
@@ -259,10 +278,10 @@ def _segments(xy: Array, yaw: float, across: float) -> list[Row]:
     return sorted(out, key=lambda row: row.v)
 
 
-def _strongest(candidates: list[tuple[float, int, int, int]]) -> list[tuple[int, int, int]]:
+def _strongest(candidates: list[tuple[float, float, int, int, int]]) -> list[tuple[int, int, int]]:
     """Return (line, first, last) of the segments beside which there is no stronger one, in the order of lines."""
     taken: list[tuple[int, int, int]] = []
-    for _, line, first, last in sorted(candidates, reverse=True):
+    for _, _, line, first, last in sorted(candidates, reverse=True):
         if not any(abs(line - k) <= 2 and min(last, b) >= max(first, a) for k, a, b in taken):
             taken.append((line, first, last))
     return sorted(taken)

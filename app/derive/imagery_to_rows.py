@@ -52,7 +52,7 @@ def imagery_to_rows(layers: Layers, parameters: Parameters, notes: DerivationNot
         name = picture_label(key)
         on = ground(picture, layers.frame, parameters.resolution, notes, name)
         bottom = on.top - on.resolution * on.valid.shape[0]
-        fields = fields_of([mask[::-1] for mask in _masks(on)], on.resolution, on.left, bottom, notes, name)
+        fields = fields_of([mask[::-1] for mask in _masks(on)], on.resolution, (on.left, bottom, 0.0), notes, name)
         rows = row_items(fields, parameters.headland_depth)
         if on.on_earth and on.frame is not None:
             back = on.frame.geometries_to_wgs84(np.array([g for _, g, _ in rows], object))

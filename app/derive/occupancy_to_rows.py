@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from app.derive import DerivationNotes, derives
 from app.derive._row_features import ROWS, fields_of, row_items
-from app.errors import CannotConvert
 from app.model.features import features
 from app.model.grid import OCCUPIED
 from app.model.layers import Layers, Part, PartKey
@@ -37,9 +36,6 @@ def occupancy_to_rows(layers: Layers, parameters: Parameters, notes: DerivationN
     parts: dict[PartKey, Part] = {}
     for key, grid in select_grids(layers, parameters.grid, "rows").items():
         label = grid_label(key)
-        x, y, yaw = grid.origin
-        if yaw:
-            raise CannotConvert(f"{label} is rotated by {yaw:g} rad: rows are found in grids without rotation")
-        fields = fields_of([grid.cells == OCCUPIED], grid.resolution, x, y, notes, label)
+        fields = fields_of([grid.cells == OCCUPIED], grid.resolution, grid.origin, notes, label)
         parts[PartKey("objects", key.level, ROWS)] = features(row_items(fields, parameters.headland_depth), "local")
     return Layers(parts, layers.datum, layers.levels)

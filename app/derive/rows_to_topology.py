@@ -73,6 +73,8 @@ def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNo
     for level, drawn in by_level.items():
         grid = layers.grids().get(PartKey("occupancy", level, MAP))
         fields = _fields(concatenate(drawn), layers)
+        if not fields:
+            raise CannotConvert("no two rows are parallel: draw or derive at least two rows of a field")
         network = _Network(parameters, grid)
         for number, one in enumerate(fields, 1):
             network.add(one, "" if len(fields) == 1 else f"f{number}-")

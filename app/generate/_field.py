@@ -367,7 +367,7 @@ def _bend(out: Field, layout: Layout, length: float | None) -> None:
         raise invalid_option_error(
             "curve",
             f"{layout.curve:g} m is too much for rows of {max(high - low, 0.0):.0f} m: they would turn by more than "
-            f"{math.degrees(math.atan(MAX_SLOPE)):.0f}°",
+            f"{math.degrees(math.atan(MAX_SLOPE)):.0f}°; use less",
         )
 
 
@@ -450,7 +450,7 @@ def _lay(out: Field, lines: Sequence[Line], layout: Layout, *, count_lost: bool)
         raise invalid_option_error(
             "yard",
             f"the fence has no room for a lane of {options.headland + MIN_AISLE_METRES:g} m behind a yard of "
-            f"{options.yard:g} m",
+            f"{options.yard:g} m: use a smaller yard or headland",
         )
     limit = options.row_length if site.is_given else None
     lane = _longest_aisle(lane, limit, options)

@@ -140,8 +140,8 @@ def _direction(ends: Array) -> float:
     step = ends[:, 1] - ends[:, 0]
     length, turn = np.hypot(*step.T), np.arctan2(step[:, 1], step[:, 0]) % math.pi
     bins = np.arange(180) * math.pi / 180
-    away = np.abs(turn[:, None] - bins[None])
-    weight = (length[:, None] * (np.minimum(away, math.pi - away) <= MAX_TURN)).sum(axis=0)
+    away = (np.abs(turn - one) for one in bins)  # one at a time: a network may have a million edges
+    weight = [float(length[np.minimum(a, math.pi - a) <= MAX_TURN].sum()) for a in away]
     best = bins[int(np.argmax(weight))]
     away = np.abs(turn - best)
     near = np.minimum(away, math.pi - away) <= MAX_TURN
@@ -185,11 +185,13 @@ def _objects(layers: Layers) -> Rows | None:
 
 def _axis(shape: Any) -> tuple[Array, float] | None:
     """Return (ends, width) of a shape that is longer than wide."""
+    if shape.is_empty:
+        return None
     if shape.geom_type == "LineString":
         ends = shapely.get_coordinates(shape)[[0, -1]]
         long = float(np.hypot(*(ends[1] - ends[0])))
         return (ends, 0.0) if long >= max(MIN_ROW_METRES, 0.9 * shape.length) else None
-    if shape.geom_type != "Polygon" or shape.is_empty:
+    if shape.geom_type != "Polygon":
         return None
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shape))
     if len(corners) < 5:

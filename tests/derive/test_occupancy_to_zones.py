@@ -198,3 +198,9 @@ def test_area_beyond_the_network_is_reported() -> None:
 
 def test_zones_are_never_derived_for_a_map() -> None:
     assert derive.plan(frozenset({"occupancy"}), frozenset({"zones"})) is None
+
+
+def test_drawn_outline_that_crosses_itself_is_compared() -> None:
+    bow = shapely.Polygon([(0, 2), (5, 6.2), (5, 2), (0, 6.2)])
+    stored = features([("drawn", bow, {"kind": "room", "name": "Lab"})], "local")
+    assert {"room-1", "room-2"} & set(by_name(zones(flat(), stored)))

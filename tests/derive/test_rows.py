@@ -97,7 +97,7 @@ def test_strange_input_gives_clear_problem() -> None:
         derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(long, "local")}))
     odd = [shapely.Point(1, 1), shapely.LineString(), shapely.LineString([(0, 0, 1), (9, 0, 2)])]
     rows = [(f"r{k}", g, {"kind": "row", "field": [], "row_width": "wide"}) for k, g in enumerate(odd)]
-    with pytest.raises(CannotDerive, match="fits between no two rows"):
+    with pytest.raises(CannotDerive, match="no two rows are parallel"):
         derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")}))
 
 
@@ -171,3 +171,40 @@ def test_picture_without_rows_raises() -> None:
 
 def test_stop_positions_name_the_nodes_of_an_aisle() -> None:
     assert stop_positions(0.0, 14.0, 2.0, 5.0) == [("ca", 0.0), ("cb", 2.0), ("c0", 7.0), ("cy", 12.0), ("cz", 14.0)]
+
+
+def test_rows_of_a_rotated_grid_are_where_they_are() -> None:
+    yaw, corner = 0.6, (100.0, -40.0)
+    cells = np.where(drawn(lines(0.2)), OCCUPIED, FREE).astype(np.uint8)
+    turned = OccupancyGrid(cells, SIZE, (*corner, yaw))
+    site = derived("occupancy_to_rows", Layers({PartKey("occupancy", "ground", MAP): turned}))
+    rows = [g for g, _ in of(site, "objects", "row")]
+    assert len(rows) == 5
+    for line in lines(0.2):
+        moved = shapely.affinity.translate(shapely.affinity.rotate(line, yaw, origin=(0, 0), use_radians=True), *corner)
+        assert min(moved.interpolate(0.5, normalized=True).distance(row) for row in rows) < 0.15
+
+
+def test_cells_that_show_no_row_are_refused_at_once() -> None:
+    cells = np.where(np.indices((300, 300))[0] % 3 == 0, OCCUPIED, FREE).astype(np.uint8)
+    coarse = OccupancyGrid(cells, 100.0)
+    with pytest.raises(CannotDerive, match="cells of 100 m, too coarse for rows"):
+        derived("occupancy_to_rows", Layers({PartKey("occupancy", "ground", MAP): coarse}))
+    long = np.zeros((1, 200_000), bool)
+    long[0, ::7] = True
+    assert find_fields(long, 0.05, 0.0, 0.0) == []
+
+
+def test_single_row_has_no_network() -> None:
+    row = features([("r1", shapely.LineString([(0, 0), (9, 0)]), {"kind": "row"})], "local")
+    with pytest.raises(CannotDerive, match="no two rows are parallel"):
+        derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): row}))
+
+
+@pytest.mark.parametrize("thick", [1, 2])
+def test_rows_one_cell_thick_are_found(thick: int) -> None:
+    mask = np.zeros((150, 200), bool)
+    for k in range(5):
+        mask[20 + 25 * k : 20 + 25 * k + thick, 20:180] = True
+    (field,) = find_fields(mask, 0.1, 0.0, 0.0)
+    assert [row.v for row in field.rows] == pytest.approx([2.0 + 2.5 * k + 0.05 * thick for k in range(5)], abs=0.1)

@@ -157,6 +157,13 @@ def test_environment_without_rows_is_refused(layers: Layers) -> None:
         generate.run("orchard", 1, {"like": "farm"}, Layers(), DerivationNotes())
 
 
+def test_objects_without_a_shape_are_no_rows() -> None:
+    shapes = [shapely.LineString(), shapely.Polygon(), shapely.Point(1, 1), shapely.LineString([(0, 0), (0, 0)])]
+    rows = [(f"r{k}", shape, {"kind": "row"}) for k, shape in enumerate(shapes)]
+    with pytest.raises(CannotGenerate, match="nothing to measure"):
+        _likeness.measure(Layers({OBJECTS: features(rows, "local")}), NAMES, "farm")
+
+
 def test_like_over_http_reads_only_what_the_caller_may_read(api: Api) -> None:
     for name in ("like-model", "like-copy", "like-empty"):
         api.post("environments", {"name": name})
