@@ -131,5 +131,5 @@ def test_companions_are_those_of_the_format(shared: Path, tmp_path: Path) -> Non
 def test_unknown_generator_option_lists_accepted_ones(offline: Fleetmap, tmp_path: Path) -> None:
     result = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
     assert result.status == 1
-    assert "typo: unknown parameter of orchard: use one of crown_diameter," in result.err
+    assert "typo: unknown parameter of orchard: use one of angle, cross_aisles," in result.err
     assert "tmap2 accepts action," in result.err

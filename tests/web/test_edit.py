@@ -196,6 +196,7 @@ def test_two_editors_lose_nothing(server: WebServer, edit: Edit) -> None:
     for editing, x in ((anna, "14"), (ben, "13")):
         editing.tool("Select and move")
         editing.select("Node c")
+        expect(editing.page.get_by_label("x, metres")).to_have_value("16.125")  # else it may change under the typing
         editing.page.get_by_label("x, metres").fill(x)
         editing.page.get_by_label("x, metres").press("Enter")
     anna.save("c is at 14", 4)
