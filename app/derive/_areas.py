@@ -9,14 +9,12 @@ from typing import Any
 import shapely
 
 from app.derive import _reading_order
+from app.model.areas import AREA_KINDS
 from app.model.features import Features
 from app.model.geodesy import LocalFrame
 
 AREAS = "areas"
 """Name of the part of zones with the areas of a grid."""
-
-AREA_KINDS = ("room", "corridor", "door", "aisle", "row")
-"""Kinds of zones that name places."""
 
 STRIP_KINDS = ("aisle", "row")
 """Those that are numbered across the direction of their group."""
