@@ -15,6 +15,7 @@ from app.convert.drawing import Canvas, Colour, Pixels
 from app.convert.pyramid import Size
 from app.convert.voxel_tiles import Columns
 from app.derive.zones_to_occupancy import KEEPOUTS, LANES, SPEEDS
+from app.model.areas import AREA_COLOUR, AREA_KINDS, AREA_OPACITY, DARK_AREA_COLOUR
 from app.model.features import Features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN
 from app.model.layers import VECTOR_LAYERS, PartKey
@@ -41,6 +42,7 @@ class Theme:
     lane: Colour
     speed: Colour
     zone: Colour
+    area: Colour
     text: Colour
     brightness: float = 1.0
 
@@ -59,6 +61,7 @@ THEMES: Mapping[ThemeName, Theme] = {
         lane=(34, 146, 86),
         speed=(214, 138, 22),
         zone=(118, 92, 190),
+        area=AREA_COLOUR,
         text=(96, 104, 114),
     ),
     "dark": Theme(
@@ -74,6 +77,7 @@ THEMES: Mapping[ThemeName, Theme] = {
         lane=(74, 196, 128),
         speed=(240, 178, 74),
         zone=(160, 138, 236),
+        area=DARK_AREA_COLOUR,
         text=(150, 158, 168),
         brightness=0.7,
     ),
@@ -165,13 +169,14 @@ class Painter:
 
     def _draw_zones(self, canvas: Canvas, part: Shapes, weight: float) -> None:
         theme, shapes = self._theme, part.geometry
-        named = ((KEEPOUTS, theme.keepout), (LANES, theme.lane), (SPEEDS, theme.speed))
-        group = np.array([next((k for k, (names, _) in enumerate(named) if kind in names), -1) for kind in part.kinds])
-        for k, colour in ((-1, theme.zone), (1, theme.lane), (2, theme.speed), (0, theme.keepout)):
+        named = (KEEPOUTS, LANES, SPEEDS, AREA_KINDS)
+        group = np.array([next((k for k, names in enumerate(named) if kind in names), -1) for kind in part.kinds])
+        drawn = (3, theme.area), (-1, theme.zone), (1, theme.lane), (2, theme.speed), (0, theme.keepout)
+        for k, colour in drawn:
             chosen = shapes[group == k]
             if len(chosen):
-                canvas.areas(chosen, colour, 0.2)
-                canvas.lines(chosen, colour, 1.1 * weight, 0.8)
+                canvas.areas(chosen, colour, AREA_OPACITY if k == 3 else 0.2)
+                canvas.lines(chosen, colour, (0.8 if k == 3 else 1.1) * weight, 0.8)
 
     def _draw_objects(self, canvas: Canvas, part: Shapes, weight: float) -> None:
         raster, shapes = self._over_raster, part.geometry

@@ -39,7 +39,7 @@ PreviewLayer = Literal["imagery", "voxels", "occupancy", "zones", "objects", "to
 LAYERS: tuple[PreviewLayer, ...] = get_args(PreviewLayer)
 """Layers of a preview, from the bottom up."""
 
-WRITER = 1
+WRITER = 2
 """Version of the picture: raise it whenever equal content gives another one."""
 
 MIN_WIDTH, MAX_WIDTH, DEFAULT_WIDTH = 64, 2048, 640

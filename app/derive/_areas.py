@@ -6,17 +6,18 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import shapely
 
+from app.derive import _reading_order
+from app.model.areas import AREA_KINDS
 from app.model.features import Features
 from app.model.geodesy import LocalFrame
 
 AREAS = "areas"
 """Name of the part of zones with the areas of a grid."""
 
-AREA_KINDS = ("room", "corridor", "door", "aisle", "row")
-"""Kinds of zones that name places."""
+STRIP_KINDS = ("aisle", "row")
+"""Those that are numbered across the direction of their group."""
 
 SAME = 0.3
 """Minimum overlap (intersection over union) of an area with a stored one whose name it keeps."""
@@ -36,7 +37,7 @@ def keep_names(areas: Sequence[Area], stored: Features | None, frame: LocalFrame
     """Return areas as rows of features: those that match a stored one with its id, name and further properties.
 
     areas: kind, polygon in metres, properties. Of several matches the largest overlap wins. Other areas are called
-    by their kind and the next numbers, from north to south, then from west to east.
+    by their kind and the next numbers, in the order of ``_reading_order``.
     """
     if stored is None or not len(stored):
         return _numbered(list(areas), {}, [], {})
@@ -81,7 +82,7 @@ def _numbered(
             kind = name.rpartition("-")[0]
             highest[kind] = max(highest[kind], int(m[1]))
     rows: list[Row] = []
-    for i in sorted(range(len(areas)), key=lambda i: _position(areas[i][1])):
+    for i in _order(areas):
         kind, shape, words = areas[i]
         if i in matches:
             area_id, before = old[matches[i]]
@@ -94,7 +95,11 @@ def _numbered(
     return rows
 
 
-def _position(shape: Any) -> tuple[float, float]:
-    """Return the order of numbers: from north to south in bands of a metre, then from west to east."""
-    x, y = shapely.get_coordinates(shapely.centroid(shape))[0]
-    return (-np.floor(y), x)
+def _order(areas: Sequence[Area]) -> list[int]:
+    """Return the areas kind by kind, in the order of their numbers."""
+    out: list[int] = []
+    for kind in AREA_KINDS:
+        index = [i for i, area in enumerate(areas) if area[0] == kind]
+        order = _reading_order.strips if kind in STRIP_KINDS else _reading_order.places
+        out += [index[k] for k in order([areas[i][1] for i in index])]
+    return out

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive._areas import AREA_KINDS
+from app.model.areas import AREA_KINDS
 from app.model.features import Features, Properties, from_columns, points, unique_ids
 from app.model.layers import Layers
 

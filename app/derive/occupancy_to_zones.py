@@ -6,7 +6,8 @@ thin lines, as of plants; aisles elsewhere. Open ground has no rooms.
 
 The part ``areas`` has one polygon each, with ``kind``, ``name``, ``area`` (m²), ``width`` (m; of a room, the diameter
 of the largest free circle) and ``confidence``: the share of a room's outline that is wall or door, of an aisle's
-shorter line that it faces, of a door's width that walls continue. Areas are numbered by kind from north to south.
+shorter line that it faces, of a door's width that walls continue. Areas are numbered by kind: rooms, corridors and
+doors as people read, rows and aisles group by group, in order across their direction (``_reading_order``).
 
 Names last: an area that overlaps one of the same kind in the stored part keeps its id, name and further properties,
 also if these were edited; a new one gets the next number.
@@ -65,6 +66,7 @@ class Parameters:
     needs={"occupancy"},
     parameters=Parameters,
     cost=5.0,
+    version=2,
     also=frozenset({"zones"}),
     makes=frozenset({AREAS}),
 )

@@ -1,4 +1,4 @@
-"""Confidence in an unknown cell from a grid's known ones: straight walls that continue, free cells between free cells.
+"""Confidence in an unknown cell from a grid's known ones: walls that continue, free cells between free cells.
 
 Nothing is extrapolated: cells beyond the known ones stay unknown. How often a cell with given surroundings is free is
 counted in the grid itself, in holes that are cut into its known part and filled in again.
@@ -42,6 +42,9 @@ MAX_WIDTH_RATIO = 0.2
 """Minimum ratio of the variances along and across the end of a straight wall."""
 
 MAX_TURN = math.radians(8.0)
+MAX_BEND = math.radians(15.0)
+"""Maximum angle of a wall to the line that continues it straight, and of an arc's ends to its chord."""
+
 MAX_ENDS = 20_000
 
 
@@ -58,7 +61,7 @@ class Grid:
 
 
 def walls(grid: Grid, target: Bool) -> Bool:
-    """Return the wanted cells over which a straight wall continues from one known end to another."""
+    """Return the wanted cells over which a wall continues from one known end to another, straight on or in an arc."""
     import cv2
 
     out = np.zeros(target.shape, np.uint8)
@@ -67,27 +70,70 @@ def walls(grid: Grid, target: Bool) -> Bool:
     if not 2 <= len(at) <= MAX_ENDS:
         return out.astype(bool)
     direction, straight = _directions(grid, at)
-    at, direction = at[straight], direction[straight]
-    if len(at) < 2:
-        return out.astype(bool)
     points = shapely.points(at[:, ::-1].astype(float))
-    pairs = shapely.STRtree(points).query(points, predicate="dwithin", distance=SPAN_METRES / grid.cell)
-    first, second = pairs[:, pairs[0] < pairs[1]]
-    across = at[second] - at[first]
+    ends = np.flatnonzero(straight)
+    pairs = shapely.STRtree(points).query(points[ends], predicate="dwithin", distance=SPAN_METRES / grid.cell)
+    first, second = ends[pairs[0]], pairs[1]
+    chosen = (first < second) | ~straight[second] & (first != second)
+    first, second = first[chosen], second[chosen]
+    continues, bend = _continues(grid, at, direction, straight, (first, second))
+    seen_free = grid.observed & ~grid.occupied
+    rows = zip(at[first[continues]].tolist(), at[second[continues]].tolist(), bend[continues].tolist(), strict=True)
+    for a, b, turn in rows:
+        steps = max(abs(a[0] - b[0]), abs(a[1] - b[1]))
+        share = np.linspace(0.0, 1.0, steps + 1)[1:-1]
+        aside = turn * share * (1.0 - share)
+        row = np.round(a[0] + share * (b[0] - a[0]) + aside * (b[1] - a[1])).astype(int)
+        column = np.round(a[1] + share * (b[1] - a[1]) - aside * (b[0] - a[0])).astype(int)
+        inside = (row >= 0) & (row < target.shape[0]) & (column >= 0) & (column < target.shape[1])
+        # An arc needs a gap: beside a wall, ends near its corners look bent.
+        blocked = grid.observed if turn else seen_free
+        if len(row) and inside.all() and not blocked[row, column].any():
+            out[row, column] = 1
+    return out.astype(bool) & target
+
+
+def _continues(
+    grid: Grid, at: Places, direction: Array, straight: Bool, pairs: tuple[Places, Places]
+) -> tuple[Bool, Array]:
+    """Return for pairs of a straight end and another one whether a wall joins them, and the arc's angle to its chord.
+
+    Two straight ends are joined by a line, or by an arc if they turn alike. At an end that is not straight, another
+    wall may join: it is enough that a wall of the first one's direction continues there.
+    """
+    first, second = pairs
+    across = (at[second] - at[first]).astype(np.float64)
     length = np.hypot(*across.T)
     line = across / np.maximum(length, 1e-9)[:, None]
     slack = np.sin(MAX_TURN + np.arctan(0.7 / np.maximum(length, 1.0)))
-    aligned = np.ones(len(first), bool)
-    for end in (first, second):
-        turn = np.abs(direction[end, 0] * line[:, 1] - direction[end, 1] * line[:, 0])
-        aligned &= turn <= slack
-    seen_free = grid.observed & ~grid.occupied
-    for a, b in zip(at[first[aligned]].tolist(), at[second[aligned]].tolist(), strict=True):
-        steps = max(abs(a[0] - b[0]), abs(a[1] - b[1]))
-        row, column = (np.round(np.linspace(p, q, steps + 1)).astype(int)[1:-1] for p, q in zip(a, b, strict=True))
-        if len(row) and not seen_free[row, column].any():
-            out[row, column] = 1
-    return out.astype(bool) & target
+    turn = []
+    for end in pairs:
+        sign = np.where((direction[end] * line).sum(axis=1) < 0, -1.0, 1.0)
+        turn.append(sign * (direction[end, 0] * line[:, 1] - direction[end, 1] * line[:, 0]))
+    bend, skew = (turn[0] - turn[1]) / 2, (turn[0] + turn[1]) / 2
+    is_line = (np.abs(turn[0]) <= slack) & (np.abs(turn[1]) <= slack)
+    is_arc = (np.abs(skew) <= slack / 2) & (np.abs(bend) > slack) & (np.abs(bend) <= math.sin(MAX_BEND))
+    # An arc's ends are directed as in the middle of their walls, half a radius before the gap: it bends less within.
+    arc = bend * length / (length + WALL_RADIUS_METRES / grid.cell)
+    both = straight[second]
+    joins = ~both & (np.abs(turn[0]) <= slack)
+    joins[joins] = _is_wall_end(grid, at[second[joins]], line[joins])
+    return np.where(both, is_line | is_arc, joins), np.where(both & is_arc, arc, 0.0)
+
+
+def _is_wall_end(grid: Grid, at: Places, line: Array) -> Bool:
+    """Return whether a wall in a direction (rows, columns) begins at each position, longer than it is wide."""
+    reach = max(2, round(WALL_RADIUS_METRES / 2 / grid.cell))
+    padded = np.pad(grid.occupied, 2 * reach)
+    ahead = at[:, None] + np.arange(1, reach + 1)[None, :, None] * line[:, None]
+    middle = at + line * reach / 2
+    aside = np.stack([line[:, 1], -line[:, 0]], axis=1) * (reach / 2 + 1.0)
+    row, column = np.moveaxis(np.round(ahead).astype(int) + 2 * reach, 2, 0)
+    out = padded[row, column].all(axis=1)
+    for place in (middle + aside, middle - aside):
+        row, column = (np.round(place).astype(int) + 2 * reach).T
+        out &= ~padded[row, column]
+    return np.asarray(out)
 
 
 def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:

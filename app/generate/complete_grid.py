@@ -1,8 +1,8 @@
 """Fill in unknown cells of a grid from its known part, as far as they are certain.
 
-Walls that continue straight on the other side of an unknown area are completed. A cell becomes free if wave-function
-collapse with the known cells fixed (``_wfc``) gives that, and cells with the same surroundings are free often enough
-(``_evidence``). All others stay unknown. With ``confidence=0`` all cells are filled in.
+Walls that continue on the other side of an unknown area, straight or in an arc, are completed. A cell becomes free if
+wave-function collapse with the known cells fixed (``_wfc``) gives that, and cells with the same surroundings are free
+often enough (``_evidence``). All others stay unknown. With ``confidence=0`` all cells are filled in.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class Options:
     )
 
 
-@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=3)
+@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=4)
 def complete_grid(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
-    """Fill in unknown cells of a grid that are certain: walls that continue straight, free cells between free ones.
+    """Fill in unknown cells of a grid that are certain: walls that continue, free cells between free ones.
 
     Known cells do not change. Every filled-in window occurs in the known part if possible; warnings state how many do
     not, and how many cells stay unknown. Raises CannotGenerate if no cell is unknown, no window is known, no cell is

@@ -16,6 +16,7 @@ from app.convert.drawing import Colour
 from app.convert.painting import THEMES
 from app.derive.zones_to_occupancy import KEEPOUTS, LANES, SPEEDS
 from app.errors import NotFound
+from app.model.areas import AREA_KINDS, AREA_OPACITY
 from app.ogc import wmts
 from app.ogc.collections import notice
 from app.ogc.extensions import Collection, Extension, all_collections
@@ -123,12 +124,13 @@ def _style_edges(layer: etree._Element) -> None:
 def _style_zones(layer: etree._Element) -> None:
     renderer = _renderer(layer, "categorizedSymbol", attr="kind")
     categories, symbols = etree.SubElement(renderer, "categories"), etree.SubElement(renderer, "symbols")
-    groups = ((sorted(KEEPOUTS), THEME.keepout), (sorted(SPEEDS), THEME.speed), (sorted(LANES), THEME.lane),
-              ([""], THEME.zone))  # fmt: skip
-    rows = [(kind, colour) for kinds, colour in groups for kind in kinds]
-    for number, (kind, colour) in enumerate(rows):
+    quiet = round(255 * AREA_OPACITY)
+    groups = ((sorted(KEEPOUTS), THEME.keepout, 60), (sorted(SPEEDS), THEME.speed, 60),
+              (sorted(LANES), THEME.lane, 60), (AREA_KINDS, THEME.area, quiet), ([""], THEME.zone, 60))  # fmt: skip
+    rows = [(kind, colour, opacity) for kinds, colour, opacity in groups for kind in kinds]
+    for number, (kind, colour, opacity) in enumerate(rows):
         etree.SubElement(categories, "category", value=kind, label=kind or "other", symbol=str(number), render="true")
-        _symbol(symbols, str(number), "fill", _fill(colour, 60))
+        _symbol(symbols, str(number), "fill", _fill(colour, opacity))
 
 
 def _maplayer(layers: etree._Element, layer_id: str, title: str, provider: str, source: str) -> etree._Element:

@@ -23,6 +23,7 @@ from app.convert.preview import (
 )
 from app.convert.tiles import Tiles
 from app.errors import Invalid, NotFound
+from app.model.areas import AREA_OPACITY
 from app.model.features import features
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
@@ -118,7 +119,8 @@ def test_thin_walls_remain_visible_in_a_large_grid(site: Site) -> None:
 def test_themes_and_levels_of_drawing(site: Site) -> None:
     nodes = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(10, 4), {"kind": "node"})]
     edge = ("ab", shapely.LineString([(0, 0), (10, 4)]), {"kind": "edge", "source": "a", "target": "b"})
-    zone = features([("z", shapely.box(0, 0, 2, 4), {"kind": "keepout"})], "local")
+    areas = [("z", shapely.box(0, 0, 2, 4), {"kind": "keepout"}), ("r", shapely.box(8, 0, 10, 4), {"kind": "room"})]
+    zone = features(areas, "local")
     parts: dict[PartKey, Part] = {
         TOPOLOGY: features([*nodes, edge], "local"),
         PartKey("zones", "ground", "zones"): zone,
@@ -137,6 +139,8 @@ def test_themes_and_levels_of_drawing(site: Site) -> None:
         assert columns.min() / 800 == pytest.approx(0.04 + 0.92 / 12, abs=0.02)  # from (0, 0)
         tint = np.array(theme.background) * 0.8 + np.array(theme.keepout) * 0.2
         assert near(pixels, tint, 4).sum() > 0.05 * pixels[..., 0].size  # 2 × 4 of 12 × 6 m
+        tint = np.array(theme.background) * (1 - AREA_OPACITY) + np.array(theme.area) * AREA_OPACITY
+        assert near(pixels, tint, 4).sum() > 0.05 * pixels[..., 0].size
         fence = near(pixels, theme.fence, 30)
         row = int(np.argmax(fence.sum(axis=1)))
         assert 0.3 < fence[row, 60:740].mean() < 0.8  # dashed

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from numpy.typing import NDArray
 
 from app import derive
-from app.derive import DerivationNotes, _strips
+from app.derive import DerivationNotes, _reading_order, _strips
 from app.derive.occupancy_to_topology import Parameters as NetworkParameters
 from app.derive.occupancy_to_topology import occupancy_to_topology
 from app.derive.occupancy_to_zones import Parameters, occupancy_to_zones
@@ -96,6 +97,35 @@ def test_open_ground_has_no_rooms_but_rows() -> None:
         assert row["width"] == pytest.approx(2.3, abs=0.2)
         assert shapely.LineString([(3.5, shape.centroid.y), (14.5, shape.centroid.y)]).within(shape)
     assert found["row-1"][1].centroid.y > found["row-3"][1].centroid.y, "numbers go from north to south"
+
+
+def test_rows_side_by_side_are_numbered_across_their_direction() -> None:
+    hedges = [(3.0 + 2.5 * k, 3.0 + k % 3, 3.2 + 2.5 * k, 14.0 + k % 2) for k in range(12)]  # their ends differ
+    found = by_name(zones(draw(36.0, 19.0, hedges)))
+    assert len(found) == 11
+    east = [found[f"row-{k}"][1].centroid.x for k in range(1, 12)]
+    assert east == sorted(east)
+
+
+def turned(x: float, y: float, angle: float, length: float = 20.0) -> Any:
+    strip = shapely.affinity.rotate(shapely.box(-length / 2, -1, length / 2, 1), angle, origin=(0, 0))
+    return shapely.affinity.translate(strip, x, y)
+
+
+def test_groups_of_strips_are_numbered_one_after_the_other() -> None:
+    slope = [turned(4.0 * k, 3.0 * k + (-2.0) ** (k % 3), -53.0) for k in range(6)]
+    far = [turned(100.0, 40.0 - 4.0 * k, 0.0) for k in range(3)]
+    lane = [turned(-100.0, -40.0, 2.0), turned(-75.0, -40.3, 1.0), turned(-88.0, -45.0, 0.0)]
+    shapes = [*slope[::-1], *far, *lane]
+    assert _reading_order.strips(shapes) == [6, 7, 8, 5, 4, 3, 2, 1, 0, 9, 10, 11]
+    assert _reading_order.strips([]) == []
+
+
+def test_places_of_different_depth_are_read_in_lines() -> None:
+    upper = [shapely.box(10 * k, 20 - k % 2, 10 * k + 9, 26 + k % 3) for k in range(4)]
+    lower = [shapely.box(10 * k, 8 + k % 2, 10 * k + 9, 14) for k in range(4)]
+    shapes = [*lower[::-1], *upper[::-1]]
+    assert _reading_order.places(shapes) == [7, 6, 5, 4, 3, 2, 1, 0]
 
 
 def test_racks_in_a_hall_give_aisles() -> None:

@@ -166,7 +166,7 @@ rows = []
 for table in sys.argv[2:]:
     layer = QgsVectorLayer(f"{sys.argv[1]}|layername={table}", table, "ogr")
     _, ok = layer.loadDefaultStyle()
-    symbol = layer.renderer().symbol().symbolLayer(0).layerType()
+    symbol = layer.renderer().symbols(QgsRenderContext())[-1].symbolLayer(0).layerType()
     to = QgsCoordinateTransform(layer.crs(), QgsCoordinateReferenceSystem("EPSG:4326"), QgsProject.instance())
     corner = next(layer.getFeatures()).geometry().vertexAt(0)
     point = to.transform(corner.x(), corner.y())

@@ -18,6 +18,7 @@ from app import formats, generate
 from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.formats import ReadContext
+from app.generate import _evidence
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, PartKey
@@ -161,6 +162,33 @@ def test_wall_is_continued_and_cells_beyond_stay_unknown() -> None:
     (left,) = [d for d in notes.dropped if d.subject == "unknown cells"]
     assert left.count > 0
     assert "confidence of 0.98" in left.why
+
+
+def walls_over(occupied: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return _evidence.walls(_evidence.Grid(occupied & ~hole, ~hole, 0.05), hole)
+
+
+def test_wall_in_an_arc_is_continued_on_its_arc() -> None:
+    row, column = np.mgrid[:200, :200]
+    occupied = np.abs(np.hypot(row - 20, column - 20) - 150) <= 1.0  # a radius of 7.5 m
+    hole = np.zeros_like(occupied)
+    hole[106:146, 106:146] = True
+    wall = walls_over(occupied, hole)
+    near, back = (cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for mask in (occupied, wall))
+    assert (near & wall).sum() == wall.sum() > 30
+    assert (back & occupied & hole).sum() > 0.9 * (occupied & hole).sum()
+
+
+@pytest.mark.parametrize("stub", [8, 0])
+def test_wall_is_continued_to_its_corner_but_not_to_a_wall_across(stub: int) -> None:
+    occupied = np.zeros((140, 140), bool)
+    occupied[20:22, 30:110] = True  # another wall, which the upper end meets
+    occupied[20 : 22 + stub, 69:71] = True
+    occupied[62:130, 69:71] = True
+    hole = np.zeros_like(occupied)
+    hole[22 + stub : 62, 50:90] = True
+    wall = walls_over(occupied, hole)
+    assert wall.sum() == (2 * (40 - stub) if stub else 0), "a gap before a wall across may be a door"
 
 
 def test_higher_confidence_fills_fewer_cells() -> None:

@@ -79,7 +79,7 @@ register(
         check=rules.check,
         write=write,
         needs=NEEDS,
-        version=2,
+        version=3,
         write_options=WriteOptions,
         extensions=(".kml",),
         claims=Claims(priority=10, companions=companions),

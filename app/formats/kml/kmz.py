@@ -86,7 +86,7 @@ register(
         check=rules.check_archive,
         write=write,
         needs=replace(NEEDS, one_of=(*NEEDS.one_of, frozenset({"imagery"}))),
-        version=2,
+        version=3,
         extensions=(".kmz",),
         claims=Claims(priority=11),
         traits=Traits(family=FAMILY, is_drawing=True, marks_blocked=True, has_title=True),

@@ -25,6 +25,7 @@ from app.formats.kml.texts import (
     place_members,
 )
 from app.formats.kml.words import END, FAMILY, OWN_ELEMENT, OWN_KEYS, STYLE, escape, quote_attribute, spell
+from app.model.areas import AREA_COLOUR, AREA_KINDS, AREA_OPACITY
 from app.model.features import Features, Properties
 from app.model.frame import GROUND
 from app.model.geodesy import LocalFrame
@@ -47,6 +48,7 @@ NEEDS = LayerRequirements(
 )
 """Alternatives of layers that ``write_kml`` can draw."""
 
+_AREA = "{2:02x}{1:02x}{0:02x}".format(*AREA_COLOUR)
 _COLOURS = {
     "node": "<IconStyle><color>ff00a5ff</color><scale>0.6</scale><Icon><href>"
     "http://maps.google.com/mapfiles/kml/shapes/shaded_dot.png</href></Icon></IconStyle>",
@@ -55,6 +57,8 @@ _COLOURS = {
     "<PolyStyle><color>402f2fd3</color></PolyStyle>",
     "zone": "<LineStyle><color>ff2f2fd3</color><width>2</width></LineStyle>"
     "<PolyStyle><color>802f2fd3</color></PolyStyle>",
+    "area": f"<LineStyle><color>ff{_AREA}</color><width>1</width></LineStyle>"
+    f"<PolyStyle><color>{round(255 * AREA_OPACITY):02x}{_AREA}</color></PolyStyle>",
     "object": "<LineStyle><color>ffb0b0b0</color><width>2</width></LineStyle>"
     "<PolyStyle><color>60b0b0b0</color></PolyStyle>",
 }
@@ -221,7 +225,9 @@ def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Itera
 def _style(layer: Layer, properties: Properties) -> str:
     if layer == "topology":
         return "edge" if properties.get("kind") == "edge" else "node"
-    return {"location": "location", "zones": "zone"}.get(layer, "object")
+    if layer == "zones":
+        return "area" if properties.get("kind") in AREA_KINDS else "zone"
+    return "location" if layer == "location" else "object"
 
 
 def _local_texts(part: Features) -> list[str]:

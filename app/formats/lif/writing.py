@@ -255,7 +255,8 @@ class _Writer:
                 if theta is not None:
                     entry["theta"] = theta
         self.lost["altitudes of nodes"] += bool(node.z)
-        self.lost["attributes of nodes"] += bool(p.keys() - CANONICAL_NODE)
+        self.lost["areas of nodes"] += p.get("area") is not None
+        self.lost["attributes of nodes"] += bool(p.keys() - CANONICAL_NODE - {"area"})
         return out
 
     def _edge(self, edge: Edge, name: str, names: Sequence[str]) -> dict[str, Any]:

@@ -111,6 +111,25 @@ def typed_parameter(value: Any) -> Any:
     return value if kind is None else [kind, value]
 
 
+AREA = "area"
+"""Parameter of a vertex with the name of the room or aisle that it is in; Open-RMF's programs keep and ignore it."""
+
+
+def area_property(parameters: Mapping[str, Any], *, typed: bool) -> dict[str, str]:
+    """Return a node's property ``area`` from its vertex's parameters. typed: whether they are ``[type, value]``."""
+    area = parameter_value(parameters, AREA) if typed else parameters.get(AREA)
+    return {AREA: area} if isinstance(area, str) and area else {}
+
+
+def with_area(parameters: Mapping[str, Any], p: Properties, *, typed: bool) -> dict[str, Any]:
+    """Return the parameters of a vertex with its node's ``area``, without that of its source."""
+    out = {key: value for key, value in parameters.items() if key not in area_property(parameters, typed=typed)}
+    area = p.get(AREA)
+    if isinstance(area, str) and area:
+        out[AREA] = typed_parameter(area) if typed else area
+    return out
+
+
 def short(text: str, max_length: int = MAX_ID_CHARACTERS) -> str:
     """Shorten a text that is too long for an id to its start and a hash of the full text."""
     if len(text) <= max_length:

@@ -58,7 +58,7 @@ register(
         read=read,
         write=write,
         needs=LayerRequirements((*ANY_FEATURES, frozenset({"occupancy"}), frozenset({"imagery"}))),
-        version=2,
+        version=3,
         read_options=ReadOptions,
         write_options=WriteOptions,
         extensions=(".gpkg",),

@@ -1,8 +1,10 @@
-"""QGIS styles of the tables: arrows along edges, red zones, a dashed fence."""
+"""QGIS styles of the tables: arrows along edges, red zones, quiet rooms and aisles, a dashed fence."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+
+from app.model.areas import AREA_COLOUR, AREA_KINDS, AREA_OPACITY
 
 _ARROW = (
     "line",
@@ -37,10 +39,34 @@ STYLES: Mapping[str, tuple[str, str, dict[str, str]]] = {
 }
 """Symbol type, class of its layer and the layer's properties, by table."""
 
+_RGB = ",".join(map(str, AREA_COLOUR))
+KINDS: Mapping[str, Mapping[str, tuple[str, str, dict[str, str]]]] = {
+    "zones": dict.fromkeys(AREA_KINDS, _fill(f"{_RGB},{round(255 * AREA_OPACITY)}", f"{_RGB},255")),
+}
+"""Further symbols for values of ``kind``, by table."""
+
 
 def style(table: str) -> str:
     """Return a table's style as QML."""
-    kind, name, properties = STYLES[table]
+    kinds = KINDS.get(table, {})
+    symbols = [_symbol(number, shape) for number, shape in enumerate([STYLES[table], *kinds.values()])]
+    head = 'type="singleSymbol"'
+    categories = ""
+    if kinds:
+        head = 'type="categorizedSymbol" attr="kind"'
+        rows = [*enumerate(kinds, 1), (0, "")]  # the empty value stands for all others
+        listed = (f'<category value="{k}" label="{k or "other"}" symbol="{n}" render="true"/>' for n, k in rows)
+        categories = f"<categories>{''.join(listed)}</categories>"
+    return (
+        '<!DOCTYPE qgis PUBLIC "http://mrcc.com/qgis.dtd" "SYSTEM">'
+        '<qgis version="3.22" styleCategories="Symbology">'
+        f'<renderer-v2 {head} symbollevels="0" enableorderby="0" forceraster="0">{categories}'
+        f"<symbols>{''.join(symbols)}</symbols></renderer-v2></qgis>"
+    )
+
+
+def _symbol(number: int, shape: tuple[str, str, dict[str, str]]) -> str:
+    kind, name, properties = shape
     arrow = ""
     if name == "ArrowLine":
         colours = '<prop k="color" v="0,150,136,255"/><prop k="outline_style" v="no"/><prop k="style" v="solid"/>'
@@ -50,10 +76,6 @@ def style(table: str) -> str:
         )
     listed = "".join(f'<prop k="{key}" v="{value}"/>' for key, value in sorted(properties.items()))
     return (
-        '<!DOCTYPE qgis PUBLIC "http://mrcc.com/qgis.dtd" "SYSTEM">'
-        '<qgis version="3.22" styleCategories="Symbology">'
-        '<renderer-v2 type="singleSymbol" symbollevels="0" enableorderby="0" forceraster="0"><symbols>'
-        f'<symbol name="0" type="{kind}" alpha="1" clip_to_extent="1" force_rhr="0">'
+        f'<symbol name="{number}" type="{kind}" alpha="1" clip_to_extent="1" force_rhr="0">'
         f'<layer class="{name}" enabled="1" locked="0" pass="0">{listed}{arrow}</layer></symbol>'
-        "</symbols></renderer-v2></qgis>"
     )

@@ -15,12 +15,12 @@ A level has vertices ``[x, y, z, name, {parameters}]``; lanes, walls, doors, mea
 Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, transform.py, lift.py).
 
 Canonical: one topology part and one objects part per level. A vertex is a node, its id is its name, else
-``<level>/<index>``; a lane is an edge, a two-way lane two edges that are written as one lane. Walls, doors, floors,
-holes, models, lifts, fiducials, measurements and human lanes are objects of these kinds. ``properties.openrmf`` holds
-an item's position in its list (``index``), its ``parameters`` and its ``vertices``. The document's ``openrmf`` is
-``{building, level, order, transform}``: the file's top level without levels and lifts, the level without its lists,
-its position in the file, and [scale, rotation, x, y] from pixels (y up) to metres. Geometry takes precedence: an item
-moved by an edit gets vertices at its new position.
+``<level>/<index>``, its text parameter ``area`` the node's property; a lane is an edge, a two-way lane two edges that
+are written as one lane. Walls, doors, floors, holes, models, lifts, fiducials, measurements and human lanes are objects
+of these kinds. ``properties.openrmf`` holds an item's position in its list (``index``), its ``parameters`` and its
+``vertices``. The document's ``openrmf`` is ``{building, level, order, transform}``: the file's top level without levels
+and lifts, the level without its lists, its position in the file, and [scale, rotation, x, y] from pixels (y up) to
+metres. Geometry takes precedence: an item moved by an edit gets vertices at its new position.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         write_options=common.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
-        version=2,
+        version=3,
         selection=Selection(common.choose_building),
         claims=Claims(priority=40, companions=companion_hook(_FILENAME)),
         traits=Traits(keeps_bends="nodes", has_title=True),

@@ -230,7 +230,9 @@ class _Reader:
             if len(row) > 2 and row[2] != 0:
                 heights[k] = number(row[2], f"{level.location_of('vertices', k)}[2]")
             if len(row) > 4 and row[4]:
-                source_properties["parameters"] = mapping(row[4], f"{level.location_of('vertices', k)}[4]")
+                parameters = mapping(row[4], f"{level.location_of('vertices', k)}[4]")
+                source_properties["parameters"] = parameters
+                node_properties |= common.area_property(parameters, typed=True)
             if len(row) > 5:
                 source_properties["more"] = row[5:]
             node_properties[NAME] = source_properties

@@ -311,10 +311,11 @@ class _Writer:
                 **(parameters or {}),
                 **{key: common.typed_parameter(value) for key, value in further.items()},
             }
+        parameters = common.with_area(parameters or {}, p, typed=True)
         self.dropped["nodes' orientations"] += p.get("orientation") is not None
         row = f"[{position[0]}, {position[1]}, {yaml.text(round(z, METRES) + 0.0)}, {yaml.text(name)}"
         if parameters or source_members.get("more"):
-            row += f", {self.flow(parameters or {})}"
+            row += f", {self.flow(parameters)}"
         return row + "".join(f", {self.flow(v)}" for v in source_members.get("more") or ()) + "]"
 
     # lanes

@@ -230,6 +230,7 @@ def _network(name: str, level: _Level, taken: set[str]) -> Features:
             source_properties["parameters"] = {
                 key: value for key, value in source_properties["parameters"].items() if key != "name"
             }
+        item_properties |= common.area_property(source_properties["parameters"], typed=False)
         properties.append(compact({**item_properties, NAME: compact(source_properties)}))
         names.append(common.short(called) if "name" in item_properties else f"{common.short(name, 200)}/{k}")
     ids = unique_ids(names, taken)

@@ -357,7 +357,8 @@ class _Writer:
     def _vertices(self, storey: _LevelWriter, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
         texts = list(map(yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         for n, k in enumerate(order):
-            options = {**self._vertex(storey, k), **self.robots.vertex_properties(storey.name, storey.ids[k])}
+            vertex = common.with_area(self._vertex(storey, k), storey.nodes[k], typed=False)
+            options = {**vertex, **self.robots.vertex_properties(storey.name, storey.ids[k])}
             if options.get("name"):
                 names[str(options["name"])] += 1
             more = "".join(f", {self.flow(v)}" for v in get_source_properties(storey.nodes[k], NAME).get("more") or ())

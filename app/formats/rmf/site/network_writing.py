@@ -80,6 +80,7 @@ class NetworkWriter:
                 self.draft.docks[floor.storey.name, i] = str(parameters["dock_name"])
             self._location(anchor, name, parameters, mapping(members.get("locations"), "locations"))
             self.models.write_robot(floor, parameters, members, xyz)
+            parameters = common.with_area(parameters, p, typed=False)
             for key in parameters.keys() - WRITTEN_ELSEWHERE:
                 self.draft.dropped[f"vertices' {key}"] += 1
             if BUILDING not in p and NAV_GRAPH not in p:
