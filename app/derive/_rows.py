@@ -62,10 +62,14 @@ DIRECTIONS, FINE_DIRECTIONS = 6, 3
 REGULAR, MISSING = 0.25, 2
 """Tolerated deviation from the distance of rows, as a share of it, and maximum multiple of it at missing rows."""
 
-STRICT = 0.6
-"""Minimum share of regular distances of a field; else its rows may stand in beds, at up to BED times their distance."""
+STRICT = 0.5
+"""Minimum share of regular distances of a field whose rows stand in beds; beds of two rows have half."""
 
-BED = 3.0
+BED = 6.0
+"""Maximum distance between beds, as a multiple of that of their rows."""
+
+FINER = 0.4
+"""Minimum score of rows, as a share of that of thicker ones that they divide: the thick ones are beds."""
 
 MIN_CONTRAST = 0.35
 """Minimum contrast between rows and aisles; scattered cells have 0."""
@@ -176,13 +180,29 @@ def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float
     xy = np.column_stack([left + (columns + 0.5) * size, bottom + (rows + 0.5) * size])
     out: list[RowField] = []
     while len(xy) >= 2 * MIN_ROWS and len(out) < limit:
-        best = max(_candidates(xy, size), key=_score, default=[])
+        best = _finest(list(_candidates(xy, size)))
         if _score(best) < max(MIN_SCORE, MIN_SHARE * out[0].score if out else 0.0):
             break
         out += best
         for block in best:
             xy = xy[~_covered(block, xy)]
     return out[:limit]
+
+
+def _finest(candidates: list[list[RowField]]) -> list[RowField]:
+    """Return the best candidate, or the rows into which its rows divide if they are beds."""
+    best = max(candidates, key=_score, default=[])
+    if not best:
+        return []
+    length = sum(row.length for block in best for row in block.rows)
+    finer = [
+        blocks
+        for blocks in candidates
+        if _score(blocks) >= FINER * _score(best)
+        and blocks[0].spacing <= 0.7 * best[0].spacing
+        and sum(row.length for block in blocks for row in block.rows) >= 1.4 * length
+    ]
+    return max(finer, key=_score, default=best)
 
 
 def _score(blocks: list[RowField]) -> float:
@@ -226,7 +246,7 @@ def _directions(xy: Array, size: float) -> list[Course]:
     for k in sorted(peaks, key=lambda k: -energy[k])[:DIRECTIONS]:
         near = [Course(half_turn(math.radians(k / 2 + tenth / 10))) for tenth in range(-5, 6)]
         straight = max(near, key=lambda course: _energy(few, course, across))
-        if len(out) < FINE_DIRECTIONS:
+        if not out:
             bent = _bent(few, straight.yaw, across)
             if _energy(few, bent, across) >= BENT * _energy(few, straight, across):
                 straight = bent
@@ -235,24 +255,29 @@ def _directions(xy: Array, size: float) -> list[Course]:
 
 
 def _bent(few: Array, yaw: float, across: float) -> Course:
-    """Return the bent direction near a straight one that has the highest energy."""
+    """Return the bent direction near a straight one that has the highest energy.
+
+    Slopes shear the rows, so that they stay copies of each other; the direction is varied after that.
+    """
     centre = (few.min(axis=0) + few.max(axis=0)) / 2
 
-    def course(turn: float, bend: float) -> Course:
-        c, s = math.cos(turn), math.sin(turn)
-        return Course(turn, bend, c * float(centre[0]) + s * float(centre[1]))
+    def course(turn: float, slope: float, bend: float) -> Course:
+        u = math.cos(turn) * float(centre[0]) + math.sin(turn) * float(centre[1])
+        return Course(turn, bend, u - slope / (2 * bend))
 
     part = few[:: max(1, len(few) // (SAMPLE // 4))]
-    coarse = itertools.product(range(-6, 7), range(-BENDS, BENDS + 1))
-    wide = [course(yaw + math.radians(turn / 2), k * BEND) for turn, k in coarse]
-    best = max(wide, key=lambda one: _energy(part, one, 2 * across))
-    for degrees, step in ((0.2, FINE_BEND), (0.05, FINE_BEND / 4)):
-        fine = itertools.product(range(-3, 4), range(-4, 5))
-        near = [course(best.yaw + math.radians(turn * degrees), best.bend + k * step) for turn, k in fine]
-        best = max(near, key=lambda one: _energy(few, one, across))
-    turn = half_turn(best.yaw)
-    turned = abs(math.remainder(turn - best.yaw, 2 * math.pi)) > 1.0  # the other way round, aside is on the other side
-    return course(turn, -best.bend if turned else best.bend)
+    bends = [k * BEND for k in range(-BENDS, BENDS + 1) if k]
+    wide = [(yaw, k / 100, bend) for k in range(-20, 21, 2) for bend in bends]
+    best = max(wide, key=lambda one: _energy(part, course(*one), 2 * across))
+    for slope, bend, turn in ((0.004, FINE_BEND, 0.02), (0.001, FINE_BEND / 4, 0.005)):
+        a, b, c = best
+        near = [(a, b + k * slope, c + n * bend) for k in range(-4, 5) for n in range(-4, 5) if c + n * bend]
+        a, b, c = max(near, key=lambda one: _energy(few, course(*one), across))
+        best = max(
+            [(a + k * turn, b - k * turn, c) for k in range(-4, 5)],
+            key=lambda one: _energy(few, course(*one), across),
+        )
+    return course(*best)
 
 
 def _candidates(xy: Array, size: float) -> Iterator[list[RowField]]:
@@ -474,7 +499,9 @@ def _field(course: Course, chain: list[Row]) -> RowField | None:
         ratio = distances / spacing
         near = np.abs(ratio - np.clip(np.round(ratio), 1, MISSING)) <= REGULAR * np.clip(np.round(ratio), 1, MISSING)
         once = np.abs(ratio - 1.0) <= REGULAR
-        in_beds = (ratio >= 1 - REGULAR) & (ratio <= BED)
+        wider = ratio[(ratio > 1 + REGULAR) & (ratio <= BED)]
+        between = float(np.median(wider)) if len(wider) else 1.0
+        in_beds = near | (np.abs(ratio - between) <= REGULAR * between)
         for fits, factor in ((near, 1.0), (in_beds, 0.7)):
             for part in _runs(fits):
                 rows = chain[part[0] : part[1] + 1]
