@@ -53,6 +53,9 @@ COMMON = 0.2
 BENDS, BENT = 12, 1.1
 """Number of bends on each side, and minimum ratio of a bent direction's energy to the straight one's."""
 
+TURNED = 1.03
+"""Minimum ratio of a turned direction's energy: along slightly bent rows it hardly differs, and aisles across blur."""
+
 BEND, FINE_BEND = 5e-4, 1e-4
 """Steps of the bend in 1/m, coarse and fine: 5e-4 is 0.2 m in the middle of 40 m."""
 
@@ -76,6 +79,9 @@ MIN_CONTRAST = 0.35
 
 SIMILAR, BESIDE = 0.4, 0.5
 """Minimum ratio of a row's length to the median, and minimum share of a row that lies beside its neighbour."""
+
+FLANK = 1.0
+"""Maximum distance of lines of one row in metres: the flank of a crown is not a row of its own."""
 
 VALLEY = 0.5
 """Maximum ratio of the cells between two rows to those of the rows: more, and they are one thick row."""
@@ -273,10 +279,10 @@ def _bent(few: Array, yaw: float, across: float) -> Course:
         a, b, c = best
         near = [(a, b + k * slope, c + n * bend) for k in range(-4, 5) for n in range(-4, 5) if c + n * bend]
         a, b, c = max(near, key=lambda one: _energy(few, course(*one), across))
-        best = max(
-            [(a + k * turn, b - k * turn, c) for k in range(-4, 5)],
-            key=lambda one: _energy(few, course(*one), across),
-        )
+        turned = [(a + k * turn, b - k * turn, c) for k in range(-4, 5)]
+        other = max(turned, key=lambda one: _energy(few, course(*one), across))
+        gain = _energy(few, course(*other), across) / max(_energy(few, course(a, b, c), across), 1e-9)
+        best = other if gain >= TURNED else (a, b, c)
     return course(*best)
 
 
@@ -424,7 +430,7 @@ def _segments(xy: Array, course: Course, across: float) -> list[Row]:
             if length >= MIN_LENGTH and len(run) * ALONG >= FILL * length:
                 mass = float(weight[line - 1 : line + 2, run[0] : run[-1] + 1].sum())
                 candidates.append((len(run) + mass / (1 + mass), int(line), int(run[0]), int(run[-1])))
-    lines = _joined(_strongest(candidates), weight > 0)
+    lines = _joined(_strongest(candidates), weight > 0, max(6, round(FLANK / across)))
     order = np.argsort(v, kind="stable")
     out = []
     for top, below, first, last in lines:
@@ -447,17 +453,20 @@ def _strongest(candidates: list[tuple[float, int, int, int]]) -> list[tuple[int,
     return sorted(taken)
 
 
-def _joined(lines: list[tuple[int, int, int]], full: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
+def _joined(
+    lines: list[tuple[int, int, int]], full: NDArray[np.bool_], reach: int
+) -> list[tuple[int, int, int, int]]:
     """Join segments of one thick row: crowns are several lines wide, and no line between is empty.
 
-    Returns (first line, last line, first step, last step). full: bool [lines, steps].
+    Returns (first line, last line, first step, last step). full: bool [lines, steps]. reach: maximum number of
+    lines from one to the next.
     """
     groups: list[tuple[int, int, int, int]] = []
     for line, first, last in lines:
         for k in range(len(groups) - 1, -1, -1):
             top, below, a, b = groups[k]
             shared = min(last, b) - max(first, a) + 1
-            if line - below > 6 or shared < BESIDE * min(last - first + 1, b - a + 1):
+            if line - below > reach or shared < BESIDE * min(last - first + 1, b - a + 1):
                 continue
             part = full[below - 1 : line + 2, max(first, a) : min(last, b) + 1].mean(axis=1)
             if part[2:-2].min(initial=1.0) >= VALLEY * min(part[:3].max(), part[-3:].max()):
