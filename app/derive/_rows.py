@@ -111,7 +111,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Direction of rows: yaw at u = middle, from where they bend aside by bend (1/m) times the square of the distance."""
+    """Direction of rows: yaw at u = middle; from there they bend aside by bend (1/m) times the distance's square."""
 
     yaw: float
     bend: float = 0.0
@@ -248,7 +248,7 @@ def _directions(xy: Array, size: float) -> list[Course]:
     across = max(2 * size, 0.2)
     energy = np.array([_energy(few, Course(math.radians(k / 2)), across) for k in range(360)])
     peaks = [k for k in range(360) if energy[k] >= max(energy[k - 1], energy[(k + 1) % 360])]
-    out = []
+    out: list[Course] = []
     for k in sorted(peaks, key=lambda k: -energy[k])[:DIRECTIONS]:
         near = [Course(half_turn(math.radians(k / 2 + tenth / 10))) for tenth in range(-5, 6)]
         straight = max(near, key=lambda course: _energy(few, course, across))
@@ -368,7 +368,7 @@ def _between_crossings(clear: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _shortened(row: Row, beside: float, steps: NDArray[np.int64], low: float, u: Array, v: Array) -> Row | None:
-    """Return a row along the longest run of steps where it stands out, with its centre there, or None if it is short."""
+    """Return a row along the longest run of steps where it stands out, None if that is short."""
     if not len(steps):
         return None
     run = max(np.split(steps, np.flatnonzero(np.diff(steps) * ALONG > GAP) + 1), key=lambda part: (len(part), -part[0]))
@@ -453,9 +453,7 @@ def _strongest(candidates: list[tuple[float, int, int, int]]) -> list[tuple[int,
     return sorted(taken)
 
 
-def _joined(
-    lines: list[tuple[int, int, int]], full: NDArray[np.bool_], reach: int
-) -> list[tuple[int, int, int, int]]:
+def _joined(lines: list[tuple[int, int, int]], full: NDArray[np.bool_], reach: int) -> list[tuple[int, int, int, int]]:
     """Join segments of one thick row: crowns are several lines wide, and no line between is empty.
 
     Returns (first line, last line, first step, last step). full: bool [lines, steps]. reach: maximum number of
@@ -463,17 +461,19 @@ def _joined(
     """
     groups: list[tuple[int, int, int, int]] = []
     for line, first, last in lines:
-        for k in range(len(groups) - 1, -1, -1):
-            top, below, a, b = groups[k]
+        one, apart = (line, line, first, last), []
+        # a line may join several: the flanks of a row's halves, on both sides of an aisle that crosses it
+        for top, below, a, b in groups:
             shared = min(last, b) - max(first, a) + 1
-            if line - below > reach or shared < BESIDE * min(last - first + 1, b - a + 1):
-                continue
-            part = full[below - 1 : line + 2, max(first, a) : min(last, b) + 1].mean(axis=1)
-            if part[2:-2].min(initial=1.0) >= VALLEY * min(part[:3].max(), part[-3:].max()):
-                groups[k] = (top, line, min(a, first), max(b, last))
-                break
-        else:
-            groups.append((line, line, first, last))
+            joins = line - below <= reach and shared >= BESIDE * min(last - first + 1, b - a + 1)
+            if joins:
+                part = full[below - 1 : line + 2, max(first, a) : min(last, b) + 1].mean(axis=1)
+                joins = bool(part[2:-2].min(initial=1.0) >= VALLEY * min(part[:3].max(), part[-3:].max()))
+            if joins:
+                one = (min(top, one[0]), line, min(a, one[2]), max(b, one[3]))
+            else:
+                apart.append((top, below, a, b))
+        groups = [*apart, one]
     return groups
 
 

@@ -51,7 +51,7 @@ class Parameters:
     node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
 
 
-@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}))
+@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}), version=2)
 def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of the aisles between rows: nodes along each aisle, at its ends and in the headlands.
 
