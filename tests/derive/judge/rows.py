@@ -17,8 +17,8 @@ Made-up sites: only the picture is given to the derivation, rows and nodes are t
 
 A row is found if a derived line lies within 0.3 of the rows' distance at its middle, along at least half of it, within
 3°; each derived line counts once. Where an aisle crosses the rows, each piece is a row. The distance of rows is the
-median distance from a row to the nearest one that lies beside it. Errors of spacing and angle are those of the found rows. Of
-several seeds the worst value counts.
+median distance from a row to the nearest one that lies beside it. Errors of spacing and angle are those
+of the found rows. Of several seeds the worst value counts.
 
 The peer is the usual way: a probabilistic Hough transform of the mask of vegetation (excess green, Otsu) or of the
 occupied cells; segments along the most frequent direction are grouped into lines.
