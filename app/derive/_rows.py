@@ -186,7 +186,7 @@ def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float
     xy = np.column_stack([left + (columns + 0.5) * size, bottom + (rows + 0.5) * size])
     out: list[RowField] = []
     while len(xy) >= 2 * MIN_ROWS and len(out) < limit:
-        best = _finest(list(_candidates(xy, size)))
+        best = _finest_field(list(_candidates(xy, size)))
         if _score(best) < max(MIN_SCORE, MIN_SHARE * out[0].score if out else 0.0):
             break
         out += best
@@ -195,7 +195,7 @@ def find_fields(mask: NDArray[np.bool_], size: float, left: float, bottom: float
     return out[:limit]
 
 
-def _finest(candidates: list[list[RowField]]) -> list[RowField]:
+def _finest_field(candidates: list[list[RowField]]) -> list[RowField]:
     """Return the best candidate, or the rows into which its rows divide if they are beds."""
     best = max(candidates, key=_score, default=[])
     if not best:
@@ -253,14 +253,14 @@ def _directions(xy: Array, size: float) -> list[Course]:
         near = [Course(half_turn(math.radians(k / 2 + tenth / 10))) for tenth in range(-5, 6)]
         straight = max(near, key=lambda course: _energy(few, course, across))
         if not out:
-            bent = _bent(few, straight.yaw, across)
+            bent = _bent_course(few, straight.yaw, across)
             if _energy(few, bent, across) >= BENT * _energy(few, straight, across):
                 straight = bent
         out.append(straight)
     return out
 
 
-def _bent(few: Array, yaw: float, across: float) -> Course:
+def _bent_course(few: Array, yaw: float, across: float) -> Course:
     """Return the bent direction near a straight one that has the highest energy.
 
     Slopes shear the rows, so that they stay copies of each other; the direction is varied after that.
@@ -323,17 +323,17 @@ def _blocks(field: RowField, u: Array, v: Array) -> list[RowField]:
     clear = np.zeros((len(near), steps), bool)
     for k, (row, beside) in enumerate(zip(field.rows, near.tolist(), strict=True)):
         half = min(max(row.width / 2, beside / 8), beside / 4)
-        own, left, right = (
+        inside, left, right = (
             _density(u, v, centre, half if centre == row.v else beside / 8, low, steps)
             for centre in (row.v, row.v - beside / 2, row.v + beside / 2)
         )
-        clear[k] = (own > 0) & (own >= CLEAR * np.maximum(left, right))
+        clear[k] = (inside > 0) & (inside >= CLEAR * np.maximum(left, right))
     out = []
     support = sum(row.fill * row.length for row in field.rows) * min(1.0, (len(field.rows) - 1) / 4)
-    for first, last in _between_crossings(clear):
+    for first, last in _ranges_between_crossings(clear):
         rows = []
-        for row, beside, own in zip(field.rows, near.tolist(), clear, strict=True):
-            shorter = _shortened(row, beside, np.flatnonzero(own[first:last]) + first, low, u, v)
+        for row, beside, inside in zip(field.rows, near.tolist(), clear, strict=True):
+            shorter = _shortened_row(row, beside, np.flatnonzero(inside[first:last]) + first, low, u, v)
             rows += [shorter] if shorter is not None else []
         typical = float(np.median([row.length for row in rows])) if rows else 0.0
         rows = [row for row in rows if row.length >= SIMILAR * typical]
@@ -350,7 +350,7 @@ def _density(u: Array, v: Array, centre: float, half: float, low: float, steps: 
     return np.bincount(i[(i >= 0) & (i < steps)], minlength=steps) / (2 * half)
 
 
-def _between_crossings(clear: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _ranges_between_crossings(clear: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the ranges of steps between aisles across the rows. clear: bool [rows, steps], where plants stand out."""
     number = np.arange(clear.shape[1])
     filled = [np.flatnonzero(one) for one in clear if one.any()]
@@ -367,7 +367,7 @@ def _between_crossings(clear: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return list(itertools.pairwise([*cuts, clear.shape[1]]))[::2]
 
 
-def _shortened(row: Row, beside: float, steps: NDArray[np.int64], low: float, u: Array, v: Array) -> Row | None:
+def _shortened_row(row: Row, beside: float, steps: NDArray[np.int64], low: float, u: Array, v: Array) -> Row | None:
     """Return a row along the longest run of steps where it stands out, None if that is short."""
     if not len(steps):
         return None
