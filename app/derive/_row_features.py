@@ -59,7 +59,7 @@ def row_items(fields: Sequence[RowField], depth: float) -> list[Item]:
         prefix = f"field-{number}/"
         spacing, yaw = round(field.spacing, 3), round(math.degrees(field.yaw), 2)
         for k, row in enumerate(field.rows, 1):
-            ends = [field.to_local(row.low, row.v), field.to_local(row.high, row.v)]
+            line = field.line(row)
             properties = {
                 "kind": "row",
                 "name": f"Row {k}",
@@ -71,7 +71,7 @@ def row_items(fields: Sequence[RowField], depth: float) -> list[Item]:
                 "length": round(row.length, 3),
                 "confidence": round(min(0.99, field.regular * (0.5 + 0.5 * row.fill)), 3),
             }
-            out.append((f"{prefix}row-{k}", shapely.LineString(ends), properties))
+            out.append((f"{prefix}row-{k}", shapely.LineString(line), properties))
         for end, sign in (("first", -1.0), ("second", 1.0)):
             ends_u = [row.low if sign < 0 else row.high for row in field.rows]
             near = [field.to_local(u, row.v) for u, row in zip(ends_u, field.rows, strict=True)]

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes, derives
-from app.derive._rows import Row, RowField, half_turn
+from app.derive._rows import Course, Row, RowField, half_turn
 from app.errors import CannotConvert, Invalid, MissingLayer
 from app.model.aisles import stop_positions
 from app.model.features import Features, concatenate, features
@@ -30,6 +30,8 @@ PARALLEL = 10.0
 """Maximum difference of rows of one field in direction, in degrees."""
 
 Item = tuple[str, Any, dict[str, Any]]
+Drawn = tuple[NDArray[np.float64], Mapping[str, Any]]
+"""Positions [n, 2] of a drawn row, and its properties."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,7 @@ class Parameters:
     node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
 
 
-@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}))
+@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}), version=2)
 def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of the aisles between rows: nodes along each aisle, at its ends and in the headlands.
 
@@ -93,32 +95,52 @@ def _fields(drawn: Features, layers: Layers) -> list[RowField]:
         metres = drawn.in_local(layers.frame)
     except Invalid as error:  # too far from the datum
         raise CannotConvert(error.detail, error.problems) from error
-    groups: dict[Any, list[tuple[NDArray[np.float64], Mapping[str, Any]]]] = {}
+    groups: dict[Any, list[Drawn]] = {}
     for geometry, properties in zip(metres, drawn.properties, strict=True):
         if geometry.geom_type != "LineString" or geometry.length == 0:
             continue
-        ends = shapely.get_coordinates(geometry)[[0, -1], :2]
+        line = shapely.get_coordinates(shapely.force_2d(geometry))
+        ends = line[[0, -1]]
         angle = math.degrees(math.atan2(*(ends[1] - ends[0])[::-1])) % 180.0
         name = properties.get("field")
         near = (k for k in groups if isinstance(k, float) and abs((k - angle + 90) % 180 - 90) <= PARALLEL)
         group = name if isinstance(name, int | str) and not isinstance(name, bool) else next(near, float(angle))
-        groups.setdefault(group, []).append((ends, properties))
+        groups.setdefault(group, []).append((line, properties))
     return [_row_field(rows) for rows in groups.values() if len(rows) > 1]
 
 
-def _row_field(rows: list[tuple[NDArray[np.float64], Mapping[str, Any]]]) -> RowField:
-    """Return drawn rows as a field."""
-    steps = np.array([ends[1] - ends[0] for ends, _ in rows])
+def _row_field(rows: list[Drawn]) -> RowField:
+    """Return drawn rows as a field, with the bend that they have in common."""
+    steps = np.array([line[-1] - line[0] for line, _ in rows])
     double = 2 * np.arctan2(steps[:, 1], steps[:, 0])
     yaw = half_turn(math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2)
-    c, s = math.cos(yaw), math.sin(yaw)
+    course = _course(yaw, [line for line, _ in rows])
     out = []
-    for ends, properties in rows:
-        along, across = ends @ np.array([c, s]), ends @ np.array([-s, c])
+    for line, properties in rows:
+        along, across = course.turned(line)
         width = properties.get("row_width", properties.get("width"))
         thick = float(width) if isinstance(width, int | float) and not isinstance(width, bool) else 0.0
         out.append(Row(float(across.mean()), float(along.min()), float(along.max()), width=thick))
-    return RowField(yaw, tuple(sorted(out, key=lambda row: row.v)))
+    rows_in_order = tuple(sorted(out, key=lambda row: row.v))
+    return RowField(course.yaw, rows_in_order, bend=course.bend, middle=course.middle)
+
+
+def _course(yaw: float, lines: list[NDArray[np.float64]]) -> Course:
+    """Return the course of lines near a direction: straight, or the parabola of least squares if any is bent."""
+    if all(len(line) == 2 for line in lines):
+        return Course(yaw)
+    parts = [Course(yaw).turned(line) for line in lines]
+    middle = float(np.concatenate([u for u, _ in parts]).mean())
+    # each row has its own distance across: only the deviations from a row's mean tell slope and bend
+    terms = [np.column_stack([u - middle, (u - middle) ** 2]) for u, _ in parts]
+    left = np.concatenate([one - one.mean(axis=0) for one in terms])
+    right = np.concatenate([v - v.mean() for _, v in parts])
+    slope, bend = np.linalg.lstsq(left, right, rcond=None)[0].tolist()
+    turned = yaw + math.atan(slope)
+    c, s = math.cos(yaw - turned), math.sin(yaw - turned)
+    # the parabola seen along its tangent: to first order of the slope, its bend is the same
+    reference = np.concatenate([np.column_stack(part) for part in parts]).mean(axis=0)
+    return Course(turned, bend * c**3, c * middle - s * float(reference[1]))
 
 
 def _low_end(a: Row, b: Row) -> float:

@@ -72,6 +72,46 @@ def test_rows_of_lines_and_posts_are_found_in_grid(yaw: float, step: float) -> N
     assert all(0.5 <= p["confidence"] < 1.0 for _, p in found)
 
 
+def test_bent_rows_are_found_and_network_follows_them() -> None:
+    def bend(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.column_stack([xy[:, 0], xy[:, 1] + 0.005 * (xy[:, 0] - 12) ** 2])
+
+    rows = [shapely.transform(shapely.segmentize(line, 0.5), bend) for line in lines(0.0, spacing=2.0, length=20.0)]
+    site = derived("occupancy_to_rows", grid(drawn(rows, 0.1)))
+    found = [g for g, _ in of(site, "objects", "row")]
+    assert len(found) == 5
+    assert max(max(shapely.hausdorff_distance(line, g) for line in rows if line.distance(g) < 0.3) for g in found) < 0.5
+    edges = [g for g, p in of(derived("rows_to_topology", site), "topology", "edge") if p["action"] == "row_traversal"]
+    assert edges
+    assert min(shapely.union_all(rows).distance(g) for g in edges) > 0.7
+
+
+def test_aisle_across_divides_rows() -> None:
+    mask = drawn(lines(0.0, spacing=2.5, length=20.0))
+    mask[:, 105:135] = False
+    ends = [g.bounds for g, _ in of(derived("occupancy_to_rows", grid(mask)), "objects", "row")]
+    assert len(ends) == 10
+    assert all(high < 10.6 or low > 13.4 for low, _, high, _ in ends)
+
+
+def test_rows_in_beds_are_found_and_not_the_beds() -> None:
+    beds = [
+        shapely.transform(row, lambda xy, v=v: xy + np.array([0.0, v])) for row in lines(0.0, 6) for v in (-0.25, 0.25)
+    ]
+    found = of(derived("occupancy_to_rows", grid(drawn(beds, 0.1))), "objects", "row")
+    assert len(found) == 12
+
+
+def test_edge_of_meadow_is_no_row() -> None:
+    image = np.full((240, 240, 3), (190, 170, 140), np.uint8)
+    image[:35] = image[-35:] = (90, 120, 60)
+    for line in lines(0.0, count=4, spacing=4.0):
+        y = 240 - round(line.centroid.y / SIZE)
+        image[y - 4 : y + 4, 40:200] = (90, 120, 60)
+    site = derived("imagery_to_rows", Layers({PartKey("imagery", "ground", "satellite"): local(image)}))
+    assert len(of(site, "objects", "row")) == 4
+
+
 def test_walls_of_a_room_are_no_rows() -> None:
     room = [shapely.box(3, 3, 20, 15).exterior, shapely.LineString([(9, 3), (9, 15)])]
     with pytest.raises(CannotDerive, match="no parallel rows"):

@@ -16,8 +16,9 @@ Made-up sites: only the picture is given to the derivation, rows and nodes are t
     seeds: [1, 2, 3]
 
 A row is found if a derived line lies within 0.3 of the rows' distance at its middle, along at least half of it, within
-3°; each derived line counts once. Errors of spacing and angle are those of the found rows. Of several seeds the worst
-value counts.
+3°; each derived line counts once. Where an aisle crosses the rows, each piece is a row. The distance of rows is the
+median distance from a row to the nearest one that lies beside it. Errors of spacing and angle are those
+of the found rows. Of several seeds the worst value counts.
 
 The peer is the usual way: a probabilistic Hough transform of the mask of vegetation (excess green, Otsu) or of the
 occupied cells; segments along the most frequent direction are grouped into lines.
@@ -58,18 +59,18 @@ SIDE = 1400
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a map shows. rows: float64 [n, 2, 2] ends. nodes: float64 [n, 2]. source: stored grid or picture."""
+    """What a map shows. rows: lines. nodes: float64 [n, 2]. source: stored grid or picture."""
 
-    rows: Array
+    rows: Sequence[Any]
     nodes: Array
     source: Layers
 
 
 @dataclass(frozen=True, slots=True)
 class Derived:
-    """Rows [n, 2, 2] and network (nodes [n, 2], lines) of a map."""
+    """Rows (lines) and network (nodes [n, 2], lines) of a map."""
 
-    rows: Array
+    rows: Sequence[Any]
     nodes: Array
     edges: Sequence[Any]
 
@@ -107,7 +108,11 @@ def _drawn(case: Case) -> Truth:
     fmt = formats.get_format("occupancy_grid")
     (grid,) = formats.read(formats.FileGroup(fmt, path.name, files), ReadContext()).parts.values()
     rows = np.array(case.labels["rows"], float).reshape(-1, 2, 2)
-    return Truth(rows, np.array(case.labels["nodes"], float), Layers({PartKey("occupancy", GROUND, MAP): grid}))
+    return Truth(
+        list(shapely.linestrings(rows)),
+        np.array(case.labels["nodes"], float),
+        Layers({PartKey("occupancy", GROUND, MAP): grid}),
+    )
 
 
 def _generated(case: Case) -> list[Truth]:
@@ -117,7 +122,7 @@ def _generated(case: Case) -> list[Truth]:
         (objects,) = site.vector("objects").values()
         (network,) = site.vector("topology").values()
         rows = [
-            shapely.get_coordinates(g)[[0, -1]]
+            g
             for g, p in zip(objects.geometry, objects.properties, strict=True)
             if p["kind"] in ("tree_row", "fence", "plant") and g.geom_type == "LineString"
         ]
@@ -127,7 +132,7 @@ def _generated(case: Case) -> list[Truth]:
             if p["kind"] == "node" and "-c" in i
         ]
         pictures: dict[PartKey, Part] = {k: p for k, p in site.parts.items() if k.layer == "imagery"}
-        out.append(Truth(np.array(rows), np.array(nodes), Layers(pictures)))
+        out.append(Truth(rows, np.array(nodes), Layers(pictures)))
     return out
 
 
@@ -145,22 +150,19 @@ def _derive(source: Layers) -> Derived:
         (made[1],) = with_network.vector("topology").values()
     objects, network = made
     rows = [] if objects is None else [g for g, p in _of(objects) if p["kind"] == "row"]
-    ends = np.array([shapely.get_coordinates(g)[[0, -1]] for g in rows]).reshape(-1, 2, 2)
     listed = [] if network is None else _of(network)
     nodes = np.array([shapely.get_coordinates(g)[0] for g, p in listed if p["kind"] == "node"]).reshape(-1, 2)
-    return Derived(ends, nodes, [g for g, p in listed if p["kind"] == "edge"])
+    return Derived(rows, nodes, [g for g, p in listed if p["kind"] == "edge"])
 
 
 def _of(part: Features) -> list[tuple[Any, Any]]:
     return list(zip(part.geometry, part.properties, strict=True))
 
 
-def _compare(drawn: Array, derived: Array) -> tuple[float, float, float, float]:
+def _compare(drawn: Sequence[Any], derived: Sequence[Any]) -> tuple[float, float, float, float]:
     """Return (share found, share right, spacing error in %, angle error in degrees)."""
     direction = _direction(drawn)
-    normal = np.array([-direction[1], direction[0]])
-    middles = np.sort(drawn.mean(axis=1) @ normal)
-    spacing = float(np.median(np.diff(middles)))
+    spacing = _spacing(drawn, direction)
     taken: dict[int, int] = {}
     for k, row in enumerate(drawn):
         for n, line in enumerate(derived):
@@ -169,35 +171,55 @@ def _compare(drawn: Array, derived: Array) -> tuple[float, float, float, float]:
                 break
     if not taken:
         return 0.0, 0.0, math.nan, math.nan
-    chosen = derived[list(taken.values())]
-    across = np.sort(chosen.mean(axis=1) @ normal)
-    length = len(across) - 1
-    own = float(np.median(np.diff(across))) if length else math.nan
+    chosen = [derived[n] for n in taken.values()]
+    own = _spacing(chosen, direction)
     c, s = _direction(chosen)
+    # the rows that were found may be pieces of curves on one side of the field
+    direction = _direction([drawn[k] for k in taken])
     angle = math.degrees(abs(math.asin(max(-1.0, min(1.0, c * direction[1] - s * direction[0])))))
     return len(taken) / len(drawn), len(taken) / len(derived), abs(own / spacing - 1) * 100, angle
 
 
-def _direction(lines: Array) -> Array:
+def _ends(lines: Sequence[Any]) -> Array:
+    """Return the ends of lines, float64 [n, 2, 2]."""
+    return np.array([shapely.get_coordinates(line)[[0, -1]] for line in lines]).reshape(-1, 2, 2)
+
+
+def _direction(lines: Sequence[Any]) -> Array:
     """Return the mean direction of lines, as a unit vector."""
-    step = lines[:, 1] - lines[:, 0]
+    ends = _ends(lines)
+    step = ends[:, 1] - ends[:, 0]
     double = 2 * np.arctan2(step[:, 1], step[:, 0])
     angle = math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def _same(row: Array, line: Array, near: float) -> bool:
+def _spacing(lines: Sequence[Any], direction: Array) -> float:
+    """Return the median distance from a line to the nearest one beside it, NaN if there is none."""
+    along = np.sort(_ends(lines) @ direction, axis=1)
+    nearest = []
+    for k, line in enumerate(lines):
+        shared = np.minimum(along[:, 1], along[k, 1]) - np.maximum(along[:, 0], along[k, 0])
+        beside = shared >= 0.5 * (along[k, 1] - along[k, 0])
+        beside[k] = False
+        middle = line.interpolate(0.5, normalized=True)
+        nearest += [min(lines[n].distance(middle) for n in np.flatnonzero(beside).tolist())] if beside.any() else []
+    return float(np.median(nearest)) if nearest else math.nan
+
+
+def _same(row: Any, line: Any, near: float) -> bool:
     """Return whether a derived line follows a drawn row."""
-    step = row[1] - row[0]
+    ends, others = _ends([row, line])
+    step = ends[1] - ends[0]
     length = float(np.hypot(*step))
     unit = step / length
-    along = np.sort((line - row[0]) @ unit)
+    along = np.sort((others - ends[0]) @ unit)
     if min(along[1], length) - max(along[0], 0.0) < length / 2:
         return False
-    other = line[1] - line[0]
+    other = others[1] - others[0]
     if abs(float(unit[0] * other[1] - unit[1] * other[0])) > math.sin(math.radians(3)) * float(np.hypot(*other)):
         return False
-    return bool(shapely.LineString(line).distance(shapely.Point(row.mean(axis=0))) <= near)
+    return bool(line.distance(row.interpolate(0.5, normalized=True)) <= near)
 
 
 def _reach(nodes: Array, derived: Derived) -> tuple[float, float]:
@@ -226,12 +248,12 @@ def _mask(source: Layers) -> tuple[NDArray[np.uint8], float, float, float]:
     raise AssertionError("neither a grid nor a picture")
 
 
-def _peer(mask: NDArray[np.uint8], size: float, left: float, top: float) -> Array:
+def _peer(mask: NDArray[np.uint8], size: float, left: float, top: float) -> list[Any]:
     """Return the rows that a probabilistic Hough transform finds."""
     cv2.setRNGSeed(0)
     edges = cv2.HoughLinesP(mask * 255, 1, math.pi / 360, 30, minLineLength=3 / size, maxLineGap=1.5 / size)
     if edges is None:
-        return np.empty((0, 2, 2))
+        return []
     lines = edges.reshape(-1, 2, 2).astype(float)
     lines = np.stack([left + lines[..., 0] * size, top - lines[..., 1] * size], axis=-1)
     step = lines[:, 1] - lines[:, 0]
@@ -243,12 +265,12 @@ def _peer(mask: NDArray[np.uint8], size: float, left: float, top: float) -> Arra
     across = lines.mean(axis=1) @ np.array([-s, c])
     order = np.argsort(across)
     groups = np.split(order, np.flatnonzero(np.diff(across[order]) > 0.3) + 1)
-    out = []
+    out: list[Any] = []
     for group in groups:
         ends = lines[group].reshape(-1, 2)
         along, v = ends @ np.array([c, s]), float(across[group].mean())
-        out.append([[c * u - s * v, s * u + c * v] for u in (along.min(), along.max())])
-    return np.array(out)
+        out.append(shapely.LineString([(c * u - s * v, s * u + c * v) for u in (along.min(), along.max())]))
+    return out
 
 
 def _draw(truth: Truth, derived: Derived) -> Image.Image:
@@ -259,7 +281,7 @@ def _draw(truth: Truth, derived: Derived) -> Image.Image:
             base = Image.fromarray(np.ascontiguousarray(display_pixels(part)[..., :3]))
         else:
             base = Image.fromarray(((1 - mask) * 255).astype(np.uint8)).convert("RGB")
-    around = np.concatenate([truth.rows.reshape(-1, 2), truth.nodes])
+    around = np.concatenate([shapely.get_coordinates(list(truth.rows)), truth.nodes])
     (low_x, low_y), (high_x, high_y) = around.min(axis=0) - 5, around.max(axis=0) + 5
     west, east = (int((x - left) / size) for x in (low_x, high_x))
     north, south = (int((top - y) / size) for y in (high_y, low_y))
@@ -273,9 +295,9 @@ def _draw(truth: Truth, derived: Derived) -> Image.Image:
     for edge in derived.edges:
         pen.line(at(shapely.get_coordinates(edge)), fill=(0, 180, 0), width=2)
     for row in truth.rows:
-        pen.line(at(row), fill=(60, 120, 255), width=5)
+        pen.line(at(shapely.get_coordinates(row)), fill=(60, 120, 255), width=5)
     for row in derived.rows:
-        pen.line(at(row), fill=(255, 0, 0), width=2)
+        pen.line(at(shapely.get_coordinates(row)), fill=(255, 0, 0), width=2)
     for nodes, colour, r in ((truth.nodes, (60, 120, 255), 5), (derived.nodes, (0, 180, 0), 3)):
         for x, y in at(nodes):
             pen.ellipse((x - r, y - r, x + r, y + r), outline=colour, width=2)
