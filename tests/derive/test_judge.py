@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from PIL import Image
@@ -63,7 +64,7 @@ def test_judge_prints_figures_and_writes_pictures(
         label(tmp_path, name)
 
     def judged(case: Case) -> Result:
-        figures = [Figure("coverage", 0.95 if case.name == "good" else 0.5, at_least=0.9)]
+        figures = [Figure("coverage", np.float64(0.95 if case.name == "good" else math.nan), at_least=0.9)]
         return Result(figures, Image.new("RGB", (4, 3)), 1.5, 20.0, case)
 
     monkeypatch.setattr("tests.derive.judge.__main__.judged", judged)
@@ -74,7 +75,9 @@ def test_judge_prints_figures_and_writes_pictures(
         printed = capsys.readouterr()
         rows = json.loads(printed.out) if printed.out else []
         assert len(rows) == count
-        assert all(row["kept"] == (row["case"] == "good") for row in rows)
+        assert all(
+            (row["kept"], row["value"]) == ((True, 0.95) if row["case"] == "good" else (False, None)) for row in rows
+        )
     assert "no file *.labels.yaml" in printed.err
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [f"{kind}-good.png", f"{kind}-poor.png"]
     monkeypatch.setattr(sys, "argv", ["judge", str(tmp_path), "--only", "poor"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,10 +65,10 @@ def _print(results: list[Result], as_json: bool) -> None:
             "kind": result.case.kind,
             "case": result.case.name,
             "figure": figure.name,
-            "value": figure.value,
+            "value": None if math.isnan(figure.value) else float(figure.value),
             "unit": figure.unit,
             "bound": figure.bound,
-            "kept": figure.is_kept,
+            "kept": bool(figure.is_kept),
             "seconds": round(result.seconds, 2),
             "megabytes": round(result.megabytes, 1),
         }
@@ -86,7 +87,14 @@ def _print(results: list[Result], as_json: bool) -> None:
         mark = "" if not row["bound"] else ("kept" if row["kept"] else "[bold red]missed[/]")
         head = (row["kind"], row["case"]) if first else ("", "")
         tail = (f"{row['seconds']:.2f}", f"{row['megabytes']:.0f}") if first else ("", "")
-        table.add_row(*head, row["figure"], f"{row['value']:.3g} {row['unit']}".strip(), row["bound"], mark, *tail)
+        table.add_row(
+            *head,
+            row["figure"],
+            "–" if row["value"] is None else f"{row['value']:.3g} {row['unit']}".strip(),
+            row["bound"],
+            mark,
+            *tail,
+        )
     Console(width=None if sys.stdout.isatty() else 140).print(table)
 
 
