@@ -174,19 +174,31 @@ class BackupWriter:
             self._guard()
 
     def _write_blobs(self) -> None:
-        key = self._repository.key
+        listed: set[str] = set()
+        bases: set[str] = set()
         for rows in self._source.blobs():
-            for row in self._missing(rows, [object_name(key, Kind.BLOB, _packed(row)) for row in rows]):
-                if row.pack is None and self._source.check_blob(row) is not None:
-                    self._content.damaged.append(row.name)
-                self._writer.add(Kind.BLOB, _packed(row), b"")
-            for row in rows:
-                if row.pack is None:
-                    self._write_file(row.key, row.stored)
-            self._guard()
+            self._write_blob_rows(rows)
+            listed.update(row.name for row in rows)
+            bases.update(row.base for row in rows if row.base is not None)
+        while bases - listed:  # stored while the list was read, before the place that it had reached
+            rows = self._source.blob_rows(sorted(bases - listed))
+            self._write_blob_rows(rows)
+            listed |= bases
+            bases = {row.base for row in rows if row.base is not None}
         for pack, size in self._source.pack_sizes().items():
             if self._write_file(f"packs/{pack}", size):
                 self._guard()
+
+    def _write_blob_rows(self, rows: Sequence[BlobRow]) -> None:
+        key = self._repository.key
+        for row in self._missing(rows, [object_name(key, Kind.BLOB, _packed(row)) for row in rows]):
+            if row.pack is None and self._source.check_blob(row) is not None:
+                self._content.damaged.append(row.name)
+            self._writer.add(Kind.BLOB, _packed(row), b"")
+        for row in rows:
+            if row.pack is None:
+                self._write_file(row.key, row.stored)
+        self._guard()
 
     def _write_file(self, file: str, size: int) -> bool:
         """Write the parts of a stored file that are missing; returns whether there were any."""

@@ -108,6 +108,10 @@ class BackupSource:
                 return
             last = max(rows)
 
+    def blob_rows(self, names: Sequence[str]) -> list[BlobRow]:
+        """Read the rows of some blobs, those that exist."""
+        return list(self._blobs.rows(names).values())
+
     def pack_sizes(self) -> dict[str, int]:
         """Return the number of bytes of each pack that its blobs take."""
         table = tables.blob

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from sqlalchemy import Column, Connection, MetaData, Table, delete, func, insert, inspect, select, text, update
+from sqlalchemy import Column, Connection, MetaData, Table, delete, exists, func, insert, inspect, select, text, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.types import TypeEngine
 
@@ -105,7 +105,10 @@ class BackupTarget:
             connection.execute(statement.on_conflict_do_update(index_elements=["sha256"], set_=again), values)
 
     def remove_blob_rows(self, present: set[str]) -> None:
-        """Remove the rows of blobs whose file is not among these: the backup kept the row longer than the file."""
+        """Remove the rows of blobs that cannot be read: the backup kept the row longer than its file or its base.
+
+        present: keys of the files.
+        """
         last = ""
         while True:
             table = tables.blob
@@ -117,8 +120,19 @@ class BackupTarget:
                 with self._database.write(notify=False, upkeep=True) as connection:
                     connection.execute(delete(table).where(table.c.sha256.in_(lost)))
             if len(rows) < BATCH:
-                return
+                break
             last = max(name for name, _ in rows)
+        self._remove_without_base()
+
+    def _remove_without_base(self) -> None:
+        base = tables.blob.alias()
+        is_there = exists(select(base.c.sha256).where(base.c.sha256 == tables.blob.c.base))
+        removed = 1
+        while removed:  # each time what had the last ones as its base
+            with self._database.write(notify=False, upkeep=True) as connection:
+                removed = connection.execute(
+                    delete(tables.blob).where(tables.blob.c.base.is_not(None), ~is_there)
+                ).rowcount
 
     @staticmethod
     def _blob_rows(connection: Connection, names: list[str]) -> list[tuple[str, str]]:

@@ -288,11 +288,20 @@ class Blobs:
             yield piece
 
     def _base(self, row: BlobRow) -> bytes:
-        """Read what a blob is the difference from. It is not hashed: the hash of the blob itself shows any damage."""
+        """Read what a blob is the difference from. It is not hashed: the hash of the blob itself shows any damage.
+
+        Raises FileNotFoundError if it is not stored.
+        """
         if row.base is None:
             return b""
         copy = self._copies.get(row.base) if self.files.remote else None
-        return b"".join(self._decoded(self._row(row.base))) if copy is None else copy
+        if copy is not None:
+            return copy
+        try:
+            base = self._row(row.base)
+        except NotFound as error:
+            raise FileNotFoundError(row.base) from error
+        return b"".join(self._decoded(base))
 
     def _add_copy(self, row: BlobRow, pieces: Iterator[bytes]) -> bool:
         """Keep a copy on this machine; False if its disk cannot be written."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import threading
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app.backends.blob_s3 import S3Files
@@ -19,7 +21,8 @@ from app.backup.retention import parse_rule
 from app.backup.service import opened_place, verify_place
 from app.errors import Conflict, Damaged, Invalid
 from app.signing import Keys, SharedKeys, SigningKeys
-from app.store.backup_source import PART_BYTES
+from app.store.backup_source import PART_BYTES, BackupSource
+from app.store.blob_rows import BlobRow
 from app.store.garbage_collection import CONTENT_LEAD
 from app.store.store import Store
 from tests.backup.conftest import NewStore, back_up, fill, restore_into, rows_of
@@ -120,6 +123,44 @@ def test_backup_during_writes_is_an_acknowledged_state(store: Store, tmp_path: P
     assert before <= head <= acknowledged[-1]
     roots = [target.versions.get("farm", n).root for n in range(1, head + 1)]
     assert roots == [store.versions.get("farm", n).root for n in range(1, head + 1)]
+
+
+def content_between(low: str, high: str) -> bytes:
+    """Make a large content whose SHA-256 begins with one of two digits, like every other one of these."""
+    noise = np.random.default_rng(1).bytes(100_000)
+    return next(
+        data for k in range(10_000) if low <= hashlib.sha256(data := noise + k.to_bytes(4)).hexdigest()[:2] <= high
+    )
+
+
+@pytest.mark.parametrize("is_old_backup", [False, True])
+def test_file_stored_during_a_backup_may_have_a_base_that_its_list_has_passed(
+    sqlite_store: Store, tmp_path: Path, empty_store: NewStore, monkeypatch: pytest.MonkeyPatch, is_old_backup: bool
+) -> None:
+    base, patched = content_between("00", "01"), content_between("fe", "ff")
+    real = BackupSource.blobs
+    lists = 0
+
+    def blobs(self: BackupSource) -> Iterator[list[BlobRow]]:
+        nonlocal lists
+        lists += 1
+        for number, rows in enumerate(real(self)):
+            yield rows
+            if lists == 2 and number == 0:
+                name = sqlite_store.blobs.put(base)
+                sqlite_store.blobs.put_many([patched], [name])
+
+    monkeypatch.setattr("app.store.backup_source.READ", 1)
+    monkeypatch.setattr(BackupSource, "blobs", blobs)
+    if is_old_backup:  # by a release that did not look for bases
+        monkeypatch.setattr(BackupSource, "blob_rows", lambda self, names: [])
+    back_up(sqlite_store, tmp_path / "backup", tmp_path / "data")
+    assert sqlite_store.blobs.rows([hashlib.sha256(patched).hexdigest()]).popitem()[1].base is not None
+    target = empty_store()
+    restore_into(target, tmp_path / "backup", tmp_path / "other")
+    present = target.blobs.rows([hashlib.sha256(data).hexdigest() for data in (base, patched)])
+    assert len(present) == (0 if is_old_backup else 2)
+    assert target.versions.get("farm").root == sqlite_store.versions.get("farm").root
 
 
 # --- keys ---
