@@ -202,18 +202,19 @@ class Proxy:
 
 
 class Memory:
-    """Memory of the server's processes, in MB: the median of some samples, since workers come and go.
+    """Memory of the server's processes, in MB: the median of some samples.
 
-    A life is the time between two kills of the server. Each is measured once it is warm, and at its end.
+    A life is the time between two kills of the server. Each is measured once it is warm, and at its end. Workers are
+    started when they are needed, so only times with as many processes are compared.
     """
 
     def __init__(self) -> None:
-        self._lives: list[list[float]] = [[]]
+        self._lives: list[dict[int, list[float]]] = [{}]
         self._started = self._sampled = time.monotonic()
 
     def restart(self) -> None:
         """Begin the next life."""
-        self._lives.append([])
+        self._lives.append({})
         self._started = time.monotonic()
 
     def sample(self, world: World) -> None:
@@ -222,17 +223,21 @@ class Memory:
         if now - self._started < WARM_SECONDS or now - self._sampled < SAMPLE_SECONDS or world.server is None:
             return
         self._sampled = now
-        self._lives[-1].append(sum(process_memory(world.server.process.pid)))
+        sizes = process_memory(world.server.process.pid)
+        self._lives[-1].setdefault(len(sizes), []).append(sum(sizes))
 
-    @property
-    def first(self) -> float:
-        """Memory of the first life, once it was warm."""
-        return statistics.median(next(life for life in self._lives if life)[:SAMPLES])
+    def change(self) -> tuple[float, float]:
+        """Return the memory of the first life that was long enough, and the most of a later moment.
 
-    @property
-    def last(self) -> float:
-        """Memory at the end of the life that needed most."""
-        return max(statistics.median(life[-SAMPLES:]) for life in self._lives if len(life) >= SAMPLES)
+        Both with the number of processes with which the difference is largest.
+        """
+        changes = []
+        for processes in {count for life in self._lives for count in life}:
+            samples = [life[processes] for life in self._lives if len(life.get(processes, ())) >= SAMPLES]
+            if samples:
+                first = statistics.median(samples[0][:SAMPLES])
+                changes.append((first, max(statistics.median(life[-SAMPLES:]) for life in samples)))
+        return max(changes, key=lambda change: change[1] - change[0])
 
 
 def process_memory(pid: int) -> list[float]:
@@ -364,7 +369,7 @@ def soak(folder: Path, minutes: float, every: float, seed: int, *, sqlite: bool)
         stack.callback(world.close)
         proxy = Proxy(world.port)
         stack.callback(proxy.close)
-        fleet = Fleet(world, seed, pause=4.0, proxy=proxy.port)
+        fleet = Fleet(world, seed, pause=4.0, proxy=proxy.port, robots=folder)  # their disks do not fill up
         stack.callback(fleet.close)
         run = Soak(fleet, proxy, disk, seed)
         readers = [Reader(world, run.windows, stopping, seed + k) for k in range(READERS)]
@@ -387,10 +392,10 @@ def report(run: Soak, fleet: Fleet, readers: list[Reader], seconds: float, seed:
     reads = Reads(sum(r.reads.answered for r in readers), sum(r.reads.excluded for r in readers))
     for reader in readers:
         reads.problems.update(reader.reads.problems)
-    memory = run.memory
+    first, last = run.memory.change()
     faults = ", ".join(f"{count} x {name}" for name, count in sorted(run.counts.items()))
-    is_available, is_lean = reads.availability >= AVAILABILITY, memory.last <= memory.first + MEMORY_MB
-    sizes = f"{memory.first:.0f} MB before the first fault, later at most {memory.last:.0f} MB"
+    is_available, is_lean = reads.availability >= AVAILABILITY, last <= first + MEMORY_MB
+    sizes = f"{first:.0f} MB when it was warm, later at most {last:.0f} MB"
     rows = [
         ("faults", faults, ""),
         ("uploads · promotes · closures acknowledged", f"{fleet.count_commits()} · {len(fleet.promoter.moves)} · "
@@ -409,6 +414,8 @@ def report(run: Soak, fleet: Fleet, readers: list[Reader], seconds: float, seed:
         print(f"failed outside restarts, {count} x: {text}")
     if problem is not None:
         print("\n".join(fleet.world.printed[-30:]))
+        for robot in fleet.robots:
+            print("\n".join(str(line)[:500] for line in robot.lines[-20:]))
     return problem is None and is_available and is_lean
 
 

@@ -183,7 +183,7 @@ def check_robots(fleet: Fleet, head: dict[str, object]) -> None:
         name = robot.into.name
         assert robot.standing["root"] == head["root"]
         robot.wait("hook", version=head["version"])
-        lines = (fleet.world.folder / f"{name}.hooks").read_text().split("\n")[:-1]
+        lines = robot.into.with_name(f"{name}.hooks").read_text().split("\n")[:-1]
         done = [(int(a), int(b), c) for a, b, c in (line.split() for line in lines)]
         sequences = [sequence for sequence, _, _ in done]
         assert sequences == sorted(set(sequences)), f"{name} processed a sequence twice, or an older one"

@@ -417,9 +417,13 @@ class Fleet:
     """Robots, the event readers and the writers of one world.
 
     pause: maximum pause of a writer after each write, in seconds. proxy: port by which robots reach the server.
+    robots: folder of their maps, if it is not the world's.
     """
 
-    def __init__(self, world: World, seed: int, *, pause: float = 0.3, proxy: int | None = None) -> None:
+    def __init__(
+        self, world: World, seed: int, *, pause: float = 0.3, proxy: int | None = None, robots: Path | None = None
+    ) -> None:
+        folder = robots or world.folder
         self.world = world
         self.dice = random.Random(seed)
         self.receiver = Receiver()
@@ -443,13 +447,13 @@ class Fleet:
             ("polling", "--poll", "1", "--channel", "latest"),
             ("promoted", "--poll", "3600", "--channel", "production"),
         ):
-            hook = f'echo "$FLEETMAP_SEQUENCE $FLEETMAP_VERSION $FLEETMAP_ROOT" >> {world.folder}/{name}.hooks'
+            hook = f'echo "$FLEETMAP_SEQUENCE $FLEETMAP_VERSION $FLEETMAP_ROOT" >> {folder}/{name}.hooks'
             variables = {"FLEETMAP_ZENOH_CONNECT": "tcp/127.0.0.1:1"} if name == "polling" else {}
             self.robots.append(
                 Robot(
                     server,
                     ENVIRONMENT,
-                    world.folder / name,
+                    folder / name,
                     *more,
                     "--on-change",
                     hook,

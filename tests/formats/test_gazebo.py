@@ -45,6 +45,9 @@ OBJECTS = PartKey("objects", name="gazebo")
 RESOURCES = PartKey("resources", name="gazebo")
 
 
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
 def folder(path: Path) -> dict[str, bytes]:
     return {p.relative_to(path).as_posix(): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
@@ -795,53 +798,53 @@ def test_written_versions_load_in_libsdformat(version: str) -> None:
 
 
 # --- real worlds -------------------------------------------------------------------------------------------------
-def real_worlds(shared: Path) -> list[tuple[str, Path, dict[str, bytes]]]:
-    """Return (key in facts.json, path, uploaded files)."""
-    out = []
-    for path in sorted((shared / "data").rglob("*")):
-        if path.is_file() and path.name.endswith((".world", ".sdf", ".world.xml")) and b"<world" in path.read_bytes():
-            root = path.parent.parent if path.parent.name == "worlds" else path.parent
-            files = {
-                p.relative_to(root).as_posix(): p.read_bytes()
-                for p in sorted(root.rglob("*"))
-                if p == path
-                or (p.is_file() and not p.name.endswith((".world", ".world.xml")) and p.parent != path.parent)
-            }
-            out.append((path.relative_to(shared / "data").as_posix(), path, files))
-    return out
+def real_worlds() -> list[str]:
+    """List the real worlds below ../shared/data."""
+    paths = (path for path in sorted(DATA.rglob("*")) if path.name.endswith((".world", ".sdf", ".world.xml")))
+    return [path.relative_to(DATA).as_posix() for path in paths if path.is_file() and b"<world" in path.read_bytes()]
 
 
-def test_real_worlds_match_facts_and_round_trip(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
+def uploaded_world(path: Path) -> dict[str, bytes]:
+    """Return a world with everything beside it but other worlds."""
+    root = path.parent.parent if path.parent.name == "worlds" else path.parent
+    return {
+        p.relative_to(root).as_posix(): p.read_bytes()
+        for p in sorted(root.rglob("*"))
+        if p == path or (p.is_file() and not p.name.endswith((".world", ".world.xml")) and p.parent != path.parent)
+    }
+
+
+def test_real_worlds_are_found(shared: Path) -> None:
+    assert len(real_worlds()) > 10
+
+
+@pytest.mark.parametrize("key", real_worlds())
+def test_real_worlds_match_facts_and_round_trip(key: str, facts_json: dict[str, Any], same: Same) -> None:
     """libsdformat reports no errors for written files beyond those for the originals."""
-    worlds = real_worlds(shared)
-    assert len(worlds) > 10
-    for key, path, files in worlds:
-        facts = facts_json[key]["facts"]
-        bundle = read_upload(files, "gazebo")
-        kinds = Counter(p["kind"] for p in objects(bundle).properties)
-        assert kinds["model"] == facts["top_level_models"], key
-        assert kinds["include"] == facts["includes"] - facts["includes_inside_model"], key
-        assert kinds["light"] == facts["light_count"], key
-        names = facts["top_level_model_names"]
-        models = [p["name"] for p in objects(bundle).properties if p["kind"] == "model"]
-        assert models[: len(names)] == names
-        moved = [p for p in objects(bundle).properties if "state" in p["gazebo"] and p["kind"] == "model"]
-        assert len(moved) == facts.get("state_pose_differs", 0), key
-        for name, text in facts["poses_top_level"].items():
-            if text:
-                properties = next(p for p in objects(bundle).properties if p["name"] == name and p["kind"] == "model")
-                assert properties["pose"] == pytest.approx([float(v) for v in text.split()]), (key, name)
-        out = offline(files, "gazebo", hints=UploadHints("gazebo")).files
-        assert same("gazebo", files, out) == [], key
-        assert etree.fromstring(out["world.sdf"]).get("version") == facts["sdf_version"]
-        again = offline(out, "gazebo").files
-        assert {n: out[n] for n in again} == again, "what only a comment names goes along, until the comment is gone"
-        base = path.relative_to(path.parent.parent if path.parent.name == "worlds" else path.parent).as_posix()
-        if complaints := check(out):
-            before = check(
-                {**{re.sub(r"^(custom_)?models/", "models/", n): d for n, d in files.items()}, "world.sdf": files[base]}
-            )
-            assert set(complaints) <= set(before), key
+    files, facts = uploaded_world(DATA / key), facts_json[key]["facts"]
+    bundle = read_upload(files, "gazebo")
+    kinds = Counter(p["kind"] for p in objects(bundle).properties)
+    assert kinds["model"] == facts["top_level_models"]
+    assert kinds["include"] == facts["includes"] - facts["includes_inside_model"]
+    assert kinds["light"] == facts["light_count"]
+    names = facts["top_level_model_names"]
+    models = [p["name"] for p in objects(bundle).properties if p["kind"] == "model"]
+    assert models[: len(names)] == names
+    moved = [p for p in objects(bundle).properties if "state" in p["gazebo"] and p["kind"] == "model"]
+    assert len(moved) == facts.get("state_pose_differs", 0)
+    for name, text in facts["poses_top_level"].items():
+        if text:
+            properties = next(p for p in objects(bundle).properties if p["name"] == name and p["kind"] == "model")
+            assert properties["pose"] == pytest.approx([float(v) for v in text.split()]), name
+    out = offline(files, "gazebo", hints=UploadHints("gazebo")).files
+    assert same("gazebo", files, out) == []
+    assert etree.fromstring(out["world.sdf"]).get("version") == facts["sdf_version"]
+    again = offline(out, "gazebo").files
+    assert {n: out[n] for n in again} == again, "what only a comment names goes along, until the comment is gone"
+    if complaints := check(out):
+        name = f"worlds/{Path(key).name}" if Path(key).parent.name == "worlds" else Path(key).name
+        models_in_place = {re.sub(r"^(custom_)?models/", "models/", n): d for n, d in files.items()}
+        assert set(complaints) <= set(check({**models_in_place, "world.sdf": files[name]}))
 
 
 def test_real_models_match_expected_shapes(shared: Path, facts_json: dict[str, Any]) -> None:
