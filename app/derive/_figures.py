@@ -6,6 +6,7 @@ cell (0, 0), so that the centre of cell (row, column) is (column + 0.5, row + 0.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -148,12 +149,13 @@ def _broken_rims(
     """Return (solid rectangles whose rims were seen in several pieces, the cells of those pieces)."""
     import cv2
 
-    contours, _ = cv2.findContours(
-        cv2.dilate(mask, np.ones((3, 3), np.uint8)), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
+    contours, tree = cv2.findContours(
+        cv2.dilate(mask, np.ones((3, 3), np.uint8)), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
     )
     out: list[tuple[int, int, Box]] = []
     seen = np.zeros_like(mask)
-    for contour in contours:
+    # no holes, but what stands in them: in a closed room
+    for contour in itertools.compress(contours, [] if tree is None else tree[0][:, 3] < 0):
         x, y, width, height = cv2.boundingRect(contour)
         if max(width, height) > sizes.box + 2 or min(width, height) <= sizes.wall + 2:
             continue

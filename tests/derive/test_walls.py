@@ -143,3 +143,20 @@ def test_broken_rim_around_unknown_ground_is_furniture() -> None:
     cells[80:83, 60], cells[70, 70:72] = FREE, FREE
     (pallet,) = [f for f in objects(cells) if f.properties["kind"] == "furniture"]
     assert pallet.geometry.area == pytest.approx(30 * 26 * CELL**2, rel=0.1)
+
+
+@pytest.mark.parametrize("door", [0, 18])
+def test_broken_rim_in_a_closed_room_is_furniture(door: int) -> None:
+    cells = np.full((140, 160), FREE, np.uint8)
+    cells[10:13, 10:150], cells[127:130, 10:150] = OCCUPIED, OCCUPIED
+    cells[10:130, 10:13], cells[10:130, 147:150] = OCCUPIED, OCCUPIED
+    cells[10:13, 100 : 100 + door] = FREE
+    for x in (30, 90):
+        cells[50:76, x : x + 30] = UNKNOWN
+        cells[50:76, x], cells[50:76, x + 29] = OCCUPIED, OCCUPIED
+        cells[50, x : x + 30], cells[75, x : x + 30] = OCCUPIED, OCCUPIED
+        cells[60:62, x], cells[50, x + 10 : x + 12], cells[75, x + 20 : x + 22] = FREE, FREE, FREE
+    part = objects(cells)
+    pallets = [f.geometry for f in part if f.properties["kind"] == "furniture"]
+    assert [p.area for p in pallets] == pytest.approx([30 * 26 * CELL**2] * 2, rel=0.1)
+    assert len([f for f in part if f.properties["kind"] == "wall"]) == (5 if door else 4), "only those of the room"
