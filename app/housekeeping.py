@@ -97,6 +97,7 @@ class _Housekeeping:
         services.access.share_failures()
         services.jobs.store_progress()
         if is_beat:
+            services.maps.cache.leave_room()
             services.jobs.send_heartbeats()
 
     def _run_as_leader(self, is_beat: bool) -> None:

@@ -12,6 +12,10 @@ from typing import Final
 ROOM_BYTES: Final = 2**20
 """Free space in bytes below which a folder is not writable, and an I/O error of SQLite means a full disk."""
 
+RESERVE_BYTES: Final = 512 * 2**20
+RESERVE_SHARE: Final = 0.05
+"""Free space that caches leave to what cannot be made again: these bytes, or this share of a smaller disk."""
+
 
 def check_room(folder: Path) -> None:
     """Raise OSError unless a file of 1 MiB can be written to a folder."""
@@ -47,3 +51,12 @@ def disk_room(folder: Path, statvfs: Callable[[Path], os.statvfs_result] = os.st
         inodes=status.f_files,
         free_inodes=status.f_favail,
     )
+
+
+def lacking_bytes(folder: Path) -> int:
+    """Return by how many bytes the free space is below the reserve; 0 if it suffices or cannot be read."""
+    try:
+        room = disk_room(folder)
+    except OSError:
+        return 0
+    return max(0, int(min(RESERVE_BYTES, RESERVE_SHARE * room.size)) - room.free)

@@ -32,6 +32,7 @@ from uuid import uuid4
 import orjson
 
 from app.backends.locks import file_lock
+from app.backends.room import lacking_bytes
 from app.convert.report import Report
 from app.errors import BROKEN_STORAGE_ERRNOS, DISK_FULL_ERRNOS, Unavailable, system_reason
 
@@ -150,10 +151,10 @@ class SharedMaps(Protocol):
 
 
 class Cache:
-    """Cache of at most ``limit`` bytes that evicts the least recently used maps. damaged: number of damaged entries.
+    """Cache of at most ``limit`` bytes that evicts the least recently used maps, and leaves the disk's reserve free.
 
-    shared: the maps of all servers, which this folder is a cache of. on_damage: called for each damaged entry. problem:
-    why maps cannot be written to disk now, or None.
+    shared: the maps of all servers, which this folder is a cache of. damaged: number of damaged entries. on_damage:
+    called for each. problem: why maps cannot be written to disk now, or None.
     """
 
     def __init__(self, folder: Path, limit: int, shared: SharedMaps | None = None) -> None:
@@ -364,8 +365,7 @@ class Cache:
         for file in cached_map.all_files():
             self._note_hash(file)
         self._total += sum(f.size for f in cached_map.all_files())
-        if self._total > self._limit:
-            self._evict()
+        self.leave_room()
         return cached_map
 
     def _write(self, key: str, product: ConvertedMap) -> CachedMap | None:
@@ -473,12 +473,18 @@ class Cache:
     def _hash_path(self, sha256: str) -> Path:
         return self._folder / "hashes" / sha256[:2] / sha256
 
-    def _evict(self) -> None:
+    def leave_room(self) -> None:
+        """Evict the least recently used maps beyond the size limit, or what the disk's reserve lacks."""
+        limit = min(self._limit, max(0, self._total - lacking_bytes(self._folder)))
+        if self._total > limit:
+            self._evict(limit)
+
+    def _evict(self, limit: int) -> None:
         """Remove entries until the size limit holds. Safe to run in several processes at once."""
         entries = sorted(self._entries())
         total = sum(size for _, size, _ in entries)
         for _, size, folder in entries[:-1]:  # the newest stays, whatever its size
-            if total <= self._limit:
+            if total <= limit:
                 break
             for line in self._hashes_of_folder(folder):
                 self._hash_path(line).unlink(missing_ok=True)

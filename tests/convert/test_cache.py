@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 
+from app.backends.room import RESERVE_SHARE
 from app.convert import cache as caching
 from app.convert.cache import Cache, ConvertedMap, LostMap
 from app.convert.report import Report
+from tests.api.test_damage import mounted_disk
 
 
 def key(text: str) -> str:
@@ -84,6 +86,24 @@ def test_eviction_removes_least_recently_used_map(tmp_path: Path) -> None:
         time.sleep(0.02)
     assert cache.get(key("a")) is None
     assert cache.get(key("c")) is not None
+
+
+def test_cache_gives_way_when_disk_gets_short(tmp_path: Path) -> None:
+    """Its limit is larger than the disk: uploads must not fail for maps that can be made again."""
+    with mounted_disk(tmp_path / "disk") as disk:
+        reserve = RESERVE_SHARE * shutil.disk_usage(disk).total
+        cache = Cache(disk / "cache", 2**30)
+        for number in range(50):
+            cache.get_or_make(key(str(number)), lambda: product(os.urandom(400_000)))
+            assert shutil.disk_usage(disk).free >= reserve
+        assert cache.problem is None
+        assert cache.get(key("49")) is not None
+        assert cache.get(key("0")) is None
+        before = cache.size
+        (disk / "upload").write_bytes(bytes(shutil.disk_usage(disk).free))
+        cache.leave_room()
+        assert shutil.disk_usage(disk).free >= reserve
+        assert 0 < cache.size < before
 
 
 def test_leftovers_of_killed_process_are_removed_at_start(tmp_path: Path) -> None:
