@@ -53,7 +53,7 @@ def backup(
             "--keep",
             metavar="RULE",
             help="Then remove older backups: 30d keeps all of 30 days; 7d/90d/2y all of 7 days, one a day of 90 days, "
-            "one a month of 2 years.",
+            "one a month of 2 years. Days and months without a backup are not counted.",
         ),
     ] = None,
     show_list: Annotated[bool, typer.Option("--list", help="List the backups in DEST; write none.")] = False,
