@@ -176,12 +176,12 @@ def restore(
 def _restore(settings: Settings, source: str, snapshot: str | None, identity: Path | None, *, as_json: bool) -> None:
     from app.backup.keys import SIGNING, key_documents, place_keys
     from app.backup.service import restore as restore_from
+    from app.main import create_folders
     from app.signing import exported_key_ids
 
     folder = settings.data_dir / "keys"
     with _opened(settings, source, identity) as repository:  # before anything is created
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
-        settings.blob_dir.mkdir(parents=True, exist_ok=True)
+        create_folders(settings)
         with _store(settings) as store:
             present = key_documents(store, folder)
             mounted = _mounted(settings)
