@@ -199,10 +199,15 @@ def open_store(settings: Settings, *, readonly: bool = False) -> Store:
     )
 
 
+def create_folders(settings: Settings) -> None:
+    """Create the folders of a server. Only its user can read a new data folder; the mode of an existing one stays."""
+    settings.data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    settings.blob_dir.mkdir(parents=True, exist_ok=True)
+
+
 def open_services(settings: Settings) -> Services:
     """Open the store and start the workers. Blocks. Raises Unavailable if the schema is not that of this release."""
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
-    settings.blob_dir.mkdir(parents=True, exist_ok=True)
+    create_folders(settings)
     store = open_store(settings)
     pools: list[Pool] = []
     try:

@@ -73,6 +73,11 @@ class Snapshot:
     damaged: tuple[str, ...] = ()
 
     @property
+    def order(self) -> tuple[int, int, datetime]:
+        """Key to sort the backups of a server, oldest first: its own counters, then its clock, which may have leapt."""
+        return self.epoch, self.position, self.started
+
+    @property
     def size(self) -> int:
         """Bytes of all packs of the backup."""
         return sum(pack.size for pack in self.packs)
@@ -229,7 +234,7 @@ class Repository:
                 out.intact.append(self._read_snapshot(file.key, match["id"]))
             except Damaged as error:
                 out.broken[match["id"]] = error.detail
-        out.intact.sort(key=lambda snapshot: snapshot.started)
+        out.intact.sort(key=lambda snapshot: snapshot.order)
         return out
 
     def remove_snapshots(self, ids: Sequence[str]) -> None:

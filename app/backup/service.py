@@ -141,7 +141,7 @@ class BackupService:
         if isinstance(repository.files, ArchiveFiles):
             return (), 0
         listed = repository.snapshots()
-        outdated = [] if keep is None else keep.outdated(listed.intact, datetime.now(UTC))
+        outdated = [] if keep is None else keep.outdated(listed.intact)
         gone = {snapshot.id for snapshot in outdated}
         repository.remove_snapshots(sorted(gone))
         stay = [snapshot for snapshot in listed.intact if snapshot.id not in gone]

@@ -53,7 +53,7 @@ def backup(
             "--keep",
             metavar="RULE",
             help="Then remove older backups: 30d keeps all of 30 days; 7d/90d/2y all of 7 days, one a day of 90 days, "
-            "one a month of 2 years.",
+            "one a month of 2 years. Days and months without a backup are not counted.",
         ),
     ] = None,
     show_list: Annotated[bool, typer.Option("--list", help="List the backups in DEST; write none.")] = False,
@@ -176,12 +176,12 @@ def restore(
 def _restore(settings: Settings, source: str, snapshot: str | None, identity: Path | None, *, as_json: bool) -> None:
     from app.backup.keys import SIGNING, key_documents, place_keys
     from app.backup.service import restore as restore_from
+    from app.main import create_folders
     from app.signing import exported_key_ids
 
     folder = settings.data_dir / "keys"
     with _opened(settings, source, identity) as repository:  # before anything is created
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
-        settings.blob_dir.mkdir(parents=True, exist_ok=True)
+        create_folders(settings)
         with _store(settings) as store:
             present = key_documents(store, folder)
             mounted = _mounted(settings)

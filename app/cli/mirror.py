@@ -94,10 +94,9 @@ def _read_token(file: Path | None) -> str:
 
 
 def _open(settings: Settings) -> Store:
-    from app.main import open_store, startup_lock
+    from app.main import create_folders, open_store, startup_lock
 
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
-    settings.blob_dir.mkdir(parents=True, exist_ok=True)
+    create_folders(settings)
     store = open_store(settings)
     with startup_lock(settings.data_dir):
         store.initialise()

@@ -378,7 +378,7 @@ def with_demo_token(settings: Settings) -> Settings:
 
     if settings.admin_token is not None or settings.insecure_no_auth:
         return settings
-    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    settings.data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     token_file = settings.data_dir / DEMO_TOKEN
     if not token_file.is_file() or not token_file.read_text().strip():
         with open(os.open(token_file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as stream:  # noqa: PTH123  its mode
@@ -389,11 +389,10 @@ def with_demo_token(settings: Settings) -> Settings:
 def _store(settings: Settings) -> Any:
     from contextlib import closing
 
-    from app.main import open_store
+    from app.main import create_folders, open_store
 
     try:
-        settings.data_dir.mkdir(parents=True, exist_ok=True)
-        settings.blob_dir.mkdir(parents=True, exist_ok=True)
+        create_folders(settings)
     except OSError as error:
         raise Unavailable(f"{error.filename}: {error.strerror}: use another folder with --data-dir") from error
     return closing(open_store(settings))

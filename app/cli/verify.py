@@ -109,10 +109,10 @@ def verify(
 
 
 def _open(settings: Settings, *, readonly: bool) -> Store:
-    from app.main import open_store
+    from app.main import create_folders, open_store
 
     if not readonly:  # with files in S3, this machine may not have served yet
-        settings.blob_dir.mkdir(parents=True, exist_ok=True)
+        create_folders(settings)
     return open_store(settings, readonly=readonly)
 
 

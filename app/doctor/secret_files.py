@@ -7,7 +7,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from app.doctor.registry import Finding, check, error, ok
+from app.doctor.registry import Finding, check, error, ok, warning
 from app.doctor.site import Site
 from app.events.security import PASSWORD_FILE, USERS_FILE
 
@@ -33,6 +33,8 @@ def secret_files(site: Site) -> Iterator[Finding]:
     if Path(".env").is_file() and any(word in Path(".env").read_text(errors="replace") for word in ("TOKEN", "KEY=")):
         paths.add(Path(".env"))
     problems = [finding for path in sorted(paths) for finding in _examine(path, Path(folder) if folder else None)]
+    if site.database_file is not None:
+        problems += _examine_database(site.database_file)
     yield from problems
     if not problems:
         yield ok(f"{len(paths)} files with keys and passwords: only their owner can read them")
@@ -57,6 +59,13 @@ def _examine(path: Path, secrets: Path | None) -> Iterator[Finding]:
     elif status.st_uid not in (os.getuid(), ENGINE) and not mounted:
         advice = f"chown {os.getuid()} {path}, or run the server as the owner"
         yield error(f"belongs to another user (number {status.st_uid})", str(path), advice)
+
+
+def _examine_database(path: Path) -> Iterator[Finding]:
+    """Look who can read SQLite's file, which has secrets of webhooks. Its group may: folders can be shared with one."""
+    if path.exists() and path.stat().st_mode & stat.S_IROTH and _is_reachable(path):
+        detail = f"every user of this machine can read the database (mode {stat.S_IMODE(path.stat().st_mode):04o})"
+        yield warning(f"{detail}, which has the secrets of webhooks", str(path), f"chmod o-rwx {path}*")
 
 
 def _is_reachable(path: Path) -> bool:

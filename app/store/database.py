@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import re
 import shutil
 import sqlite3
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -65,7 +68,7 @@ def engine(url: str, *, readonly: bool) -> Engine:
     }
     if parsed.get_backend_name() == "sqlite":
         if parsed.database and parsed.database != ":memory:" and not readonly:
-            Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+            Path(parsed.database).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         sql_engine = create_engine(parsed, **options)
         event.listen(sql_engine, "connect", _sqlite_on_connect(readonly))
         event.listen(sql_engine, "begin", _sqlite_on_begin)
@@ -100,6 +103,16 @@ def _sqlite_on_connect(readonly: bool) -> Any:
 def _sqlite_on_begin(connection: Connection) -> None:
     write = connection.get_execution_options().get("write")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
+
+
+def _create_private(path: Path) -> None:
+    """Create SQLite's file for its owner, and for the group if the folder is its group's to write to (umask applies).
+
+    The file has secrets of webhooks. SQLite gives its mode to the files beside it, and reports itself what fails here.
+    """
+    with contextlib.suppress(OSError):
+        is_shared = path.parent.stat().st_mode & stat.S_IWGRP
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o660 if is_shared else 0o600))
 
 
 class _FileGone(DatabaseDamaged):
@@ -325,10 +338,13 @@ class Database:
             raise _FileGone(problem)
 
     def _before_connect(self, *_: object) -> None:
-        """Keep SQLite from creating an empty file if its file is missing."""
+        """Keep SQLite from creating its file: if it is missing, or so that every user of the machine can read it."""
         self._check_file()
-        if self.readonly and self.file is not None and not self.file.exists():
+        if self.file is None or self.file.exists():
+            return
+        if self.readonly:
             raise _FileGone(f"the database {self._name} is missing: restore a backup")
+        _create_private(self.file)
 
     def _after_connect(self, *_: object) -> None:
         if self._inode is None and self.file is not None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from app.backends.blob_s3 import S3Files
 from app.backends.documents import FileDocument
 from app.backends.lead import LocalLead, open_leads
 from app.backup.keys import collect_keys, key_documents
+from app.backup.repository import Snapshot
 from app.backup.retention import parse_rule
 from app.backup.service import opened_place, verify_place
 from app.errors import Conflict, Damaged, Invalid
@@ -311,28 +314,81 @@ def test_backup_to_and_from_s3(sqlite_store: Store, tmp_path: Path, s3_url: str,
 # --- retention ---
 
 
+@pytest.fixture
+def snapshot(sqlite_store: Store, tmp_path: Path) -> Snapshot:
+    return back_up(sqlite_store, tmp_path / "backup", tmp_path / "data").snapshot
+
+
+NOON = datetime(2030, 6, 15, 12, tzinfo=UTC)
+EARLIER = "20200101T000000Z-00000000"
+
+
+def nightly(snapshot: Snapshot, times: Iterable[datetime]) -> list[Snapshot]:
+    """Copy a manifest for each of these times, with a higher position of the log each time."""
+    return [
+        dataclasses.replace(snapshot, id=f"{time:%Y%m%dT%H%M%SZ}-00000000", started=time, position=number)
+        for number, time in enumerate(times)
+    ]
+
+
 @pytest.mark.parametrize(
     ("rule", "expected"),
     [
+        ("0d", [0]),
         ("2d", [0, 1, 2]),
-        ("1d/4d", [0, 1, 2, 3]),
-        ("1d/3d/400d", [0, 1, 2, 3, 40, 200]),
+        ("1d/4d", [0, 1, 2, 3, 40]),
+        ("1d/3d/60d", [0, 1, 2, 3, 40, 200]),
+        ("1d/3d/400d", [0, 1, 2, 3, 40, 200, 500]),
     ],
 )
-def test_rule_keeps_all_then_one_a_day_then_one_a_month(
-    sqlite_store: Store, tmp_path: Path, rule: str, expected: list[int]
-) -> None:
-    import dataclasses
+def test_rule_keeps_all_then_one_a_day_then_one_a_month(snapshot: Snapshot, rule: str, expected: list[int]) -> None:
+    """Days and months without a backup are not counted."""
+    ages = [500, 200, 41, 40, 3, 2, 1, 0]
+    snapshots = nightly(snapshot, (NOON - timedelta(days=age, hours=-1 if age else 0) for age in ages))
+    gone = parse_rule(rule).outdated(snapshots)
+    assert [age for age, one in zip(ages, snapshots, strict=True) if one not in gone][::-1] == expected
 
-    snapshot = back_up(sqlite_store, tmp_path / "backup", tmp_path / "data").snapshot
-    now = datetime(2030, 6, 15, 12, tzinfo=UTC)
-    ages = [0, 1, 2, 3, 40, 41, 200, 500]
-    snapshots = []
-    for age in ages:
-        started = now - timedelta(days=age, hours=-1 if age else 0)
-        snapshots.append(dataclasses.replace(snapshot, id=f"{started:%Y%m%dT%H%M%SZ}-00000000", started=started))
-    gone = parse_rule(rule).outdated(snapshots, now)
-    assert [age for age, one in zip(ages, snapshots, strict=True) if one not in gone] == expected
+
+@pytest.mark.parametrize("leap", [timedelta(days=3650), timedelta(days=-3650)])
+@pytest.mark.parametrize("rule", ["7d", "30d", "7d/90d", "7d/90d/2y"])
+def test_clock_that_leaps_removes_no_more_than_a_night_does(snapshot: Snapshot, rule: str, leap: timedelta) -> None:
+    """Also not after some nights with the wrong clock, and after it is right again."""
+    nights = [NOON + timedelta(days=night) for night in range(500)]
+    times = [*nights[:480], *(night + leap for night in nights[480:483]), *nights[483:]]
+    stay: list[Snapshot] = []
+    for number, one in enumerate(nightly(snapshot, times)):
+        gone = parse_rule(rule).outdated([*stay, one])
+        stay = [other for other in [*stay, one] if other not in gone]
+        if number >= 480:
+            assert len(gone) <= 1
+            assert one in stay
+            assert {f"{night:%Y%m%d}" for night in times[number - 7 : number]} <= {other.id[:8] for other in stay}
+
+
+def test_backup_of_a_clock_ahead_is_not_the_newest(
+    sqlite_store: Store, tmp_path: Path, empty_store: NewStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, data = tmp_path / "backup", tmp_path / "data"
+
+    class Ahead(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> Self:
+            return cls(2090, 1, 1, tzinfo=tz)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("app.backup.create.datetime", Ahead)
+        ahead = back_up(sqlite_store, place, data).snapshot
+    save(sqlite_store, "farm", *replaces({GRID: grid(seed=8)}))
+    later = back_up(sqlite_store, place, data, keep=parse_rule("1d")).snapshot
+    assert later.started < ahead.started
+    with opened_place(str(place), tmp_path, key=lambda _: None) as repository:
+        assert [one.id for one in repository.snapshots().intact] == [ahead.id, later.id]
+        repository.write_snapshot(dataclasses.replace(later, epoch=later.epoch + 1, position=0, id=EARLIER))
+        assert repository.snapshots().intact[-1].id == EARLIER, "a restored server counts from a lower position"
+        repository.remove_snapshots([EARLIER])
+    target = empty_store()
+    assert restore_into(target, place, tmp_path / "other").snapshot.id == later.id
+    assert target.versions.get("farm").number == 3
 
 
 @pytest.mark.parametrize("rule", ["", "30", "30d/7d", "1d/2d/3d/4d", "d", "0.5d", "-1d"])

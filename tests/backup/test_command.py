@@ -85,6 +85,7 @@ def test_robot_ahead_of_the_backup_follows_the_restored_server(
     result = command(capfd, "restore", place, "--data-dir", restored)
     assert result["snapshot"] == written["snapshot"]
     assert result["keys"]
+    assert [path.stat().st_mode & 0o77 for path in (restored, restored / "fleetmap.sqlite3")] == [0, 0]
     with running(settings_for(restored, scrub_hours=0)) as other:
         assert other.get("environments/farm/versions/2").json()["root"]
         assert sync(other, robot) == (1, result["epoch"])

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import signal
 import socket
 import sqlite3
 import ssl
+import stat
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,10 +22,24 @@ from tests.cli.conftest import Fleetmap, ServerProcess
 from tests.events.conftest import eventually
 
 
+@pytest.fixture
+def usual_umask() -> Iterator[None]:
+    """As a shell of most systems has it."""
+    former = os.umask(0o022)
+    yield
+    os.umask(former)
+
+
+def modes(data: Path) -> tuple[int, set[int]]:
+    """Return the modes of a data folder and of the files of its database."""
+    return stat.S_IMODE(data.stat().st_mode), {stat.S_IMODE(p.stat().st_mode) for p in data.glob("fleetmap.sqlite3*")}
+
+
 def start(folder: Path, *arguments: str, **environment: str) -> ServerProcess:
     return ServerProcess("--data-dir", str(folder / "data"), *arguments, environment=environment, folder=folder)
 
 
+@pytest.mark.usefixtures("usual_umask")
 def test_first_start_prints_a_token_once_and_signals_stop_it_cleanly(tmp_path: Path, offline: Fleetmap) -> None:
     """First with two workers, of which only one may make the token."""
     process = start(tmp_path, "--workers", "2")
@@ -32,6 +49,7 @@ def test_first_start_prints_a_token_once_and_signals_stop_it_cleanly(tmp_path: P
         token = process.wait_for(r"administrator's token, shown only once: (\S+)")[1]
         listed = offline("token", "list", "--server", process.address, "--token", token, "--json")
         assert [row["role"] for row in listed.json] == ["admin"]
+        assert modes(tmp_path / "data") == (0o700, {0o600})
     finally:
         assert process.stop(signal.SIGTERM) == 0
     assert sum("shown only once" in line for line in process.lines) == 1
@@ -180,6 +198,17 @@ def test_migrate_brings_a_database_up_and_hides_its_password(offline: Fleetmap, 
     result = offline("migrate", "--database-url", "postgresql+psycopg://me:hidden-word@127.0.0.1:1/none")
     assert result.status == 1
     assert "hidden-word" not in result.err + result.out
+
+
+@pytest.mark.usefixtures("usual_umask")
+@pytest.mark.parametrize(("folder", "file"), [(0o755, 0o600), (0o2775, 0o640)])
+def test_existing_data_folder_keeps_its_mode(folder: int, file: int, tmp_path: Path, offline: Fleetmap) -> None:
+    """Such as a mounted one. If its group may write there, the database is the group's as far as the umask lets."""
+    data = tmp_path / "data"
+    data.mkdir()
+    data.chmod(folder)
+    assert offline("migrate", "--data-dir", data).status == 0
+    assert modes(data) == (folder, {file})
 
 
 def test_database_of_newer_release_is_not_changed(offline: Fleetmap, tmp_path: Path) -> None:

@@ -124,6 +124,17 @@ def test_systemd_accepts_the_unit(name: str, tmp_path: Path) -> None:
     assert rated.returncode == 0, rated.stdout.splitlines()[-1]
 
 
+def test_backup_unit_fits_the_server_unit() -> None:
+    """The nightly backup runs the same program as the same user, and may write to the same data folder."""
+    text = (DOCKER / "fleetmap-backup.service").read_text()
+    backup, server = read_unit(text), read_unit((DOCKER / "fleetmap-server.service").read_text())
+    data = f"/var/lib/{server['StateDirectory'][0]}"
+    assert backup["User"] == server["User"]
+    assert backup["ExecStart"][0].split()[0] == server["ExecStart"][0].split()[0]
+    assert data in backup["ReadWritePaths"][0].split()
+    assert f"FLEETMAP_DATA_DIR={data}\n" in text
+
+
 def test_services_of_the_docs_run_with_tls_and_users(machine: Path) -> None:
     port, zenoh_port = free_port(), free_port()
     text = (machine / "etc/systemd/system/fleetmap-server.service").read_text()

@@ -73,6 +73,7 @@ class Place:
         (self.data / "blobs").mkdir(parents=True)
         self.database = self.data / "fleetmap.sqlite3"
         self.database.write_bytes(empty_database())
+        self.database.chmod(0o600)
         self.data.chmod(0o700)
 
     def site(self, *, unknown: tuple[str, ...] = (), server: str | None = None, **more: Any) -> Site:
@@ -330,6 +331,10 @@ CASES: list[Case] = [
     ("secret-files", "error", "every user", lambda p: (everyone_may_pass(p), p.site(
         environment={"FLEETMAP_SECRETS_DIR": str(p.secret("s/fleetmap_admin_token", 0o444).parent)}
     ))[-1]),
+    ("secret-files", "ok", "0 files", lambda p: (everyone_may_pass(p), p.database.chmod(0o660), p.site())[-1]),
+    ("secret-files", "warning", "can read the database", lambda p: (
+        everyone_may_pass(p), p.database.chmod(0o644), p.site()
+    )[-1]),
     ("server", "ok", "answers", running_server),
     ("server", "ok", "not asked", lambda p: p.site()),
     ("server", "error", "does not answer", lambda p: p.site(server=f"http://127.0.0.1:{free_port()}")),
