@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -25,6 +25,7 @@ from app.convert.pyramid import Size
 from app.convert.recently_used import RecentlyUsed
 from app.convert.tiles import Tiles
 from app.model import masks
+from app.model.antimeridian import cut_at_antimeridian
 from app.model.features import Features
 from app.model.frame import Datum
 from app.model.geodesy import WGS84, LocalFrame, between, local_frame
@@ -35,7 +36,7 @@ from app.store.values import Box, PartEntry, Version
 from app.syntax import images
 from app.syntax.geotiff import fit_affine
 
-WRITER = 1
+WRITER = 2
 """Version of the pictures: raise it whenever equal content gives another one."""
 
 MAX_SIDE = 2048
@@ -51,6 +52,9 @@ MARGIN = 64.0
 
 FAR = 2.0**15
 """Pixels around the picture beyond which geometries are cut, as coordinates of a drawing are limited."""
+
+GLOBES: Mapping[str, float] = {WGS84: 360.0, "EPSG:3857": 2 * math.pi * 6378137.0}
+"""Lengths of the equator in the CRSs that end at the antimeridian."""
 
 STEPS = 5
 """Number of points along each side of a raster's visible part to which its transform is fitted."""
@@ -74,6 +78,15 @@ class View:
         """Convert coordinates of the CRS to pixels, +y up."""
         x0, y0, x1, y1 = self.box
         return (points - (x0, y0)) * (self.width / (x1 - x0), self.height / (y1 - y0))
+
+    def globes(self) -> Iterator[View]:
+        """Yield the view, and the same one of the globe beyond the antimeridian if it reaches there."""
+        yield self
+        x0, y0, x1, y1 = self.box
+        turn = GLOBES.get(self.crs, math.inf)
+        for beyond in (-turn if x0 < -turn / 2 else 0.0, turn if x1 > turn / 2 else 0.0):
+            if beyond:
+                yield replace(self, box=(x0 - beyond, y0, x1 - beyond, y1))
 
     @property
     def unit(self) -> float:
@@ -135,7 +148,7 @@ class Views:
         for entry in content.parts:
             if entry.key.layer in VECTOR_LAYERS:
                 converted = self._convert(version, version.datum, entry, view.crs)
-                parts[entry.key] = _visible(converted, view, content.shape_types)
+                parts[entry.key] = _joined([_visible(converted, one, content.shape_types) for one in view.globes()])
         painter.features(canvas, parts, 1.0)
         return self._pictures.put(key, images.encode_png(canvas.finish()))
 
@@ -151,6 +164,7 @@ class Views:
             geometry = part.in_local(frame)
         else:
             geometry = shapely.force_2d(part.in_wgs84(frame))
+            geometry = cut_at_antimeridian(geometry) if crs in GLOBES else geometry
             geometry = shapely.transform(geometry, partial(between, WGS84, crs))
         shapes = shapes_of(part, geometry, np.ones(len(part), bool))
         return self._converted.put(key, _Converted(shapes, shapely.bounds(shapes.geometry).reshape(-1, 4)))
@@ -172,6 +186,13 @@ def _visible(converted: _Converted, view: View, types: Collection[int] | None) -
     if len(cut):
         geometry[cut] = shapely.clip_by_rect(geometry[cut], -FAR, -FAR, view.width + FAR, view.height + FAR)
     return Shapes(geometry, [shapes.kinds[row] for row in rows.tolist()], shapes.spacing * view.unit)
+
+
+def _joined(shapes: Sequence[Shapes]) -> Shapes:
+    if len(shapes) == 1:
+        return shapes[0]
+    geometry = np.concatenate([one.geometry for one in shapes])
+    return Shapes(geometry, [kind for one in shapes for kind in one.kinds], shapes[0].spacing)
 
 
 class _Drawing:
@@ -257,6 +278,11 @@ class _Drawing:
             points = self._frame.to_wgs84(points) if crs == LOCAL else between(crs, WGS84, points)
             to_local = self._view.crs == LOCAL
             points = self._frame.to_local(points) if to_local else between(WGS84, self._view.crs, points)
+        turn = GLOBES.get(self._view.crs)
+        if turn is not None:  # a raster across the antimeridian continues beyond it, on the side that is drawn
+            points[:, 0] -= turn * np.round((points[:, 0] - points[0, 0]) / turn)
+            middle = (self._view.box[0] + self._view.box[2]) / 2
+            points[:, 0] -= turn * round((float(points[:, 0].mean()) - middle) / turn)
         fit = fit_affine(np.column_stack([columns, rows, self._view.to_pixels(points)]).tolist())
         return None if fit is None or fit[0][0] * fit[0][4] == fit[0][1] * fit[0][3] else fit[0]
 

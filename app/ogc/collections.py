@@ -126,8 +126,7 @@ async def get_collection(
     add(body, "p", entry.description)
     if entry.bbox is not None:
         add(body, "p", "West, south, east, north: " + ", ".join(f"{value:.7f}°" for value in entry.bbox))
-        if entry.bbox[0] <= entry.bbox[2]:
-            draw_map_picture(body, service, "collections", entry.id)
+        draw_map_picture(body, service, "collections", entry.id)
     link_list(body, links)
     if "crs" in entry.members:
         add(body, "h2", "Coordinate reference systems")

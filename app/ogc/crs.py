@@ -50,6 +50,16 @@ class ReferenceSystem:
         """Return the number of decimals of coordinates: 1e-9 metres or 1e-12 degrees."""
         return 12 if self.kind == "crs84" or self.swap else 9
 
+    @property
+    def is_geographic(self) -> bool:
+        """Return whether coordinates are degrees."""
+        return self.kind == "crs84" or self.swap
+
+    @property
+    def ends_at_antimeridian(self) -> bool:
+        """Return whether geometries across the antimeridian are in two pieces."""
+        return self.is_geographic or self.code == MERCATOR
+
     def from_wgs84(self, geometry: NDArray[np.object_], datum: Datum) -> NDArray[np.object_]:
         """Convert geometries from CRS84."""
         if self.kind == "crs84":

@@ -14,6 +14,7 @@ import shapely
 import shapely.geometry
 
 from app.errors import Conflict, Invalid, NotFound, Problem
+from app.model.antimeridian import join_at_antimeridian
 from app.model.geodesy import local_frame
 from app.model.layers import PartKey
 from app.ogc.crs import ReferenceSystem
@@ -213,6 +214,9 @@ class FeatureEditor:
             raise Invalid(f"invalid GeoJSON geometry: {error}", problems) from error
         if not np.isfinite(shapely.get_coordinates(shape)).all():
             raise Invalid("the geometry has a coordinate that is not finite: give numbers", problems)
+        if self._crs.kind != "local":
+            degrees = self._crs.to_wgs84(np.array([shape], object), self._datum)
+            shape = join_at_antimeridian(degrees[0])  # it was sent in two pieces
         parts = shapely.get_parts(shape)
         if self._layer == "topology" and shape.geom_type.startswith("Multi") and len(parts) == 1:
             shape = parts[0]  # programs with layers of one type send all as multiple ones
@@ -222,8 +226,7 @@ class FeatureEditor:
             )
         if self._crs.kind == "local":
             return shape
-        one = np.array([shape], object)
-        local = self._frame.geometries_to_local(self._crs.to_wgs84(one, self._datum))[0]
+        local = self._frame.geometries_to_local(np.array([shape], object))[0]
         if not np.isfinite(shapely.get_coordinates(local)).all():
             raise Invalid(f"the geometry is outside the area of {self._crs.uri}: check Content-Crs", problems)
         return local

@@ -101,6 +101,12 @@ def draw_map(parent: Element, geometry: NDArray[np.object_]) -> None:
     geometry = shapely.force_2d(geometry[~shapely.is_empty(geometry)])
     if not len(geometry):
         return
+    turned = (
+        shapely.transform(geometry, lambda xy: np.column_stack([xy[:, 0] % 360.0, xy[:, 1]]))
+        if _width(geometry) > 180.0
+        else geometry
+    )
+    geometry = turned if _width(turned) < _width(geometry) else geometry  # on both sides of the antimeridian
     bounds = shapely.bounds(geometry)
     west, south = bounds[:, :2].min(axis=0).tolist()
     east, north = bounds[:, 2:].max(axis=0).tolist()
@@ -131,6 +137,11 @@ def draw_map(parent: Element, geometry: NDArray[np.object_]) -> None:
     for kind, drawn in paths.items():
         if drawn:
             add(svg, "path", d="".join(drawn), class_=kind)
+
+
+def _width(geometry: NDArray[np.object_]) -> float:
+    west, _, east, _ = shapely.total_bounds(geometry)
+    return float(east - west)
 
 
 def _path(coordinates: Any) -> str:

@@ -24,6 +24,8 @@ MAX_FILTERS = 20
 FILTERS_OF_PART_3 = frozenset({"filter", "filter-lang", "filter-crs"})
 _TIME = re.compile(r"\d{4}-\d{2}-\d{2}(?:[Tt]\d{2}:\d{2}:\d{2}(?:\.\d{1,9})?(?:[Zz]|[+-]\d{2}:\d{2}))?", re.ASCII)
 
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
 Rows = NDArray[np.intp]
 
 
@@ -97,19 +99,25 @@ def parse_limit(text: str) -> int:
     return MAX_LIMIT if len(digits) > len(str(MAX_LIMIT)) else min(int(digits), MAX_LIMIT)
 
 
+def parse_numbers(text: str) -> list[float]:
+    """Parse finite numbers separated by commas; none if one is something else (Python reads `1_0`, too)."""
+    parts = [part.strip(" ") for part in text.split(",")] if len(text) <= 1000 else []
+    return [float(part) for part in parts] if all(map(_is_finite, parts)) else []
+
+
+def _is_finite(text: str) -> bool:
+    return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
+
+
 def parse_bbox(text: str, crs: ReferenceSystem) -> tuple[Box, tuple[float, float] | None]:
     """Parse a box of 4 numbers, or 6 with heights, in the axis order of its CRS. Raises Invalid."""
-    try:
-        numbers = [float(part) for part in text.split(",")] if len(text) <= 1000 else []
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (4, 6) or not all(math.isfinite(number) for number in numbers):
+    numbers = parse_numbers(text)
+    if len(numbers) not in (4, 6):
         raise invalid("bbox", "must be 4 or 6 finite numbers, separated by commas")
     half = len(numbers) // 2
     x0, y0, x1, y1 = numbers[0], numbers[1], numbers[half], numbers[half + 1]
     first, second = ("latitude", "longitude") if crs.swap else ("x", "y")
-    degrees = crs.kind == "crs84" or crs.swap
-    if degrees:
+    if crs.is_geographic:
         first, second = ("latitude", "longitude") if crs.swap else ("longitude", "latitude")
         south, north, west, east = (x0, x1, y0, y1) if crs.swap else (y0, y1, x0, x1)
         if not -90.0 <= south <= north <= 90.0:
@@ -188,19 +196,18 @@ def select_rows(table: Table, query: ItemQuery) -> Rows:
 def _in_box(table: Table, box: Box, crs: ReferenceSystem) -> Rows:
     """Return the rows whose geometry intersects a box: by their boxes, then those that cross its edge exactly."""
     degrees = crs.box_in_wgs84(box, table.datum, "bbox")
-    is_geographic = crs.kind == "crs84" or crs.swap
     hits = np.zeros(len(table), bool)
     inside = np.zeros(len(table), bool)
     west, south, east, north = table.boxes.T
     for x0, y0, x1, y1 in degrees:
         hits |= (west <= x1) & (east >= x0) & (south <= y1) & (north >= y0)
-        if is_geographic:
+        if crs.is_geographic:
             inside |= (west >= x0) & (east <= x1) & (south >= y0) & (north <= y1)
     rows = np.flatnonzero(hits & ~inside)
     if len(rows):
-        geometry = table.in_wgs84(rows) if is_geographic else table.in_crs(rows, crs)
+        geometry = table.in_wgs84(rows) if crs.is_geographic else table.in_crs(rows, crs)
         exact = np.zeros(len(rows), bool)
-        for shape in (shapely.box(*one) for one in (degrees if is_geographic else [box])):
+        for shape in (shapely.box(*one) for one in (degrees if crs.is_geographic else [box])):
             shapely.prepare(shape)
             exact |= shapely.intersects(shape, geometry)
         hits[rows] = exact

@@ -75,7 +75,7 @@ async def get_landing_page(service: Service, f: Representation = None) -> Respon
     missing = notice(service)
     if missing is not None:
         add(body, "p", missing)
-    if box is not None and box[0] <= box[2]:
+    if box is not None:
         draw_map_picture(body, service)
     line = add(body, "p", "In QGIS: add an OGC API - Features connection with the address ")
     add(line, "code", service.landing_url).tail = ". If it asks for a password, give your token; any user name will do."

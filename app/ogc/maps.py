@@ -24,10 +24,12 @@ from app.ogc.crs import EPSG, MERCATOR, ReferenceSystem, parse_crs, reference_sy
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension, all_collections
 from app.ogc.extent import site_box
+from app.ogc.item_query import parse_numbers
 from app.ogc.negotiation import Representation
 from app.ogc.rasters import check_collection, content_of
 from app.ogc.routing import both, ogc_router
 from app.ogc.service import Link, Service, link
+from app.ogc.tile_matrix_sets import MERCATOR_EDGE
 from app.store.parts.boxes import ring
 from app.store.values import Box
 
@@ -36,6 +38,10 @@ REL = "http://www.opengis.net/def/rel/ogc/1.0/map"
 CONFORMANCE = "http://www.opengis.net/spec/ogcapi-maps-1/1.0/conf/"
 DEFAULT_SIDE = 1024
 """Longer side of a map without a size, in pixels."""
+
+MAX_COORDINATE = 1e9
+MIN_SIDE = 1e-9
+"""Maximum of a box's coordinates, and minimum of its sides, in units of its CRS."""
 
 _CURIE = re.compile(r"\[(EPSG|OGC):([A-Za-z0-9.]+)\]")
 _HEX = re.compile(r"(0x|#)?([0-9a-fA-F]{6})")
@@ -110,19 +116,33 @@ def _code(system: ReferenceSystem) -> str:
 
 def _parse_box(text: str, system: ReferenceSystem) -> Box:
     """Parse a box, x first. Raises Invalid."""
-    try:
-        numbers = [float(word) for word in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
-        problem = Problem("must be four numbers", where="bbox")
+    numbers = parse_numbers(text)
+    if len(numbers) != 4 or max(map(abs, numbers)) > MAX_COORDINATE:
+        problem = Problem(f"must be four numbers within ±{MAX_COORDINATE:g}", where="bbox")
         raise Invalid(f"bbox must be four numbers separated by commas, got {text[:80]!r}", [problem])
     a, b, c, d = numbers
     box = (b, a, d, c) if system.swap else (a, b, c, d)
+    if system.is_geographic:
+        box = _continued(box)
     if box[0] >= box[2] or box[1] >= box[3]:
-        reason = "bbox must have a minimum below its maximum on both axes: a map across the antimeridian is not drawn"
-        raise Invalid(reason, [Problem("has no area", where="bbox")])
+        raise Invalid(
+            "bbox must have a minimum below its maximum on both axes (in degrees, west > east is the antimeridian)",
+            [Problem("has no area", where="bbox")],
+        )
     return box
+
+
+def _continued(box: Box) -> Box:
+    """Return a box in degrees across the antimeridian with an east beyond 180."""
+    west, south, east, north = box
+    return (west, south, east + 360.0, north) if 180.0 >= west > east >= -180.0 else box
+
+
+def _corners(box: Box, system: ReferenceSystem) -> Box:
+    """Return a box as clients see it: in the CRS's order of axes, with west > east across the antimeridian."""
+    west, south, east, north = box
+    east = east - 360.0 if system.is_geographic and west <= 180.0 < east else east
+    return (south, west, north, east) if system.swap else (west, south, east, north)
 
 
 def _convert(service: Service, box: Box, source: ReferenceSystem, target: ReferenceSystem) -> Box:
@@ -138,6 +158,8 @@ def _convert(service: Service, box: Box, source: ReferenceSystem, target: Refere
     if target.code == MERCATOR:
         degrees[:, 1] = degrees[:, 1].clip(-85.05, 85.05)
     out = frame.to_local(degrees) if target.kind == "local" else geodesy.between(geodesy.WGS84, _code(target), degrees)
+    if target.code == MERCATOR:  # PROJ's x ends at the antimeridian
+        out[:, 0] += np.round(degrees[:, 0] / 180.0 - out[:, 0] / MERCATOR_EDGE) * MERCATOR_EDGE
     if not np.isfinite(out).all():
         raise Invalid(
             f"the bbox is outside the area of {target.uri}: choose another crs", [Problem("outside", where="bbox")]
@@ -185,10 +207,16 @@ async def _extent(service: Service, collection: str | None) -> Box:
     if collection is not None:
         (entry,) = [one for one in await all_collections(service) if one.id == collection]
         box = entry.bbox or box
-    if box is None or box[0] > box[2]:
+    if box is None:
         raise NotFound(f"{collection or service.environment.name} has no box to draw by default: give a bbox")
-    x, y = max((box[2] - box[0]) * 0.02, 1e-6), max((box[3] - box[1]) * 0.02, 1e-6)
-    return max(-180.0, box[0] - x), max(-90.0, box[1] - y), min(180.0, box[2] + x), min(90.0, box[3] + y)
+    west, south, east, north = _continued(box)
+    x, y = max((east - west) * 0.02, 1e-6), max((north - south) * 0.02, 1e-6)
+    south, north = max(-90.0, south - y), min(90.0, north + y)
+    return (
+        (west - x, south, east + x, north)
+        if east > 180.0
+        else (max(-180.0, west - x), south, min(180.0, east + x), north)
+    )
 
 
 async def _map(service: Service, collection: str | None, wanted: _Wanted) -> Response:
@@ -205,13 +233,17 @@ async def _map(service: Service, collection: str | None, wanted: _Wanted) -> Res
     else:
         box = _parse_box(wanted.bbox, given)
     box = _convert(service, box, given, system)
+    if min(box[2] - box[0], box[3] - box[1]) < MIN_SIDE:
+        raise Invalid(
+            f"the bbox is too small, or outside the area of {system.uri}: choose a larger one, or another crs",
+            [Problem("has no area", where="bbox")],
+        )
     view = View(_code(system), box, *_size(box, system, wanted))
     background = _background(wanted)
     content = content_of(service, collection)
     key = view_key(service.version, content, view, background)
     etag = f'"{key[:32]}"'
-    corners = (box[1], box[0], box[3], box[2]) if system.swap else box
-    headers = {"content-bbox": ",".join(repr(value) for value in corners), "content-crs": f"<{system.uri}>"}
+    headers = {"content-bbox": ",".join(map(repr, _corners(box, system))), "content-crs": f"<{system.uri}>"}
     if none_match(service.request.headers.get("if-none-match"), etag):
         return service.respond(b"", PNG, headers, etag)
     views, join = service.services.views, service.services.response_cache.join

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from app.api.http.features import Position, geometries_as_geojson
 from app.api.http.responses import json_bytes
+from app.model.antimeridian import cut_at_antimeridian
 from app.model.features import Properties
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, local_frame
@@ -161,8 +162,14 @@ class Table:
         boxes = self.boxes[~np.isnan(self.boxes[:, 0])]
         if not len(boxes):
             return None
+        if boxes[:, 2].max() - boxes[:, 0].min() > 180.0:  # on both sides of the antimeridian
+            boxes = shapely.bounds(shapely.get_parts(self.in_wgs84(np.arange(len(self)))))
+            boxes = boxes[~np.isnan(boxes[:, 0])]
+            return join(
+                [(west, south, east, north) for west, south, east, north in boxes.tolist()], self.datum.longitude
+            )
         low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
-        return join([(float(low[0]), float(low[1]), float(high[0]), float(high[1]))], self.datum.longitude)
+        return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
     @cached_property
     def types(self) -> Mapping[str, frozenset[JsonType]]:
@@ -208,13 +215,17 @@ class Table:
         return ROW_BYTES * len(self) + 3 * sum(map(len, self.packed)) + 72 * coordinates
 
     def in_wgs84(self, rows: NDArray[np.intp]) -> NDArray[np.object_]:
-        """Return the geometries of rows in degrees."""
+        """Return the geometries of rows in degrees, cut at the antimeridian."""
+        return cut_at_antimeridian(self._in_degrees(rows))
+
+    def _in_degrees(self, rows: NDArray[np.intp]) -> NDArray[np.object_]:
         return _converted(self.geometry[rows], self.local[rows], local_frame(self.datum))
 
     def in_crs(self, rows: NDArray[np.intp], crs: ReferenceSystem) -> NDArray[np.object_]:
         """Return the geometries of rows in a CRS. Raises Invalid if one is too far away for the local frame."""
         if crs.kind != "local":
-            return crs.from_wgs84(self.in_wgs84(rows), self.datum)
+            geometry = self.in_wgs84(rows) if crs.ends_at_antimeridian else self._in_degrees(rows)
+            return crs.from_wgs84(geometry, self.datum)
         out, local = self.geometry[rows], self.local[rows]
         if not local.all():
             out[~local] = crs.from_wgs84(out[~local], self.datum)

@@ -39,7 +39,7 @@ from app.syntax.vector_tile import (
     layer,
 )
 
-WRITER = 1
+WRITER = 2
 """Version of the tiles' content: raise it whenever equal content gives other tiles."""
 
 EXTENT = 4096
@@ -132,6 +132,8 @@ def _planar(table: Table, code: str) -> NDArray[np.object_]:
     points, feature = shapely.get_coordinates(geometry, return_index=True)
     local = table.local[feature]
     points[local] = local_frame(table.datum).to_wgs84(points[local])
+    if len(points) and np.ptp(points[:, 0]) > 180.0:  # on both sides of the antimeridian
+        return geodesy.geometries_from_wgs84(code, shapely.force_2d(table.in_wgs84(np.arange(len(table)))))
     shapely.set_coordinates(geometry, geodesy.between(WGS84, code, points))
     return geometry
 

@@ -38,9 +38,9 @@ def local_geojson(shapes: dict[str, Any], kinds: str) -> bytes:
     return json.dumps({**head, "features": features}).encode()
 
 
-def create_turned(api: Api, name: str) -> None:
-    """Create a site whose +y axis points 30 degrees east of north."""
-    api.post("environments", {"name": name, "title": "Turned <site>", "datum": TURNED_DATUM})
+def create_turned(api: Api, name: str, datum: dict[str, float] = TURNED_DATUM) -> None:
+    """Create a site whose +y axis points 30 degrees east of north, or as its datum says."""
+    api.post("environments", {"name": name, "title": "Turned <site>", "datum": datum})
     api.upload(name, {"network.tmap2.yaml": samples.tmap2()})
     api.upload(name, {"things.geojson": local_geojson(SHAPES, "thing")}, layer="objects", format="geojson")
     grid = samples.grid(width=40, height=30)

@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Damaged, MissingDatum, NotFound
+from app.model.antimeridian import cut_at_antimeridian
 from app.model.features import Features
 from app.model.geodesy import LocalFrame
 from app.store import tree
@@ -402,20 +403,32 @@ def features_in_box(draft: ChunkStage, root: PartRoot, box: Box, crs: str, frame
             )
         boxes = split_box(box) if crs == "wgs84" else [box]
         coarse = boxes if same else [c for b in boxes for c in boxes_in_other_frame(b, crs, frame)]
-        leaves = tree.select(draft, node, lambda have, coarse=coarse: _meets(have, coarse))  # type: ignore[misc]
+        meets = _meets_on_earth if name == "wgs84" else _meets
+        leaves = tree.select(draft, node, lambda have, meets=meets, coarse=coarse: meets(have, coarse))  # type: ignore[misc]
         candidates = dict(leaf_items(draft, leaves, anchor))
         ids = list(candidates)
-        wkb = [candidates[i].wkb for i in ids]
-        if same or frame is None:
-            have = wkb_bounds(wkb)
-        else:
-            geometry = from_wkb(wkb)
-            have = bounds(
-                frame.geometries_to_local(geometry) if crs == "local" else frame.geometries_to_wgs84(geometry)
-            )
-        hits = np.flatnonzero(_meets(have, boxes)) if ids else np.empty(0, np.intp)
+        hits = _hits([candidates[i].wkb for i in ids], boxes, crs, None if same else frame)
         out.update((ids[k], candidates[ids[k]]) for k in hits.tolist())
     return out
+
+
+def _hits(wkb: Sequence[bytes], boxes: Sequence[Box], crs: str, frame: LocalFrame | None) -> NDArray[np.intp]:
+    """Return which geometries meet boxes of ``crs``. frame: of geometries in the other one, else None."""
+    if not wkb:
+        return np.empty(0, np.intp)
+    geometry = None if frame is None else from_wkb(wkb)
+    if geometry is not None and frame is not None:
+        geometry = frame.geometries_to_local(geometry) if crs == "local" else frame.geometries_to_wgs84(geometry)
+    have = wkb_bounds(wkb) if geometry is None else bounds(geometry)
+    if crs == "local":
+        return np.flatnonzero(_meets(have, boxes))
+    hits = _meets_on_earth(have, boxes)
+    wide = np.flatnonzero(hits & _is_wide(have))
+    if len(wide):
+        pieces = cut_at_antimeridian(from_wkb([wkb[k] for k in wide.tolist()]) if geometry is None else geometry[wide])
+        parts, index = shapely.get_parts(pieces, return_index=True)
+        hits[wide] = np.bincount(index, _meets(bounds(parts), boxes), len(wide)) > 0
+    return np.flatnonzero(hits)
 
 
 def _meets(have: NDArray[np.float64], boxes: Sequence[Box]) -> NDArray[np.bool_]:
@@ -423,6 +436,19 @@ def _meets(have: NDArray[np.float64], boxes: Sequence[Box]) -> NDArray[np.bool_]
     for x0, y0, x1, y1 in boxes:
         out |= (have[:, 0] <= x1) & (have[:, 2] >= x0) & (have[:, 1] <= y1) & (have[:, 3] >= y0)
     return out
+
+
+def _is_wide(have: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which boxes in degrees may be around what crosses the antimeridian: it is outside of them."""
+    with np.errstate(invalid="ignore"):  # of a box around nothing
+        return np.asarray(have[:, 2] - have[:, 0] > 180.0)
+
+
+def _meets_on_earth(have: NDArray[np.float64], boxes: Sequence[Box]) -> NDArray[np.bool_]:
+    """Return which boxes in degrees may meet others, also across the antimeridian."""
+    around = have.copy()
+    around[_is_wide(have), 0::2] = -180.0, 180.0
+    return _meets(around, boxes)
 
 
 # --- chunks -> values ---
