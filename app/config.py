@@ -187,14 +187,6 @@ class Settings(RetentionSettings):
         "token is always accepted.",
     )
 
-    max_robots: int = Field(
-        default=10_000,
-        ge=1,
-        le=100_000,
-        description="Maximum number of robots in an environment; statuses of further ones are refused. On a router "
-        "without users anyone can invent robots. The page's view of a fleet reads all of its robots: with 100 000 that "
-        "takes some 200 MB of memory and 10 seconds.",
-    )
     anonymous_networks: str = Field(
         default="",
         description="Networks whose clients may read everything without a token, as role `viewer`: addresses or CIDRs, "
