@@ -196,6 +196,7 @@ def open_store(settings: Settings, *, readonly: bool = False) -> Store:
         readonly=readonly,
         files=files,
         copies_bytes=settings.blob_cache_bytes,
+        max_robots=settings.max_robots,
     )
 
 

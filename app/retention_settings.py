@@ -1,4 +1,4 @@
-"""Settings of retention, a part of ``app.config.Settings``."""
+"""Settings of what is kept, a part of ``app.config.Settings``: versions, uploads, robots."""
 
 from __future__ import annotations
 
@@ -12,8 +12,16 @@ from app.store.retention_rule import Rule
 
 
 class RetentionSettings(BaseSettings):
-    """Which versions and uploads stay by their age."""
+    """Which versions and uploads stay by their age, and how many robots."""
 
+    max_robots: int = Field(
+        default=10_000,
+        ge=1,
+        le=100_000,
+        description="Maximum number of robots in an environment; statuses of further ones are refused. On a router "
+        "without users anyone can invent robots. The page's view of a fleet reads all of its robots: with 100 000 that "
+        "takes some 200 MB of memory and 10 seconds.",
+    )
     retention_all_days: int | None = Field(
         default=None,
         ge=1,

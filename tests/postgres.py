@@ -73,9 +73,9 @@ class Cluster:
             host="127.0.0.1", port=self.port, user="fleetmap", dbname=database, autocommit=True, connect_timeout=10
         )
 
-    def create_database(self, template: str = "fleetmap_template") -> str:
+    def create_database(self, template: str = "fleetmap_template", *, name: str | None = None) -> str:
         """Create an empty database with PostGIS, or copy one without connections; return its name."""
-        name = f"t{uuid.uuid4().hex}"
+        name = name or f"t{uuid.uuid4().hex}"
         with self.connect() as connection:
             names = sql.Identifier(name), sql.Identifier(template)
             copy = sql.SQL("CREATE DATABASE {} TEMPLATE {}").format(*names)
@@ -136,8 +136,8 @@ def postgres_cluster() -> Iterator[Cluster]:
 
 
 @contextmanager
-def running_cluster() -> Iterator[Cluster]:
-    """Run a cluster outside of tests."""
+def running_cluster(kept: Path | None = None) -> Iterator[Cluster]:
+    """Run a cluster outside of tests. kept: folder where its data stay, and are found again."""
     folder = _binaries()
     if folder is None:
         _missing("PostgreSQL is not installed (initdb is not to be found)")
@@ -145,10 +145,10 @@ def running_cluster() -> Iterator[Cluster]:
     prefix, uid = _as_user()
     if os.geteuid() == 0 and uid is None:
         _missing("PostgreSQL does not run as root, and there is no other user to run it as")
-    root = Path(tempfile.mkdtemp(prefix="fleetmap-pg-"))
+    root = kept or Path(tempfile.mkdtemp(prefix="fleetmap-pg-"))
+    home = root.absolute() / "home"
+    home.mkdir(parents=True, exist_ok=True)
     root.chmod(0o755)
-    home = root / "home"
-    home.mkdir()
     if uid is not None:
         os.chown(home, uid, -1)
     data = home / "data"
@@ -160,33 +160,50 @@ def running_cluster() -> Iterator[Cluster]:
         )
 
     try:
-        process = run(
-            str(folder / "initdb"),
-            *("-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync", *_initdb_options()),
-        )
-        if process.returncode:
-            pytest.fail(f"initdb failed: {process.stderr}")
-        for _ in range(5):
-            cluster = Cluster(free_port(), folder, data, run)
-            started = cluster.start()
-            if started.returncode == 0:
-                break
-        if started.returncode:
-            log = (home / "log").read_text(errors="replace") if (home / "log").exists() else ""
-            pytest.fail(f"PostgreSQL does not start: {started.stdout}{started.stderr}{log}")
+        if not (data / "PG_VERSION").exists():
+            _create_cluster(folder, data, run)
+        cluster = _started_cluster(folder, data, run)
         try:
-            with cluster.connect() as connection:
-                row = connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'").fetchone()
-                if row is None:
-                    _missing("PostGIS is not installed beside PostgreSQL")
-                connection.execute("CREATE DATABASE fleetmap_template")
-            with cluster.connect("fleetmap_template") as connection:
-                connection.execute("CREATE EXTENSION postgis")
+            _create_template(cluster)
             yield cluster
         finally:
-            run(str(folder / "pg_ctl"), "-D", str(data), "-m", "immediate", "-w", "stop")
+            mode = "immediate" if kept is None else "fast"
+            run(str(folder / "pg_ctl"), "-D", str(data), "-m", mode, "-w", "stop")
     finally:
-        shutil.rmtree(root, ignore_errors=True)
+        if kept is None:
+            shutil.rmtree(root, ignore_errors=True)
+
+
+def _create_cluster(folder: Path, data: Path, run: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    process = run(
+        str(folder / "initdb"),
+        *("-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync", *_initdb_options()),
+    )
+    if process.returncode:
+        pytest.fail(f"initdb failed: {process.stderr}")
+
+
+def _started_cluster(folder: Path, data: Path, run: Callable[..., subprocess.CompletedProcess[str]]) -> Cluster:
+    for _ in range(5):
+        cluster = Cluster(free_port(), folder, data, run)
+        started = cluster.start()
+        if started.returncode == 0:
+            return cluster
+    log = data.parent / "log"
+    text = log.read_text(errors="replace") if log.exists() else ""
+    pytest.fail(f"PostgreSQL does not start: {started.stdout}{started.stderr}{text}")
+
+
+def _create_template(cluster: Cluster) -> None:
+    with cluster.connect() as connection:
+        if connection.execute("SELECT 1 FROM pg_database WHERE datname = 'fleetmap_template'").fetchone():
+            return
+        row = connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'").fetchone()
+        if row is None:
+            _missing("PostGIS is not installed beside PostgreSQL")
+        connection.execute("CREATE DATABASE fleetmap_template")
+    with cluster.connect("fleetmap_template") as connection:
+        connection.execute("CREATE EXTENSION postgis")
 
 
 @pytest.fixture

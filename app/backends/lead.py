@@ -66,18 +66,22 @@ class Lead(ABC):
 
     @contextmanager
     def fenced(self) -> Iterator[None]:
-        """Let transactions of this context be committed only by the leader. They and this raise LeadLostError."""
+        """Let transactions of this context be committed only in the present term. They and this raise LeadLostError.
+
+        A process that loses the lead meanwhile and wins it again may not store what it has read before.
+        """
+        term = self.term
         if not self.is_held:
             raise self._lost_error()
-        token = _fence.set(self)
+        token = _fence.set((self, term))
         try:
             yield
         finally:
             _fence.reset(token)
 
-    def check_term(self, connection: Connection) -> None:
-        """Check within a transaction, right before its commit, that this process has the lead. Raises LeadLostError."""
-        del connection
+    def check_term(self, connection: Connection, term: int | None) -> None:
+        """Check within a transaction, right before its commit, that this term goes on. Raises LeadLostError."""
+        del connection, term
         if not self.is_held:
             raise self._lost_error()
 
@@ -85,14 +89,15 @@ class Lead(ABC):
         return LeadLostError(f"another server has taken over ({self.name}): nothing was stored")
 
 
-_fence: ContextVar[Lead | None] = ContextVar("fence", default=None)
+_fence: ContextVar[tuple[Lead, int | None] | None] = ContextVar("fence", default=None)
 
 
 def check_fence(connection: Connection) -> None:
     """Check a transaction of a leader right before its commit; others pass. Raises LeadLostError."""
-    lead = _fence.get()
-    if lead is not None:
-        lead.check_term(connection)
+    fence = _fence.get()
+    if fence is not None:
+        lead, term = fence
+        lead.check_term(connection, term)
 
 
 class Leads(ABC):
@@ -210,10 +215,9 @@ class SharedLead(Lead):
             self.is_wanted = False
             self._leads.wake()
 
-    def check_term(self, connection: Connection) -> None:
-        """Check that no other process has won an election, and keep elections waiting until the commit."""
-        term = self.term
-        super().check_term(connection)
+    def check_term(self, connection: Connection, term: int | None) -> None:
+        """Check that no process has won an election since, and keep elections waiting until the commit."""
+        super().check_term(connection, term)
         query = (
             "SELECT term, set_config('idle_in_transaction_session_timeout', %s, true) FROM lead WHERE name = %s "
             "FOR SHARE"

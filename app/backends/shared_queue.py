@@ -104,8 +104,15 @@ class SharedQueue:
 
     def submit(self, task: Task) -> None:
         """Add a task, unless one with its key waits; that becomes as urgent as this. Raises Unavailable if full."""
+        try:
+            self._submit(task)
+        except IntegrityError:  # another server was first: its task may be less urgent
+            with contextlib.suppress(IntegrityError):
+                self._submit(task)
+
+    def _submit(self, task: Task) -> None:
         top = _TOP[task.urgency]
-        with contextlib.suppress(IntegrityError), self._transaction() as connection:  # another server was first
+        with self._transaction() as connection:
             values = {"top": top, "environment": task.environment, "queue": task.urgency}
             row = connection.execute(_TAGS, values).one()
             tag = max(row.first or 0, 0 if row.own is None else row.own + 1)

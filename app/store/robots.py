@@ -20,7 +20,7 @@ HISTORY: Final = 200
 """Maximum number of reports stored per robot and environment."""
 
 MAX_ROBOTS: Final = 10_000
-"""Maximum number of robots in an environment: on a router without users anyone can invent names."""
+"""Default of the number of robots that an environment may have: on a router without users anyone can invent names."""
 
 MAX_PRESENT: Final = 100_000
 
@@ -29,10 +29,10 @@ LAST_SEEN: Final = timedelta(seconds=60)
 
 
 class Robots:
-    """Store of the fleet."""
+    """Store of the fleet. limit: number of robots that an environment may have."""
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
+    def __init__(self, database: Database, *, limit: int = MAX_ROBOTS) -> None:
+        self._database, self._limit = database, limit
 
     def note_reports(self, reports: Sequence[ReceivedReport]) -> list[FleetMapError | None]:
         """Store robot reports in the given order, in one transaction; returns for each None, or the error.
@@ -52,7 +52,9 @@ class Robots:
                     except NotFound as error:
                         owners[name] = error
                 owner = owners[name]
-                out[k] = owner if isinstance(owner, FleetMapError) else _note(connection, owner, reports[k])
+                out[k] = (
+                    owner if isinstance(owner, FleetMapError) else _note(connection, owner, reports[k], self._limit)
+                )
         return out
 
     def all(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
@@ -156,7 +158,7 @@ class Robots:
             return [_as_robot(row) for row in connection.execute(query)]
 
 
-def _note(connection: Connection, environment_id: str, received: ReceivedReport) -> FleetMapError | None:
+def _note(connection: Connection, environment_id: str, received: ReceivedReport, limit: int) -> FleetMapError | None:
     table, report = tables.robot, received.report
     conditions = (table.c.environment_id == environment_id, table.c.robot == received.robot)
     row = connection.execute(select(table).where(*conditions).with_for_update()).one_or_none()
@@ -191,9 +193,12 @@ def _note(connection: Connection, environment_id: str, received: ReceivedReport)
     if row is not None:
         connection.execute(update(table).where(*conditions).values(values))
     else:
-        others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
-        if connection.execute(others).scalar_one() >= MAX_ROBOTS:
-            return Conflict(f"{received.environment} has {MAX_ROBOTS} robots: remove robots that no longer exist")
+        tally = tables.robot_tally.c  # its sum: counting the robots of a large fleet takes a hundred times as long
+        others = select(func.coalesce(func.sum(tally.number), 0)).where(tally.environment_id == environment_id)
+        if connection.execute(others).scalar_one() >= limit:
+            return Conflict(
+                f"{received.environment} has {limit} robots: remove robots that no longer exist, or raise the limit"
+            )
         keys = {"environment_id": environment_id, "robot": received.robot}
         upsert(connection, table, keys, values)  # the later writer wins
     if not again:

@@ -42,7 +42,7 @@ from app.store.overlays import Overlays
 from app.store.position import Areas
 from app.store.retention import Retention
 from app.store.robot_counts import RobotCounts
-from app.store.robots import Robots
+from app.store.robots import MAX_ROBOTS, Robots
 from app.store.search import Search
 from app.store.search_index import SearchIndex
 from app.store.sessions import Sessions
@@ -59,8 +59,8 @@ class Store:
 
     database_url: ``sqlite:///PATH`` or ``postgresql+psycopg://…`` (with PostGIS). readonly: the database itself rejects
     writes; ``versions.prepare`` and all reading work. files: the blob store, by default that folder; with one on
-    another machine ``blob_dir`` has copies of at most ``copies_bytes`` bytes. ``generation()`` is a number that changes
-    with every committed write on this host.
+    another machine ``blob_dir`` has copies of at most ``copies_bytes`` bytes. max_robots: of an environment.
+    ``generation()`` is a number that changes with every committed write on this host.
     """
 
     def __init__(
@@ -72,6 +72,7 @@ class Store:
         clock: Callable[[], datetime] = utcnow,
         files: BlobFiles | None = None,
         copies_bytes: int = COPIES_BYTES,
+        max_robots: int = MAX_ROBOTS,
     ) -> None:
         self.database_url = database_url
         self.blob_dir = Path(blob_dir)
@@ -90,7 +91,7 @@ class Store:
         self.content = ContentReader(self.chunks, self.blobs)
         self.channels = Channels(database)
         self.overlays = Overlays(database)
-        self.robots = Robots(database)
+        self.robots = Robots(database, limit=max_robots)
         self.robot_counts = RobotCounts(database)
         self.fleet_figures = FleetFigures(database)
         self.mirror_source = MirrorSource(database, self.chunks)

@@ -134,6 +134,29 @@ class TestShared:
             store.environments.create("fresh")
         assert [e.name for e in store.environments.page()[0]] == ["fresh"]
 
+    def test_work_of_an_earlier_term_is_not_stored_in_a_later_one(
+        self, store: Store, open_process: Callable[[], Leads]
+    ) -> None:
+        lead, successor = open_process().lead("task"), open_process().lead("task")
+        eventually(lead.try_acquire)
+
+        def lose_and_win_again() -> None:
+            lead.release()
+            eventually(successor.try_acquire)
+            successor.release()
+            eventually(lead.try_acquire)
+
+        def write_late() -> None:
+            with lead.fenced():
+                lose_and_win_again()
+                store.environments.create("stale")
+
+        with pytest.raises(LeadLostError):
+            write_late()
+        with lead.fenced():
+            store.environments.create("fresh")
+        assert [e.name for e in store.environments.page()[0]] == ["fresh"]
+
     def test_stopped_process_loses_the_lead(
         self, database_url: str, tmp_path: Path, open_process: Callable[[], Leads]
     ) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 import pytest
+from sqlalchemy import text
 
 from app.backends.queue import LocalQueue, Queue, Task, Urgency
 from app.errors import Unavailable
@@ -181,6 +182,32 @@ def test_waiting_task_becomes_urgent_when_a_robot_needs_it(case: Case) -> None:
     case.start()
     eventually(lambda: len(made(case)) == 2)
     assert made(case) == ["needed", "first"]
+
+
+@pytest.mark.postgres
+def test_task_becomes_urgent_although_another_server_adds_it_at_the_same_time(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from app.backends import shared_queue
+
+    case = next(cases := _shared(request, tmp_path))
+    case.submit("first")
+    add, raise_urgency = shared_queue.SharedQueue._submit, shared_queue._RAISE
+
+    def add_late(queue: shared_queue.SharedQueue, task: Task) -> None:
+        """Look for the task before the other server has added it."""
+        monkeypatch.setattr(shared_queue.SharedQueue, "_submit", add)
+        case.submit("same")
+        with monkeypatch.context() as before:
+            before.setattr(shared_queue, "_RAISE", text(raise_urgency.text.replace("'todo'", "'failed'")))
+            add(queue, task)
+
+    monkeypatch.setattr(shared_queue.SharedQueue, "_submit", add_late)
+    case.submit("same", urgency="robot")
+    case.start()
+    eventually(lambda: len(made(case)) == 2)
+    assert made(case) == ["same", "first"]
+    next(cases, None)
 
 
 def test_cancelled_task_is_not_made(case: Case) -> None:

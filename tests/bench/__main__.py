@@ -265,6 +265,12 @@ def main() -> int:
         help="one of the tables; scale and scale-postgresql (half an hour each), servers and sizing (with PostgreSQL), "
         "and backup only if they are named",
     )
+    parser.add_argument(
+        "--databases",
+        type=Path,
+        metavar="FOLDER",
+        help="where scale and scale-postgresql find or leave their filled databases (see tests.bench.scale_databases)",
+    )
     arguments = parser.parse_args()
     if arguments.only == "sizing":
         return sizing.report(arguments.json)
@@ -283,7 +289,9 @@ def main() -> int:
     server_rows = servers.rows() if arguments.only == "servers" else []
     generation_rows = generate.rows() if arguments.only in (None, "generate") else []
     huge = [derived.measure(name) for name in derived.CASES] if arguments.only in (None, "derived") else []
-    scale_rows = scale.rows(postgres=arguments.only == "scale-postgresql") if is_scale else []
+    scale_rows = []
+    if is_scale:
+        scale_rows = scale.rows(postgres=arguments.only == "scale-postgresql", folder=arguments.databases)
     mirror_rows = mirror.rows() if arguments.only in (None, "mirror") else []
     backup_rows = backup.rows() if arguments.only == "backup" else []
     if arguments.json:

@@ -1,6 +1,6 @@
 """What grows with the number of environments, versions, robots and edits: each against few of them.
 
-The databases are filled by ``scale_site``; the servers are ordinary ones. A request counts by the CPU time of its
+The databases are those of ``scale_databases``; the servers are ordinary ones. A request counts by the CPU time of its
 server's threads and of the database's processes that serve it, since on a busy machine the time on the clock says
 little; that is shown beside it.
 """
@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,8 @@ from app.store.changes import Changes, Replace
 from app.store.store import Store
 from app.store.values import Source
 from tests.bench import http
-from tests.bench.scale_site import TOPOLOGY, datum_of, fill, name_of, network
+from tests.bench.scale_databases import ENVIRONMENTS, VERSIONS, FilledDatabase, filled
+from tests.bench.scale_site import AGE, GRACE, TOPOLOGY, datum_of, name_of, network
 from tests.ports import free_port
 from tests.postgres import running_cluster
 
@@ -46,34 +47,32 @@ BOUND = 1.2
 TOKEN = "bench-" + "0" * 40
 
 
-def rows(environments: int = 10_000, versions: int = 100, *, postgres: bool = False) -> list[dict[str, Any]]:
-    """Measure everything on SQLite, or on a PostgreSQL cluster of its own; growth in bytes only on SQLite."""
+def rows(
+    environments: int = ENVIRONMENTS,
+    versions: int = VERSIONS,
+    *,
+    postgres: bool = False,
+    folder: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Measure everything on SQLite, or on a PostgreSQL cluster of its own; growth in bytes only on SQLite.
+
+    folder: where the databases with many environments are, and stay.
+    """
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        filled(folder or Path(temporary), environments, versions, postgres=postgres) as databases,
+    ):
+        compared = compare(databases, f"{environments} × {versions}")
     if not postgres:
-        return [*requests(environments, versions), *channels(), *growth()]
+        return [*compared, *channels(), *growth()]
     with running_cluster() as cluster:
-
-        def url() -> str:
-            return cluster.url(cluster.create_database())
-
-        return [*requests(environments, versions, url), *channels(url)]
+        return [*compared, *channels(lambda: cluster.url(cluster.create_database()))]
 
 
-def requests(environments: int, versions: int, url: Callable[[], str] | None = None) -> list[dict[str, Any]]:
-    """Measure requests on a small and a large database in turns, and a garbage collection on both."""
-    with tempfile.TemporaryDirectory() as folder:
-        databases = []
-        for name, sizes in (("small", (10, 10)), ("large", (environments, versions))):
-            place = Path(folder) / name
-            database = url() if url is not None else f"sqlite:///{place / 'fleetmap.sqlite'}"
-            fill(database, place, *sizes)
-            databases.append((database, place, sizes[0]))
-        return compare(databases, f"{environments} × {versions}")
-
-
-def compare(databases: list[tuple[str, Path, int]], label: str) -> list[dict[str, Any]]:
-    """Compare the costs of two filled databases: URL, data folder and number of environments of each."""
+def compare(databases: list[FilledDatabase], label: str) -> list[dict[str, Any]]:
+    """Compare the costs of requests to two databases in turns, and of garbage collections."""
     with contextlib.ExitStack() as stack:
-        sites = [stack.enter_context(_server(*database)) for database in databases]
+        sites = [stack.enter_context(_server(database)) for database in databases]
         measured = [row for what, request in REQUESTS.items() for row in _compare(f"{what}, {label}", request, sites)]
     collections = _row(f"garbage collection, {label}", *_collections(databases), unit="ms CPU")
     return [*measured, collections]
@@ -111,9 +110,10 @@ def _cpu_clock(process: int, database: str) -> Iterator[Callable[[], float]]:
 
 
 @contextlib.contextmanager
-def _server(database: str, folder: Path, environments: int) -> Iterator[_Site]:
+def _server(database: FilledDatabase) -> Iterator[_Site]:
     port = free_port()
-    env = {"FLEETMAP_DATA_DIR": str(folder), "FLEETMAP_DATABASE_URL": database, "FLEETMAP_ADMIN_TOKEN": TOKEN}
+    env = {"FLEETMAP_DATA_DIR": str(database.folder), "FLEETMAP_DATABASE_URL": database.url}
+    env["FLEETMAP_ADMIN_TOKEN"] = TOKEN
     env |= {
         "FLEETMAP_LOG_LEVEL": "warning",
         "FLEETMAP_ZENOH_MODE": "off",
@@ -125,13 +125,13 @@ def _server(database: str, folder: Path, environments: int) -> Iterator[_Site]:
     with (
         http.serving(command, port, env) as process,
         httpx.Client(base_url=f"http://127.0.0.1:{port}", headers=auth, timeout=120) as client,
-        _cpu_clock(process.pid, database) as cpu,
+        _cpu_clock(process.pid, database.url) as cpu,
     ):
         for _ in range(600):
             if client.get("/api/v1/search", params={"q": "dock"}).status_code != 503:
                 break
             time.sleep(0.5)
-        yield _Site(client, environments, cpu)
+        yield _Site(client, database.environments, cpu)
 
 
 # --- requests ---
@@ -216,30 +216,37 @@ def _row(what: str, small: float, large: float, *, unit: str, bound: float = BOU
     }
 
 
-def _collections(databases: list[tuple[str, Path, int]]) -> list[float]:
+def _collections(databases: list[FilledDatabase]) -> list[float]:
     """Measure garbage collections after ten commits each, in turns: median CPU milliseconds on each database."""
     spent: list[list[float]] = [[] for _ in databases]
     with contextlib.ExitStack() as stack:
-        stores = [Store(url, folder / "blobs") for url, folder, _ in databases]
-        clocks = [stack.enter_context(_cpu_clock(os.getpid(), url)) for url, _, _ in databases]
+        stores = [Store(database.url, database.folder / "blobs") for database in databases]
+        clocks = [stack.enter_context(_cpu_clock(os.getpid(), database.url)) for database in databases]
         for store in stores:
             stack.callback(store.close)
-            store.garbage.collect(timedelta(hours=6))  # the first one looks at everything
-            with store._database.write() as connection:  # the overlap of an hour would cover all versions
-                connection.execute(update(tables.version).values(time=datetime.now(UTC) - timedelta(days=1)))
-        for turn in range(COLLECTIONS):
+        for turn in range(COLLECTIONS + 1):
             for store, clock, times in zip(stores, clocks, spent, strict=True):
-                _commit_ten(store, 10**6 * (turn + 1))
+                _make_older(store)
+                _commit_ten(store)
                 before = clock()
-                store.garbage.collect(timedelta(hours=6))
-                times.append(clock() - before)
+                store.garbage.collect(GRACE)
+                if turn:  # the first one also has the commits of the requests
+                    times.append(clock() - before)
     return [sorted(times)[COLLECTIONS // 2] for times in spent]
 
 
-def _commit_ten(store: Store, seed: int) -> None:
+def _make_older(store: Store) -> None:
+    """Have the last hours' versions be a day old: a collection looks again at those since an hour before the last."""
+    time = tables.version.c.time
+    with store._database.write() as connection:
+        now = datetime.now(UTC)
+        connection.execute(update(tables.version).where(time > now - AGE / 2).values(time=now - AGE))
+
+
+def _commit_ten(store: Store) -> None:
     for environment in range(10):
         head = store.versions.get(name_of(environment))
-        changes = Changes((Replace(TOPOLOGY, network(environment + seed)),))
+        changes = Changes((Replace(TOPOLOGY, network(random.getrandbits(60))),))
         store.versions.commit(head.environment, store.versions.prepare(head, changes), author="bench", message="")
 
 

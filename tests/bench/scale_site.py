@@ -2,22 +2,22 @@
 
 Each environment is created, and its last versions are prepared and committed, as a server does it; only the
 transactions are joined, a thousand commits in one, so that they do not wait for the disk. Of a long history, one
-environment in a hundred has committed every version itself; the others have copies of its older versions and events,
-row by row as a mirror stores them, below newer versions of their own.
+environment in two hundred has committed every version itself; the others have copies of its older versions and events,
+row by row as a mirror stores them, below a newest version of their own. All are a day old, and garbage was collected.
 """
 
 from __future__ import annotations
 
 import contextlib
 import random
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, func, insert, select, update
 
 from app.model.features import Features, from_columns, points
 from app.model.frame import Datum
@@ -33,13 +33,18 @@ NODES: Final = 20
 JOINED: Final = 1000
 """Number of commits in one transaction while a database is filled."""
 
-GROUP: Final = 100
+GROUP: Final = 200
 """Number of environments that share a long history."""
 
 SHORT: Final = 10
 """Number of versions up to which each environment commits all of its own."""
 
-NEWEST: Final = 3
+AGE: Final = timedelta(days=1)
+"""Age of what is written: a garbage collection looks again at the versions of the hour before the last one."""
+
+GRACE: Final = timedelta(hours=6)
+
+NEWEST: Final = 1
 """Number of versions of its own that an environment with a copied history has."""
 
 
@@ -62,33 +67,32 @@ def network(seed: int) -> Features:
     return from_columns([f"n{k}" for k in range(NODES)], points(xy), properties, "local")
 
 
-def fill(url: str, folder: Path, environments: int, versions: int) -> float:
-    """Create environments, each with this many versions after its empty one; returns the seconds."""
-    started = time.perf_counter()
-    store = Store(url, folder / "blobs")
+def fill(url: str, folder: Path, environments: int, versions: int) -> None:
+    """Create environments, each with this many versions after its empty one; goes on where it was interrupted."""
+    store = Store(url, folder / "blobs", clock=lambda: datetime.now(UTC) - AGE)
     store.migrate()
-    number = 0
+    with store.transaction() as connection:
+        done = connection.execute(select(func.count()).select_from(tables.environment)).scalar_one()
+    number = JOINED
     history: _History | None = None
     with contextlib.ExitStack() as stack:
-        for environment in range(environments):
-            if number >= JOINED or not environment:
+        for environment in range(done, environments):
+            if number >= JOINED:
                 stack.close()
                 connection = stack.enter_context(joined(store))
                 number = 0
-            if versions > SHORT and environment % GROUP == 0:
+            first = environment - environment % GROUP  # of the environments that share a history
+            if versions > SHORT and environment == first:
                 history = None
+            elif versions > SHORT and history is None:
+                history = _read_history(connection, first, versions - NEWEST)
             number += _fill_environment(store, connection, environment, versions, history)
-            if versions > SHORT and history is None:
-                history = _read_history(connection, environment, versions - NEWEST)
     with joined(store):
         store.index.refresh()  # of those with a copied history; commits have done the others
     store.search_index.refresh(environments)
     store.search_index.merge()  # as every day
-    if not url.startswith("sqlite"):
-        with store._database.engine.connect() as connection:
-            connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM ANALYZE")
+    store.garbage.collect(GRACE)  # the first one, which looks at everything
     store.close()
-    return time.perf_counter() - started
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,7 +159,7 @@ def test_robots_are_listed_per_environment(farm: Store):
 
 def test_history_and_fleet_are_bounded(farm: Store, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robots, "HISTORY", 5)
-    monkeypatch.setattr(robots, "MAX_ROBOTS", 2)
+    monkeypatch.setattr(farm.robots, "_limit", 2)
     farm.robots.note_reports([received_report("r1", k, version=k) for k in range(12)] + [received_report("r2", 0)])
     assert [r.version for _, r in farm.robots.history("farm", "r1")] == [11, 10, 9, 8, 7]
     assert len(farm.robots.history("farm", "r2")) == 1
