@@ -348,7 +348,7 @@ def test_report_that_is_being_stored_keeps_its_version(history: Store):
     with history._database.write(notify=False, upkeep=True) as connection:
         owner = connection.execute(text("SELECT id FROM environment")).scalar_one()
         body = RobotReport("production", 20, head.root, "downloading", holds=(5, version.root))
-        assert _note(connection, owner, ReceivedReport("farm", "r1", body, datetime.now(UTC))) is None
+        assert _note(connection, owner, ReceivedReport("farm", "r1", body, datetime.now(UTC)), 10) is None
         thread.start()
         _wait_until_blocked(history)
     thread.join(60)
