@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -128,19 +129,29 @@ def _is_rim(contour: Any, box: Box, mask: NDArray[np.uint8], free: NDArray[np.bo
 
     if min(box.length, box.width) < 2 * sizes.speck:
         return False
-    x, y, width, height = cv2.boundingRect(contour)
-    piece = np.zeros((height + 2, width + 2), np.uint8)
-    cv2.drawContours(piece, [contour], -1, 1, cv2.FILLED, offset=(1 - x, 1 - y))
-    piece[1:-1, 1:-1] &= mask[y : y + height, x : x + width]
-    outline, inside = np.zeros_like(piece), np.zeros_like(piece)
-    corners = _corners(box) - (x - 1.0, y - 1.0)
-    cv2.polylines(outline, [np.round(corners).astype(np.int32)], True, 1)
+    corners = np.floor(_corners(box) + 0.5).astype(np.int32)
+    # the corners of a turned box may lie outside the window of the outline
+    x, y, width, height = window = cv2.boundingRect(np.vstack([contour[:, 0, :], corners]))
+    corners -= (x, y)
+    piece, outline, inside = np.zeros((3, height, width), np.uint8)
+    cv2.drawContours(piece, [contour], -1, 1, cv2.FILLED, offset=(-x, -y))
+    piece &= _cut(mask, window)
+    cv2.polylines(outline, [corners], True, 1)
     near = cv2.dilate(piece, np.ones((5, 5), np.uint8)) == 1
     if near[outline == 1].mean() < MIN_RIM:
         return False
-    cv2.fillPoly(inside, [np.round(corners).astype(np.int32)], 1)
-    inner = (inside == 1)[1:-1, 1:-1] & (piece[1:-1, 1:-1] == 0)
-    return bool((free[y : y + height, x : x + width] & inner).sum() <= FREE_INSIDE * inner.sum())
+    cv2.fillPoly(inside, [corners], 1)
+    inner = (inside == 1) & (piece == 0)
+    return bool((_cut(free, window) & inner).sum() <= FREE_INSIDE * inner.sum())
+
+
+def _cut(cells: NDArray[Any], window: Sequence[int]) -> NDArray[Any]:
+    """Return the cells of a window (x, y, width, height); those outside the grid are zero."""
+    x, y, width, height = window
+    out = np.zeros((height, width), cells.dtype)
+    part = cells[max(y, 0) : y + height, max(x, 0) : x + width]
+    out[max(-y, 0) :, max(-x, 0) :][: part.shape[0], : part.shape[1]] = part
+    return out
 
 
 def _broken_rims(

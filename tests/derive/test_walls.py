@@ -160,3 +160,20 @@ def test_broken_rim_in_a_closed_room_is_furniture(door: int) -> None:
     pallets = [f.geometry for f in part if f.properties["kind"] == "furniture"]
     assert [p.area for p in pallets] == pytest.approx([30 * 26 * CELL**2] * 2, rel=0.1)
     assert len([f for f in part if f.properties["kind"] == "wall"]) == (5 if door else 4), "only those of the room"
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.35, 0.8, 1.9, -0.35])
+@pytest.mark.parametrize(("left", "right", "boxes"), [(0.15, 1.0, 0), (0.3, 1.0, 0), (0.5, 0.5, 1), (1.0, 1.0, 1)])
+def test_rim_counts_all_sides_of_a_turned_box(left: float, right: float, boxes: int, yaw: float) -> None:
+    """A side of 2 m and parts of those beside it: furniture if enough was seen, else the corner of a room."""
+    cells = np.full((140, 140), FREE, np.uint8)
+    c, s = math.cos(yaw), math.sin(yaw)
+
+    def drawn(*points: tuple[float, float]) -> NDArray[np.int32]:
+        return np.round(np.array(points) @ np.array([[c, s], [-s, c]]) + (70, 70)).astype(np.int32)
+
+    cv2.fillPoly(cells, [drawn((-20, -15), (20, -15), (20, 15), (-20, 15))], UNKNOWN)
+    ends = (-20, 30 * left - 15), (20, 30 * right - 15)
+    cv2.polylines(cells, [drawn(ends[0], (-20, -15), (20, -15), ends[1])], False, OCCUPIED)
+    found = [f.geometry for f in objects(cells) if f.properties["kind"] == "furniture"]
+    assert [f.area for f in found] == pytest.approx([41 * (30 * right + 1) * CELL**2] * boxes, rel=0.1)
