@@ -308,9 +308,8 @@ def test_drawing_that_is_all_zones_or_fence_keeps_the_objects(api: Api, bare: st
     assert area["properties"]["kind"] == kind
 
 
-def test_zones_from_geojson_delete_no_objects_from_geojson(api: Api, fresh: Callable[[], str]) -> None:
+def test_zones_from_geojson_delete_no_objects_from_geojson(api: Api, bare: str) -> None:
     """A drawing of zones only says nothing of objects: mode=replace keeps those that came from GeoJSON, too."""
-    env = fresh()
     ring = [[-0.52, 53.26], [-0.51, 53.26], [-0.51, 53.27], [-0.52, 53.26]]
     tree = {"type": "Feature", "id": "tree", "properties": {"kind": "tree"},
             "geometry": {"type": "Point", "coordinates": [-0.52, 53.26]}}  # fmt: skip
@@ -320,8 +319,8 @@ def test_zones_from_geojson_delete_no_objects_from_geojson(api: Api, fresh: Call
     def collection(*features: dict[str, object]) -> bytes:
         return json.dumps({"type": "FeatureCollection", "features": features}).encode()
 
-    api.upload(env, {"objects.geojson": collection(tree)}, layer="objects")
-    api.upload(env, {"zones.geojson": collection(wet)}, layer="zones", mode="replace")
+    api.upload(bare, {"objects.geojson": collection(tree)}, layer="objects")
+    api.upload(bare, {"zones.geojson": collection(wet)}, layer="zones", mode="replace")
     for layer, name in (("objects", "tree"), ("zones", "wet")):
-        layers = api.get(f"environments/{env}/versions/latest/layers/{layer}").json()
+        layers = api.get(f"environments/{bare}/versions/latest/layers/{layer}").json()
         assert [feature["id"] for feature in layers["features"]] == [name]
