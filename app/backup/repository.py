@@ -34,6 +34,10 @@ from app.errors import Conflict, Damaged, Invalid
 
 FORMAT: Final = 1
 DESCRIPTION: Final = "fleetmap-backup.json"
+NO_BACKUP: Final = (
+    "there is no complete backup in this place: the first one was interrupted, or this copy of the place is cut off or "
+    "lacks `snapshots`: restore from another copy (`fleetmap backup SOURCE --list` shows what each has)"
+)
 MAX_MANIFEST: Final = 2**30
 _SNAPSHOT: Final = re.compile(r"snapshots/(?P<id>\d{8}T\d{6}Z-[0-9a-f]{8})\.json")
 _PLAIN: Final = ("id", "release", "revision", "database", "epoch", "position", "keys", "written")
@@ -300,7 +304,7 @@ def choose(snapshots: SnapshotList, id_: str | None) -> Snapshot:
     """Return the backup whose id begins so, the newest without an id. Raises Invalid, Damaged."""
     if id_ is None:
         if not snapshots.intact:
-            raise Damaged(next(iter(snapshots.broken.values()), "there is no complete backup in this place"))
+            raise Damaged(next(iter(snapshots.broken.values()), NO_BACKUP))
         newest = snapshots.intact[-1]
         later = [name for name in snapshots.broken if name > newest.id]
         if later:

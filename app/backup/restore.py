@@ -85,10 +85,8 @@ class Restorer:
         self._open: dict[str, set[int]] = {}
 
     def run(self, snapshot: Snapshot) -> RestoreResult:
-        """Restore. Raises Conflict if the place is not empty or the backup is of a newer release; Damaged."""
-        check_release(snapshot)
+        """Restore a backup that ``check_complete`` passed. Raises Conflict if the place is not empty; Damaged."""
         self._target.check_empty(snapshot.revision)
-        self._check_complete(snapshot)
         self._target.begin(snapshot.revision)
         self._wanted = {bytes.fromhex(name) for table in snapshot.tables for name in table.segments}
         for pack in snapshot.packs:
@@ -105,15 +103,6 @@ class Restorer:
         epoch = next_epoch(snapshot.epoch)
         self._target.complete(epoch)
         return RestoreResult(snapshot, epoch, rows, verification)
-
-    def _check_complete(self, snapshot: Snapshot) -> None:
-        """Raise Damaged before anything is written if a pack is missing or has another size."""
-        sizes = {file.key: file.size for file in self._repository.files.list("packs/")}
-        for pack in snapshot.packs:
-            size = sizes.get(pack.key)
-            if size != pack.size:
-                fault = "is missing" if size is None else f"has {size} of {pack.size} bytes"
-                raise Damaged(f"backup {snapshot.id} is not complete: the pack {pack.name[:16]}… {fault}")
 
     # --- content ---
 
@@ -220,6 +209,16 @@ def check_release(snapshot: Snapshot) -> None:
             f"the backup was written by release {snapshot.release}, whose schema {snapshot.revision} is newer than "
             f"{schema.newest()} of this release: restore with that release or a newer one"
         )
+
+
+def check_complete(repository: Repository, snapshot: Snapshot) -> None:
+    """Raise Damaged if a pack of a backup is missing or has another size."""
+    sizes = {file.key: file.size for file in repository.files.list("packs/")}
+    for pack in snapshot.packs:
+        size = sizes.get(pack.key)
+        if size != pack.size:
+            fault = "is missing" if size is None else f"has {size} of {pack.size} bytes"
+            raise Damaged(f"backup {snapshot.id} is not complete: the pack {pack.name[:16]}… {fault}")
 
 
 def unexpected(findings: Sequence[Finding], snapshot: Snapshot) -> str | None:

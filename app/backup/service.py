@@ -17,7 +17,7 @@ from app.backends.lead import Lead, LeadLostError, Leads
 from app.backup.check import PlaceCheck, check_place
 from app.backup.create import BackupWriter, KeyBundle
 from app.backup.repository import Repository, Snapshot, choose, finish, read_description
-from app.backup.restore import Restorer, RestoreResult, check_release
+from app.backup.restore import Restorer, RestoreResult, check_complete, check_release
 from app.backup.retention import KeepRule
 from app.errors import Conflict, FleetMapError, Invalid, Unavailable
 from app.store.backups import BackupRecord
@@ -208,10 +208,22 @@ def verify_place(repository: Repository, progress: Progress = lambda size: None)
     return check_place(repository, repository.snapshots(), progress)
 
 
+def choose_restorable(repository: Repository, snapshot_id: str | None) -> Snapshot:
+    """Choose a backup, before anything is created for it.
+
+    snapshot_id: begin of its id; None: the newest. Raises Invalid, Conflict for a backup of a newer release; Damaged if
+    it is cut off or altered.
+    """
+    snapshot = choose(repository.snapshots(), snapshot_id)
+    check_release(snapshot)
+    check_complete(repository, snapshot)
+    return snapshot
+
+
 def restore(
     store: Store,
     repository: Repository,
-    snapshot_id: str | None,
+    snapshot: Snapshot,
     *,
     present_keys: Sequence[str],
     place_keys: Callable[[Mapping[str, bytes]], None],
@@ -220,15 +232,12 @@ def restore(
     """Restore a backup into an empty store.
 
     Args:
-        snapshot_id: begin of the id of the backup; None: the newest.
+        snapshot: from ``choose_restorable``.
         present_keys: ids of the signing keys that the place has already, newest first.
         place_keys: puts documents with keys into their place.
 
-    Raises Conflict if the place is not empty, or the backup is of another server or a newer release; Damaged if it is
-    cut off or altered; Unavailable.
+    Raises Conflict if the place is not empty, or the backup is of another server; Damaged if it is altered; Unavailable.
     """
-    snapshot = choose(repository.snapshots(), snapshot_id)
-    check_release(snapshot)
     if present_keys and snapshot.key_ids and not set(present_keys) & set(snapshot.key_ids):
         raise Conflict(
             f"the backup is of another server: its signing key is {snapshot.key_ids[0]}, this place has "

@@ -175,12 +175,14 @@ def restore(
 
 def _restore(settings: Settings, source: str, snapshot: str | None, identity: Path | None, *, as_json: bool) -> None:
     from app.backup.keys import SIGNING, key_documents, place_keys
+    from app.backup.service import choose_restorable
     from app.backup.service import restore as restore_from
     from app.main import create_folders
     from app.signing import exported_key_ids
 
     folder = settings.data_dir / "keys"
-    with _opened(settings, source, identity) as repository:  # before anything is created
+    with _opened(settings, source, identity) as repository:
+        chosen = choose_restorable(repository, snapshot)  # before anything is created
         create_folders(settings)
         with _store(settings) as store:
             present = key_documents(store, folder)
@@ -194,7 +196,7 @@ def _restore(settings: Settings, source: str, snapshot: str | None, identity: Pa
 
             with output.progress_bar("restoring", count_bytes=True) as bar:
                 result = restore_from(
-                    store, repository, snapshot, present_keys=ids, place_keys=place, progress=bar.advance
+                    store, repository, chosen, present_keys=ids, place_keys=place, progress=bar.advance
                 )
     restored = result.snapshot
     if as_json:

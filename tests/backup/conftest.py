@@ -15,7 +15,7 @@ from app.backends.lead import open_leads
 from app.backup.create import KeyBundle
 from app.backup.keys import collect_keys, key_documents, place_keys
 from app.backup.restore import RestoreResult
-from app.backup.service import BackupOptions, BackupResult, BackupService, opened_place, restore
+from app.backup.service import BackupOptions, BackupResult, BackupService, choose_restorable, opened_place, restore
 from app.store.backup_tables import dumped_tables, order_of, stored_columns
 from app.store.store import Store
 from app.store.values import Source
@@ -88,7 +88,8 @@ def restore_into(
     present = key_documents(store, folder / "keys").get("keys")
     ids = [] if present is None else exported_key_ids(present)
     with opened_place(str(place), folder, key=lambda _: None, identities=identities) as repository:
-        return restore(store, repository, snapshot, present_keys=ids, place_keys=bring)
+        chosen = choose_restorable(repository, snapshot)
+        return restore(store, repository, chosen, present_keys=ids, place_keys=bring)
 
 
 NewStore = Callable[[], Store]

@@ -77,7 +77,7 @@ SPOILT = {
     "cut manifest": (cut_manifest, Damaged, "cut off or was altered"),
     "altered manifest": (alter_manifest, Damaged, "cut off or was altered"),
     "renamed manifest": (rename_manifest, Damaged, "is that of"),
-    "lost manifest": (lambda place: manifest(place).unlink(), Damaged, "no complete backup"),
+    "lost manifest": (lambda place: manifest(place).unlink(), Damaged, "cut off .* another copy"),
     "cut description": (lambda place: (place / "fleetmap-backup.json").write_text("{"), Damaged, "cut off"),
     "lost description": (lambda place: (place / "fleetmap-backup.json").unlink(), Invalid, "has no backups"),
     "newer form": (newer_form, Conflict, "newer one"),

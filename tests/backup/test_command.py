@@ -93,6 +93,19 @@ def test_robot_ahead_of_the_backup_follows_the_restored_server(
         assert "fleetmap_backup_age_seconds +Inf" in other.get("/metrics").text
 
 
+def test_refused_restore_creates_nothing(site: tuple[Api, Path], tmp_path: Path, capfd: Output) -> None:
+    place, target = tmp_path / "backup", tmp_path / "restored"
+    command(capfd, "backup", place, "--data-dir", site[1] / "data")
+    largest = max(place.glob("packs/*/*"), key=lambda path: path.stat().st_size)
+    largest.write_bytes(largest.read_bytes()[:-1])
+    assert run(["restore", str(place), "--data-dir", str(target)]) == 1
+    assert "not complete" in capfd.readouterr().err
+    next(place.glob("snapshots/*")).unlink()
+    assert run(["restore", str(place), "--data-dir", str(target)]) == 1
+    assert "restore from another copy" in " ".join(capfd.readouterr().err.split())
+    assert not target.exists()
+
+
 def test_list_verify_and_keep(site: tuple[Api, Path], tmp_path: Path, capfd: Output) -> None:
     data, place = site[1] / "data", tmp_path / "backup"
     ids = [command(capfd, "backup", place, "--data-dir", data)["snapshot"] for _ in range(2)]
