@@ -236,7 +236,7 @@ def restore(
         present_keys: ids of the signing keys that the place has already, newest first.
         place_keys: puts documents with keys into their place.
 
-    Raises Conflict if the place is not empty, or the backup is of another server; Damaged if it is altered; Unavailable.
+    Raises Conflict if the place is not empty or the backup is of another server; Damaged if it is altered; Unavailable.
     """
     if present_keys and snapshot.key_ids and not set(present_keys) & set(snapshot.key_ids):
         raise Conflict(
