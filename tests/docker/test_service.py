@@ -23,8 +23,8 @@ from tests.docker.containers import DOCKER, TOP
 from tests.events.conftest import eventually
 from tests.ports import free_port
 
-UNITS = ("fleetmap-server.service", "fleetmap-agent.service")
-EXPOSURE = {"fleetmap-server.service": 2.5, "fleetmap-agent.service": 5.5}
+UNITS = ("fleetmap-server.service", "fleetmap-agent.service", "fleetmap-doctor.service")
+EXPOSURE = {"fleetmap-server.service": 2.5, "fleetmap-agent.service": 5.5, "fleetmap-doctor.service": 5.5}
 """Maximum of ``systemd-analyze security``, from 0 to 10."""
 SCRIPTS = {
     "sudo": 'exec "$@"',
@@ -135,6 +135,24 @@ def test_backup_unit_fits_the_server_unit() -> None:
     assert f"FLEETMAP_DATA_DIR={data}\n" in text
 
 
+def test_doctor_unit_has_the_settings_of_the_server_unit() -> None:
+    doctor, server = (read_unit((DOCKER / f"fleetmap-{name}.service").read_text()) for name in ("doctor", "server"))
+    same = ("User", "StateDirectory", "WorkingDirectory", "LoadCredential", "EnvironmentFile", "AmbientCapabilities")
+    assert {key: doctor[key] for key in same} == {key: server[key] for key in same}
+    assert set(server["Environment"]) == set(doctor["Environment"]) - {"FLEETMAP_CA=%d/ca.pem"}
+    assert doctor["ExecStart"] == [server["ExecStart"][0].replace(" serve ", " doctor ")]
+
+
+def examine(machine: Path, server: Service, changes: dict[str, str]) -> str:
+    """Run the doctor's unit on the data folder of a server; returns what it prints."""
+    text = (DOCKER / "fleetmap-doctor.service").read_text().replace("/etc/fleetmap/", f"{machine}/etc/fleetmap/")
+    doctor = Service(text, machine / "doctor", {**changes, "STATE_DIRECTORY": str(server.state)})
+    status = doctor.start().wait(120)
+    printed = doctor.log.read_text()
+    assert status == 0, printed
+    return printed
+
+
 def test_services_of_the_docs_run_with_tls_and_users(machine: Path) -> None:
     port, zenoh_port = free_port(), free_port()
     text = (machine / "etc/systemd/system/fleetmap-server.service").read_text()
@@ -164,6 +182,10 @@ def test_services_of_the_docs_run_with_tls_and_users(machine: Path) -> None:
         https.post("/api/v1/environments/farm/versions", files=files).raise_for_status()
         created = https.post("/api/v1/tokens", json={"name": "tractor-7", "role": "robot"}).json()
         run_agent(machine, https, created["token"], password)
+        printed = examine(machine, server, changes)
+        assert re.search("ok +http-port: a server answers", printed), printed
+        assert re.search("ok +certificate-https: its chain leads to a trusted authority", printed), printed
+        assert re.search("ok +zenoh-router: ", printed), printed
     finally:
         process.terminate()
         status = process.wait(60)
