@@ -102,12 +102,31 @@ def test_revoked_token_asks_to_sign_in_and_loses_nothing(open_page: Open, server
     page.get_by_text("Features (").click()
     page.get_by_placeholder("Search by name, id or kind").fill("Yard")
     server.call("DELETE", f"tokens/{token['id']}", 204)
+    sign_in_again(page, server)
+    expect(page.get_by_placeholder("Search by name, id or kind")).to_have_value("Yard")
+    expect(page.get_by_role("button", name="Yard1", exact=False).first).to_be_visible()
+
+
+def test_site_opened_without_a_session_is_loaded_after_signing_in(open_page: Open, server: WebServer) -> None:
+    token = server.make_token("editor")
+    page = open_page("/", token=token["token"])
+    link = page.locator("a", has_text="Orchard")
+    expect(link).to_be_visible()
+    server.call("DELETE", f"tokens/{token['id']}", 204)
+    expect(page.get_by_role("dialog", name="Sign in again")).to_be_visible()
+    link.dispatch_event("click")  # as if it were in the moment before the dialog
+    expect(page.get_by_role("button", name="Try again")).to_be_attached()
+    sign_in_again(page, server)
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+    expect(page.get_by_role("button", name="Try again")).to_have_count(0)
+    wait_until_drawn(page)
+
+
+def sign_in_again(page: Page, server: WebServer) -> None:
     dialog = page.get_by_role("dialog", name="Sign in again")
     dialog.get_by_label("Token").fill(server.token)
     dialog.get_by_role("button", name="Sign in", exact=True).click()
     expect(dialog).to_have_count(0)
-    expect(page.get_by_placeholder("Search by name, id or kind")).to_have_value("Yard")
-    expect(page.get_by_role("button", name="Yard1", exact=False).first).to_be_visible()
 
 
 def test_last_map_stays_readable_offline(open_page: Open) -> None:

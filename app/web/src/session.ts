@@ -1,6 +1,6 @@
 /** The signed-in user. The token stays in an HttpOnly cookie that scripts cannot read. */
 import { effect, signal } from "@preact/signals";
-import { ApiError, api, ask, type Role, type Schemas, unauthenticated } from "./api/client";
+import { ApiError, api, ask, type Role, returns, type Schemas, unauthenticated } from "./api/client";
 
 export type Session = Schemas["SessionOut"];
 
@@ -36,6 +36,7 @@ export async function start(): Promise<void> {
 export async function signIn(credentials: { token: string } | { code: string }): Promise<boolean> {
   session.value = await ask(api.POST("/api/v1/session", { body: credentials as Schemas["SignInBody"] }));
   expired.value = false;
+  returns.value += 1;
   return true;
 }
 

@@ -13,6 +13,7 @@ import {
   type LayerPart,
   type Raster,
   requestJson,
+  returns,
   type Version,
 } from "./api/client";
 import { EventStream } from "./api/events";
@@ -97,6 +98,12 @@ export class Site {
       this.stops.push(effect(() => void this.loadVersion(this.ref.value)));
       this.stops.push(effect(() => void this.loadByExtent(this.extent.value)));
     });
+    const since = returns.peek();
+    this.stops.push(
+      effect(() => {
+        if (returns.value > since) void this.refresh().then(() => this.loadByExtent(this.extent.peek()));
+      }),
+    );
   }
 
   close(): void {

@@ -20,10 +20,20 @@ export const online = signal(true);
 /** Number of 401 responses: the session watches it. */
 export const unauthenticated = signal(0);
 
+/** Number of times that the server was back, or a session began: what could not be loaded is loaded again. */
+export const returns = signal(0);
+
 const ASK_AGAIN = 3000;
 
+let wasOnline = true;
+
 effect(() => {
-  if (online.value) return;
+  if (online.value) {
+    if (!wasOnline) returns.value = returns.peek() + 1;
+    wasOnline = true;
+    return;
+  }
+  wasOnline = false;
   const timer = setInterval(() => {
     fetch("/healthz", { cache: "no-store" }).then(
       (response) => {

@@ -1,6 +1,6 @@
 /** Loading of a view's data: the old picture stays until the new one is there. */
 import { useCallback, useEffect, useRef, useState } from "preact/hooks";
-import { type ApiError, asApiError, isAbort, online } from "./client";
+import { type ApiError, asApiError, isAbort, returns } from "./client";
 
 export interface Loaded<T> {
   data: T | undefined;
@@ -9,34 +9,29 @@ export interface Loaded<T> {
   reload: () => void;
 }
 
-/** Loads when the component appears, when `keys` change, and when the server answers again. */
+/** Loads when the component appears, when `keys` change, and when the server is back or a session begins. */
 export function useLoaded<T>(load: (signal: AbortSignal) => Promise<T>, keys: unknown[]): Loaded<T> {
   const [state, setState] = useState<Omit<Loaded<T>, "reload">>({ data: undefined, problem: null, loading: true });
   const [round, setRound] = useState(0);
   const key = JSON.stringify(keys);
   const shown = useRef(key);
-  const isOnline = online.value;
-  const failed = useRef(false);
+  const since = returns.value;
 
   useEffect(() => {
-    if (!isOnline && failed.current) return;
     const control = new AbortController();
     setState((old) => ({ data: shown.current === key ? old.data : undefined, problem: null, loading: true }));
     shown.current = key;
     load(control.signal).then(
       (data) => {
-        failed.current = false;
         if (!control.signal.aborted) setState({ data, problem: null, loading: false });
       },
       (error) => {
         if (control.signal.aborted || isAbort(error)) return;
-        const problem = asApiError(error);
-        failed.current = problem.isOffline;
-        setState((old) => ({ data: old.data, problem, loading: false }));
+        setState((old) => ({ data: old.data, problem: asApiError(error), loading: false }));
       },
     );
     return () => control.abort();
-  }, [key, round, isOnline]);
+  }, [key, round, since]);
   const reload = useCallback(() => setRound((value) => value + 1), []);
   return { ...state, reload };
 }

@@ -14,7 +14,7 @@ import type { Layer } from "ol/layer";
 import OlMap from "ol/Map";
 import View from "ol/View";
 import { go, param } from "../address";
-import { type LayerPart, online } from "../api/client";
+import { type LayerPart, returns } from "../api/client";
 import type { Site } from "../site";
 import { colour, palette, theme } from "../theme";
 import { baseMap, createBaseLayer, isBaseMapShown, loadBaseMap } from "./base-map";
@@ -136,7 +136,7 @@ export class SiteMap {
       effect(() => this.paintAgain()),
       effect(() => this.showOpacity()),
       effect(() => {
-        if (online.value) for (const layer of this.rasters.values()) layer.tiles.retry();
+        if (returns.value) for (const layer of this.rasters.values()) layer.tiles.retry();
       }),
       effect(() => this.selection.setFeatures(this.selected.value ? [this.selected.value] : [])),
     );
