@@ -62,11 +62,22 @@ def rows(
         tempfile.TemporaryDirectory() as temporary,
         filled(folder or Path(temporary), environments, versions, postgres=postgres) as databases,
     ):
+        _read_all(folder or Path(temporary))
         compared = compare(databases, f"{environments} × {versions}")
     if not postgres:
         return [*compared, *channels(), *growth()]
     with running_cluster() as cluster:
         return [*compared, *channels(lambda: cluster.url(cluster.create_database()))]
+
+
+def _read_all(folder: Path) -> None:
+    """Read all files, so that requests find both databases in the system's cache: no disk is compared."""
+    for file in folder.rglob("*"):
+        with contextlib.suppress(OSError):  # ended meanwhile, or private to the database's user
+            if file.is_file():
+                with file.open("rb") as opened:
+                    while opened.read(1 << 20):
+                        pass
 
 
 def compare(databases: list[FilledDatabase], label: str) -> list[dict[str, Any]]:
@@ -254,18 +265,27 @@ def _commit_ten(store: Store) -> None:
 
 
 def channels(url: Callable[[], str] | None = None) -> list[dict[str, Any]]:
-    """Measure the body of ``GET /channels`` in an environment with 100 and 100 000 robots, half of them on the bus."""
-    with tempfile.TemporaryDirectory() as folder:
-        times = []
+    """Measure the body of ``GET /channels`` in environments with 100 and 100 000 robots, half of them on the bus."""
+    spent: list[list[float]] = [[], []]
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        stores, clocks = [], []
         for number in (100, 100_000):
             place = Path(folder) / str(number)
             database = url() if url is not None else f"sqlite:///{place / 'fleetmap.sqlite'}"
             store = Store(database, place / "blobs")
+            stack.callback(store.close)
             store.migrate()
             _add_robots(store, number)
-            times.append(_median(lambda store=store: _list_channels(store)))  # type: ignore[misc]
-            store.close()
-    return [_row("channels with their robots, 100 000 robots against 100", *times, unit="ms", bound=2.0)]
+            stores.append(store)
+            clocks.append(stack.enter_context(_cpu_clock(os.getpid(), database)))
+        for _ in range(ROUNDS):
+            for store, clock, times in zip(stores, clocks, spent, strict=True):
+                before = clock()
+                _list_channels(store)
+                times.append(clock() - before)
+    small, large = (sorted(times)[ROUNDS // 2] for times in spent)
+    what = "channels with their robots, 100 000 robots against 100"
+    return [_row(what, small, large, unit="ms CPU", bound=2.0)]
 
 
 def _add_robots(store: Store, number: int) -> None:
@@ -297,15 +317,6 @@ def _add_robots(store: Store, number: int) -> None:
 def _list_channels(store: Store) -> bytes:
     counts = count_robots(store.robot_counts, "farm", datetime.now(UTC))
     return json_bytes([as_dict(channel, counts) for channel in store.channels.all("farm")])
-
-
-def _median(work: Callable[[], Any]) -> float:
-    times = []
-    for _ in range(ROUNDS):
-        started = time.perf_counter()
-        work()
-        times.append((time.perf_counter() - started) * 1e3)
-    return sorted(times)[ROUNDS // 2]
 
 
 # --- edits and re-uploads ---
