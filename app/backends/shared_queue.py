@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final
 
 import procrastinate
@@ -30,7 +31,7 @@ from procrastinate.worker import Worker
 from psycopg.conninfo import make_conninfo
 from sqlalchemy import Connection, Row, text
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
 from app.backends.fence import LIMIT_IDLE_TIME, FenceError, fenced_by
 from app.backends.queue import FULL, Performer, QueueFigures, Task, Urgency, carry_out, with_parent
@@ -237,16 +238,21 @@ class _GiveBack(procrastinate.BaseRetryStrategy):
 
 
 class _JobManager(JobManager):
-    """Ends the attempt of a task that the worker made. Procrastinate would end a later one of another worker, too."""
+    """Ends the attempt of a task that the worker made. Procrastinate would end a later one of another worker, too.
 
-    def __init__(self, connector: procrastinate.BaseConnector, queue: SharedQueue) -> None:
+    It would also leave a task that it could not end running for ever, since its worker is alive: here it tries again.
+    """
+
+    def __init__(
+        self, connector: procrastinate.BaseConnector, queue: SharedQueue, is_stopping: Callable[[], bool]
+    ) -> None:
         super().__init__(connector)
-        self._queue = queue
+        self._queue, self._is_stopping = queue, is_stopping
 
     async def finish_job(self, job: jobs.Job, status: jobs.Status, delete_job: bool) -> None:
         """Remove a task, whatever its status: its outcome is stored already."""
         del status, delete_job
-        _log_unless(await asyncio.to_thread(self._queue.finish, _attempt(job)), job)
+        await self._end(job, self._queue.finish)
 
     async def retry_job(
         self,
@@ -259,13 +265,27 @@ class _JobManager(JobManager):
         """Give a task back."""
         del priority, queue, lock
         seconds = 0.0 if retry_at is None else max(0.0, (retry_at - datetime.now(UTC)).total_seconds())
-        _log_unless(await asyncio.to_thread(self._queue.give_back, _attempt(job), seconds), job)
+        await self._end(job, partial(self._queue.give_back, seconds=seconds))
 
-
-def _log_unless(is_ended: bool, job: jobs.Job) -> None:
-    if not is_ended:
-        key = (job.lock or "")[:16]
-        log.warning("queue: this worker was taken for dead, what it made too late is thrown away (key=%s)", key)
+    async def _end(self, job: jobs.Job, end: Callable[[Attempt], bool]) -> None:
+        """End an attempt, as soon as the database can be had. A worker that stops leaves that to the others."""
+        key, is_logged = (job.lock or "")[:16], False
+        while True:
+            try:
+                is_ended = await asyncio.to_thread(end, _attempt(job))
+            except (FleetMapError, SQLAlchemyError) as error:
+                if not is_logged:  # once for each task
+                    reason = error.detail if isinstance(error, FleetMapError) else type(error).__name__
+                    log.warning("queue: a task could not be ended, will retry (key=%s, reason=%s)", key, reason)
+                is_logged = True
+                if self._is_stopping():
+                    return
+                await asyncio.sleep(RETRY_SECONDS)
+            else:
+                if not is_ended:
+                    text = "queue: this worker was taken for dead, what it made too late is thrown away (key=%s)"
+                    log.warning(text, key)
+                return
 
 
 def _attempt(job: jobs.Job) -> Attempt:
@@ -340,7 +360,7 @@ class QueueWorker:
         options |= {"application_name": "fleetmap worker", "connect_timeout": 5, "keepalives_idle": 2}
         connector = _Connector(conninfo=make_conninfo(**options), min_size=1, max_size=self._slots + 4, timeout=10.0)
         queue_app = procrastinate.App(connector=connector)
-        queue_app.job_manager = _JobManager(connector, self._queue)
+        queue_app.job_manager = _JobManager(connector, self._queue, self._stopping.is_set)
         queue_app.task(name=TASK, retry=_GiveBack(), pass_context=True)(self._perform)
         async with queue_app.open_async():
             self._worker = Worker(

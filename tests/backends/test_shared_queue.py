@@ -12,6 +12,7 @@ from app.backends import shared_queue
 from app.backends.fence import fenced_by
 from app.backends.queue import Task
 from app.backends.shared_queue import Attempt, SharedQueue, TaskLostError
+from app.errors import NoRoom, Unavailable
 from tests.backends.test_queue import Case, eventually, made, shared_case
 
 pytestmark = pytest.mark.postgres
@@ -95,6 +96,44 @@ def test_task_is_not_put_back_while_its_worker_commits(case: Case, queue: Shared
         assert rows(queue) == [("doing", 0)]
     queue.put_back_stalled()
     assert rows(queue) == [("todo", 1)]
+
+
+def test_end_of_a_task_is_stored_once_the_database_can_be_had(
+    case: Case, queue: SharedQueue, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(shared_queue, "RETRY_SECONDS", 0.1)
+    finish, calls = SharedQueue.finish, []
+
+    def away(queue: SharedQueue, attempt: Attempt) -> bool:
+        calls.append(attempt)
+        if len(calls) < 4:
+            raise Unavailable("the database is away")
+        return finish(queue, attempt)
+
+    monkeypatch.setattr(SharedQueue, "finish", away)
+    case.submit("task")
+    case.start()
+    eventually(lambda: len(calls) == 4)
+    eventually(lambda: rows(queue) == [])
+    assert made(case) == ["task"], "once"
+    assert caplog.text.count("could not be ended") == 1
+
+
+def test_task_is_not_given_back_while_another_with_its_key_waits(case: Case, queue: SharedQueue) -> None:
+    """Two cannot wait at once: else it would stay at its worker for ever, and the other one behind it."""
+    perform = case.recorder.perform
+
+    def fail_first(task: Task) -> None:
+        perform(task)
+        if len(case.recorder.begun) == 1:
+            case.submit("task")
+            raise NoRoom("the disk is full")
+
+    case.recorder.perform = fail_first  # type: ignore[method-assign]
+    case.submit("task")
+    case.start()
+    eventually(lambda: len(made(case)) == 2)
+    eventually(lambda: rows(queue) == [])
 
 
 def test_task_becomes_urgent_although_another_server_adds_it_at_the_same_time(
