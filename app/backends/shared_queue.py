@@ -312,6 +312,15 @@ class _Connector(procrastinate.PsycopgConnector):
                 await asyncio.sleep(RETRY_SECONDS)
 
 
+async def _beat(manager: JobManager, worker: Worker) -> None:
+    """Send heartbeats as long as a worker has tasks. Procrastinate ends its own when it begins to stop."""
+    while True:
+        await asyncio.sleep(HEARTBEAT_SECONDS)
+        if worker.worker_id is not None:
+            with contextlib.suppress(exceptions.ConnectorException):  # the next one may arrive
+                await manager.update_heartbeat(worker.worker_id)
+
+
 class QueueWorker:
     """Takes tasks from the queue, ``slots`` at once.
 
@@ -377,9 +386,11 @@ class QueueWorker:
             )
             if self._stopping.is_set():
                 return
+            beating = asyncio.create_task(_beat(queue_app.job_manager, self._worker))
             try:
                 await self._worker.run()  # type: ignore[no-untyped-call]
             finally:
+                beating.cancel()
                 self._worker = None
 
     async def _perform(self, context: procrastinate.JobContext, /, **arguments: Any) -> None:

@@ -49,8 +49,10 @@ class Recorder:
 class Case:
     """A queue whose tasks are taken once ``start`` was called."""
 
-    def __init__(self, queue: Queue, recorder: Recorder, start: Callable[[], None]) -> None:
-        self.queue, self.recorder, self.start = queue, recorder, start
+    def __init__(
+        self, queue: Queue, recorder: Recorder, start: Callable[[], None], stop: Callable[[], None] = lambda: None
+    ) -> None:
+        self.queue, self.recorder, self.start, self.stop = queue, recorder, start, stop
 
     def submit(self, key: str, environment: str = "a", urgency: Urgency = "person") -> None:
         self.queue.submit(Task("test", key, environment, urgency, {"value": 1}))
@@ -86,6 +88,7 @@ def shared_case(request: pytest.FixtureRequest, folder: Path) -> Iterator[Case]:
     name = cluster.create_database(request.getfixturevalue("migrated_database"))
     store, recorder = Store(cluster.url(name), folder / "blobs"), Recorder()
     queue = SharedQueue(store.transaction, waiting=WAITING)
+    stops: list[Callable[[], None]] = []
     ends: list[Callable[[], None]] = []
 
     def start() -> None:
@@ -95,14 +98,18 @@ def shared_case(request: pytest.FixtureRequest, folder: Path) -> Iterator[Case]:
         thread = threading.Thread(target=loop.run_until_complete, args=(worker.run(),))
         thread.start()
 
-        def end() -> None:
+        def stop() -> None:
             loop.call_soon_threadsafe(worker.stop)
+
+        def end() -> None:
+            stop()
             thread.join(SECONDS)
             loop.close()
 
+        stops.append(stop)
         ends.append(end)
 
-    yield Case(queue, recorder, start)
+    yield Case(queue, recorder, start, lambda: stops[0]())
     for end in ends:
         end()
     store.close()

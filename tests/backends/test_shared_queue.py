@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -134,6 +136,28 @@ def test_task_is_not_given_back_while_another_with_its_key_waits(case: Case, que
     case.start()
     eventually(lambda: len(made(case)) == 2)
     eventually(lambda: rows(queue) == [])
+
+
+def test_stopping_worker_keeps_its_task_until_it_has_ended_it(
+    case: Case, queue: SharedQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has more time to stop than until others take it for dead."""
+    monkeypatch.setattr(shared_queue, "HEARTBEAT_SECONDS", 0.2)
+    monkeypatch.setattr(shared_queue, "STALLED_SECONDS", 2.0)
+    perform, may_end = case.recorder.perform, threading.Event()
+    case.recorder.perform = lambda task: (perform(task), may_end.wait(60))  # type: ignore[method-assign,assignment]
+    case.submit("task")
+    case.start()
+    eventually(lambda: case.recorder.begun)
+    case.stop()
+    end = time.monotonic() + 3 * shared_queue.STALLED_SECONDS
+    while time.monotonic() < end:
+        queue.put_back_stalled()
+        assert rows(queue) == [("doing", 0)]
+        time.sleep(0.1)
+    may_end.set()
+    eventually(lambda: rows(queue) == [])
+    assert case.recorder.begun == ["task"]
 
 
 def test_task_becomes_urgent_although_another_server_adds_it_at_the_same_time(
