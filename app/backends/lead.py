@@ -2,7 +2,10 @@
 
 Local: a file lock in the data folder, for all processes of one server. Shared: a lock in PostgreSQL, for all servers on
 one database. A shared lead is a lease: its session ends if the server falls silent for LEASE_SECONDS, and another
-server gets the lead. What a leader writes is fenced by its term: a transaction of a former leader fails.
+server gets the lead.
+
+Work of a leader belongs to the term in which it began. A process may lose the lead and win it again without noticing;
+another one may have led meanwhile. So work asks its term whether it goes on, and transactions of an earlier term fail.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
@@ -25,7 +28,7 @@ import psycopg
 from sqlalchemy import Connection
 
 from app.backends.direct import DirectConnection
-from app.errors import Unavailable
+from app.backends.fence import LIMIT_IDLE_TIME, FenceError, fenced_by
 
 log = logging.getLogger(__name__)
 
@@ -35,26 +38,57 @@ LEASE_SECONDS: Final = 2.0
 ROUND_SECONDS: Final = 0.25
 """Interval of a server's heartbeats, and of its attempts to get leads that others have."""
 
-FENCE_SECONDS: Final = 2.0
-"""Maximum time that a transaction of a leader may block its successor, between the check of its term and its commit."""
 
-
-class LeadLostError(Unavailable):
+class LeadLostError(FenceError):
     """The process no longer has the lead: another one may have it."""
 
 
-class Lead(ABC):
-    """Right to do one task. Thread-safe. term: number of the election that this process won, if there are elections."""
+@dataclass(frozen=True, slots=True)
+class Term:
+    """Time from winning a lead to losing it. number: of the election."""
 
-    term: int | None = None
+    lead: Lead
+    number: int
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether this process has had the lead ever since. Never blocks."""
+        return self.lead.term == self
+
+    @contextmanager
+    def fenced(self) -> Iterator[None]:
+        """Let transactions of this context be committed only in this term. They and this raise LeadLostError."""
+        if not self.goes_on:
+            raise self.lost_error()
+        with fenced_by(self):
+            yield
+
+    def check(self, connection: Connection) -> None:
+        """Check within a transaction, right before its commit, that the term goes on. Raises LeadLostError."""
+        if not self.goes_on:
+            raise self.lost_error()
+        self.lead.check_term(connection, self)
+
+    def lost_error(self) -> LeadLostError:
+        """Return the error for work that another leader may have done meanwhile."""
+        return LeadLostError(f"another server has taken over ({self.lead.name}): nothing was stored")
+
+
+class Lead(ABC):
+    """Right to do one task. Thread-safe."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     @property
     @abstractmethod
+    def term(self) -> Term | None:
+        """Present term; None if this process does not have the lead. Never blocks."""
+
+    @property
     def is_held(self) -> bool:
-        """Whether this process has the lead. Never blocks."""
+        """Whether this process has the lead now. Work that takes some time asks its term instead. Never blocks."""
+        return self.term is not None
 
     @abstractmethod
     def try_acquire(self) -> bool:
@@ -65,39 +99,14 @@ class Lead(ABC):
         """Give up the lead, and take part in no election until the next ``try_acquire``."""
 
     @contextmanager
-    def fenced(self) -> Iterator[None]:
-        """Let transactions of this context be committed only in the present term. They and this raise LeadLostError.
+    def fenced(self) -> Iterator[Term]:
+        """Fence this context by the present term. Raises LeadLostError."""
+        term = self.term or Term(self, 0)  # none has the number 0
+        with term.fenced():
+            yield term
 
-        A process that loses the lead meanwhile and wins it again may not store what it has read before.
-        """
-        term = self.term
-        if not self.is_held:
-            raise self._lost_error()
-        token = _fence.set((self, term))
-        try:
-            yield
-        finally:
-            _fence.reset(token)
-
-    def check_term(self, connection: Connection, term: int | None) -> None:
-        """Check within a transaction, right before its commit, that this term goes on. Raises LeadLostError."""
-        del connection, term
-        if not self.is_held:
-            raise self._lost_error()
-
-    def _lost_error(self) -> LeadLostError:
-        return LeadLostError(f"another server has taken over ({self.name}): nothing was stored")
-
-
-_fence: ContextVar[tuple[Lead, int | None] | None] = ContextVar("fence", default=None)
-
-
-def check_fence(connection: Connection) -> None:
-    """Check a transaction of a leader right before its commit; others pass. Raises LeadLostError."""
-    fence = _fence.get()
-    if fence is not None:
-        lead, term = fence
-        lead.check_term(connection, term)
+    def check_term(self, connection: Connection, term: Term) -> None:  # noqa: B027  most leads need no more
+        """Check in the database that a term goes on, and that none begins before the commit. Raises LeadLostError."""
 
 
 class Leads(ABC):
@@ -131,12 +140,13 @@ class LocalLead(Lead):
         super().__init__(name)
         self._path = data_dir / f"{name}.lock"
         self._handle: IO[str] | None = None
+        self._elections = 0
         self._mutex = threading.Lock()
 
     @property
-    def is_held(self) -> bool:
-        """Whether this process has the lock."""
-        return self._handle is not None
+    def term(self) -> Term | None:
+        """Time for which this process has the lock."""
+        return None if self._handle is None else Term(self, self._elections)
 
     def try_acquire(self) -> bool:
         """Take the lock if it is free; return whether this process has it. Raises OSError."""
@@ -148,6 +158,7 @@ class LocalLead(Lead):
                 except OSError:
                     handle.close()
                     return False
+                self._elections += 1
                 self._handle = handle
             return True
 
@@ -195,12 +206,13 @@ class SharedLead(Lead):
         self._leads = leads
         self.key = int.from_bytes(hashlib.sha256(f"fleetmap lead {name}".encode()).digest()[:8], "big", signed=True)
         self.is_wanted = False
-        self.term = None
+        self.won: Term | None = None
 
     @property
-    def is_held(self) -> bool:
-        """Whether this process has the lock, and PostgreSQL cannot have ended its session."""
-        return self.is_wanted and self.term is not None and self._leads.has_lease
+    def term(self) -> Term | None:
+        """Time for which this process has the lock. None as soon as PostgreSQL may have ended its session."""
+        won = self.won
+        return won if self.is_wanted and self._leads.has_lease else None
 
     def try_acquire(self) -> bool:
         """Take part in the election, which is held by the thread of ``SharedLeads``."""
@@ -215,16 +227,11 @@ class SharedLead(Lead):
             self.is_wanted = False
             self._leads.wake()
 
-    def check_term(self, connection: Connection, term: int | None) -> None:
+    def check_term(self, connection: Connection, term: Term) -> None:
         """Check that no process has won an election since, and keep elections waiting until the commit."""
-        super().check_term(connection, term)
-        query = (
-            "SELECT term, set_config('idle_in_transaction_session_timeout', %s, true) FROM lead WHERE name = %s "
-            "FOR SHARE"
-        )
-        row = connection.exec_driver_sql(query, (str(int(FENCE_SECONDS * 1000)), self.name)).one_or_none()
-        if row is None or row.term != term:
-            raise self._lost_error()
+        query = f"SELECT term, {LIMIT_IDLE_TIME} FROM lead WHERE name = %s FOR SHARE"  # noqa: S608  a constant
+        if connection.exec_driver_sql(query, (self.name,)).scalar() != term.number:
+            raise term.lost_error()
 
 
 class SharedLeads(Leads):
@@ -310,13 +317,13 @@ class SharedLeads(Leads):
         self._lease_until = sent + LEASE_SECONDS
         self._roles = {name: holder == self._server for name, holder in rows}
         for lead in list(self._leads.values()):
-            if lead.is_wanted and lead.term is None:
-                lead.term = self._elect(self._connection, lead)
-            elif not lead.is_wanted and lead.term is not None:
-                lead.term = None
+            if lead.is_wanted and lead.won is None:
+                lead.won = self._elect(self._connection, lead)
+            elif not lead.is_wanted and lead.won is not None:
+                lead.won = None
                 self._connection.execute("SELECT pg_advisory_unlock(%s)", (lead.key,))
 
-    def _elect(self, connection: DirectConnection, lead: SharedLead) -> int | None:
+    def _elect(self, connection: DirectConnection, lead: SharedLead) -> Term | None:
         """Try to get a lead; return the new term, None if another process has it."""
         if not connection.execute("SELECT pg_try_advisory_lock(%s)", (lead.key,))[0][0]:
             return None
@@ -324,15 +331,15 @@ class SharedLeads(Leads):
             "INSERT INTO lead (name, term, holder, since) VALUES (%s, 1, %s, now()) ON CONFLICT (name) DO UPDATE "
             "SET term = lead.term + 1, holder = excluded.holder, since = excluded.since RETURNING term"
         )
-        term = int(connection.execute(query, (lead.name, self._server))[0][0])
+        number = int(connection.execute(query, (lead.name, self._server))[0][0])
         self._roles[lead.name] = True
-        log.info("leads: this server leads (task=%s, term=%d)", lead.name, term)
-        return term
+        log.info("leads: this server leads (task=%s, term=%d)", lead.name, number)
+        return Term(lead, number)
 
     def _disconnect(self) -> None:
         self._lease_until = 0.0
         for lead in self._leads.values():
-            lead.term = None
+            lead.won = None
         if self._connection is not None:
             with contextlib.suppress(Exception):
                 self._connection.close()

@@ -4,7 +4,8 @@ Servers add and cancel tasks in plain transactions; ``QueueWorker`` runs Procras
 is its urgency and its tag (see ``app.backends.queue``). Of two tasks with one key, one waits while the other runs, and
 then finds the result made.
 
-A worker that dies leaves its tasks marked as running. The others see its heartbeat end and put the tasks back.
+A worker that dies leaves its tasks marked as running. The others see its heartbeat end and put the tasks back. It may
+only have stood still: what it then stores, and the end of its task, count no more.
 """
 
 from __future__ import annotations
@@ -17,17 +18,22 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final
 
 import procrastinate
 from procrastinate import exceptions, jobs
 from procrastinate.connector import Notify
+from procrastinate.manager import JobManager
 from procrastinate.worker import Worker
 from psycopg.conninfo import make_conninfo
-from sqlalchemy import Connection, text
+from sqlalchemy import Connection, Row, text
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
+from app.backends.fence import LIMIT_IDLE_TIME, FenceError, fenced_by
 from app.backends.queue import FULL, Performer, QueueFigures, Task, Urgency, carry_out, with_parent
 from app.errors import FleetMapError, Unavailable
 
@@ -82,18 +88,45 @@ _FIGURES = text(
 _WORKERS = text(
     "SELECT count(*) FROM procrastinate_workers WHERE last_heartbeat > now() - make_interval(secs => :seconds)"
 )
+_RUNNING: Final = (
+    "SELECT job.id, job.args, job.attempts, job.abort_requested OR EXISTS (SELECT 1 FROM procrastinate_jobs other"
+    " WHERE other.queueing_lock = job.queueing_lock AND other.status = 'todo') AS is_needless"
+    " FROM procrastinate_jobs job WHERE job.status = 'doing'"
+)
+"""Running tasks. is_needless: whether a task was cancelled, or another one with its key waits."""
+
 _STALLED = text(
-    "SELECT job.id, job.args, job.attempts, job.abort_requested, EXISTS (SELECT 1 FROM procrastinate_jobs other"
-    " WHERE other.queueing_lock = job.queueing_lock AND other.status = 'todo') AS again"
-    " FROM procrastinate_jobs job WHERE job.status = 'doing' AND NOT EXISTS (SELECT 1 FROM procrastinate_workers worker"
+    _RUNNING + " AND NOT EXISTS (SELECT 1 FROM procrastinate_workers worker"  # noqa: S608  constants
     " WHERE worker.id = job.worker_id AND worker.last_heartbeat > now() - make_interval(secs => :seconds))"
     " FOR UPDATE OF job SKIP LOCKED"
 )
-_RETRY = text("SELECT procrastinate_retry_job_v2(:id, now(), NULL, NULL, NULL)")
+_OF_ATTEMPT = text(_RUNNING + " AND job.id = :id AND job.attempts = :attempts FOR UPDATE OF job")
+_CHECK = text(
+    f"SELECT {LIMIT_IDLE_TIME} FROM procrastinate_jobs"  # noqa: S608  constants
+    " WHERE id = :id AND attempts = :attempts AND status = 'doing' FOR SHARE"
+)
+_RETRY = text("SELECT procrastinate_retry_job_v2(:id, now() + make_interval(secs => :seconds), NULL, NULL, NULL)")
 _REMOVE = text("SELECT procrastinate_finish_job_v1(:id, 'failed', true)")
 _SWEEP = text("DELETE FROM procrastinate_jobs WHERE NOT (status IN ('todo', 'doing'))")
 
 Transaction = Callable[[], AbstractContextManager[Connection]]
+
+
+class TaskLostError(FenceError):
+    """The worker no longer has the task: it was taken for dead, and another one may have it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A worker's right to a task, until it ends it or is taken for dead. id: of the task. number: of earlier ones."""
+
+    id: int
+    number: int
+
+    def check(self, connection: Connection) -> None:
+        """Check within a transaction that the worker has the task still, and until the commit. Raises TaskLostError."""
+        if connection.execute(_CHECK, {"id": self.id, "attempts": self.number}).first() is None:
+            raise TaskLostError("another worker has taken over the task: nothing was stored")
 
 
 class SharedQueue:
@@ -139,22 +172,43 @@ class SharedQueue:
         oldest = max((float(row.oldest or 0) for row in rows if row.status == "todo"), default=0.0)
         return QueueFigures(waiting, running, oldest, workers)
 
+    def finish(self, attempt: Attempt) -> bool:
+        """Remove a task. Returns False, and does nothing, if the worker no longer has it."""
+        with self._transaction() as connection:
+            row = _row_of(connection, attempt)
+            if row is not None:
+                connection.execute(_REMOVE, {"id": row.id})
+            return row is not None
+
+    def give_back(self, attempt: Attempt, seconds: float) -> bool:
+        """Let a task wait again, for some seconds at least. Returns False if the worker no longer has it."""
+        with self._transaction() as connection:
+            row = _row_of(connection, attempt)
+            if row is not None:
+                connection.execute(_REMOVE if row.is_needless else _RETRY, {"id": row.id, "seconds": seconds})
+            return row is not None
+
     def put_back_stalled(self) -> list[Task]:
         """Put back the tasks of dead workers. Returns those that too many workers died of, which are removed."""
         given_up = []
         with self._transaction() as connection:
             for row in connection.execute(_STALLED, {"seconds": STALLED_SECONDS}).all():
                 task = _as_task(row.args)
-                if row.abort_requested or row.again:  # another one with its key waits
+                if row.is_needless:
                     connection.execute(_REMOVE, {"id": row.id})
                 elif row.attempts + 1 >= MAX_ATTEMPTS:
                     connection.execute(_REMOVE, {"id": row.id})
                     given_up.append(task)
                 else:
                     log.warning("queue: a worker died, its task is put back (key=%s)", task.key[:16])
-                    connection.execute(_RETRY, {"id": row.id})
+                    connection.execute(_RETRY, {"id": row.id, "seconds": 0})
             connection.execute(_SWEEP)
         return given_up
+
+
+def _row_of(connection: Connection, attempt: Attempt) -> Row[Any] | None:
+    """Lock the row of an attempt and return it; None if the worker no longer has the task."""
+    return connection.execute(_OF_ATTEMPT, {"id": attempt.id, "attempts": attempt.number}).one_or_none()
 
 
 def _as_arguments(task: Task) -> dict[str, Any]:
@@ -183,6 +237,62 @@ class _GiveBack(procrastinate.BaseRetryStrategy):
         return None
 
 
+class _JobManager(JobManager):
+    """Ends the attempt of a task that the worker made. Procrastinate would end a later one of another worker, too.
+
+    It would also leave a task that it could not end running for ever, since its worker is alive: here it tries again.
+    """
+
+    def __init__(
+        self, connector: procrastinate.BaseConnector, queue: SharedQueue, is_stopping: Callable[[], bool]
+    ) -> None:
+        super().__init__(connector)
+        self._queue, self._is_stopping = queue, is_stopping
+
+    async def finish_job(self, job: jobs.Job, status: jobs.Status, delete_job: bool) -> None:
+        """Remove a task, whatever its status: its outcome is stored already."""
+        del status, delete_job
+        await self._end(job, self._queue.finish)
+
+    async def retry_job(
+        self,
+        job: jobs.Job,
+        retry_at: datetime | None = None,
+        priority: int | None = None,
+        queue: str | None = None,
+        lock: str | None = None,
+    ) -> None:
+        """Give a task back."""
+        del priority, queue, lock
+        seconds = 0.0 if retry_at is None else max(0.0, (retry_at - datetime.now(UTC)).total_seconds())
+        await self._end(job, partial(self._queue.give_back, seconds=seconds))
+
+    async def _end(self, job: jobs.Job, end: Callable[[Attempt], bool]) -> None:
+        """End an attempt, as soon as the database can be had. A worker that stops leaves that to the others."""
+        key, is_logged = (job.lock or "")[:16], False
+        while True:
+            try:
+                is_ended = await asyncio.to_thread(end, _attempt(job))
+            except (FleetMapError, SQLAlchemyError) as error:
+                if not is_logged:  # once for each task
+                    reason = error.detail if isinstance(error, FleetMapError) else type(error).__name__
+                    log.warning("queue: a task could not be ended, will retry (key=%s, reason=%s)", key, reason)
+                is_logged = True
+                if self._is_stopping():
+                    return
+                await asyncio.sleep(RETRY_SECONDS)
+            else:
+                if not is_ended:
+                    text = "queue: this worker was taken for dead, what it made too late is thrown away (key=%s)"
+                    log.warning(text, key)
+                return
+
+
+def _attempt(job: jobs.Job) -> Attempt:
+    assert job.id is not None
+    return Attempt(job.id, job.attempts)
+
+
 class _Connector(procrastinate.PsycopgConnector):
     """Connections of a worker. Procrastinate listens for new tasks on one, and would never again once it is lost."""
 
@@ -200,6 +310,15 @@ class _Connector(procrastinate.PsycopgConnector):
                     log.warning("worker: not notified of new tasks, polls meanwhile and will retry (reason=%s)", reason)
                 outage = True
                 await asyncio.sleep(RETRY_SECONDS)
+
+
+async def _beat(manager: JobManager, worker: Worker) -> None:
+    """Send heartbeats as long as a worker has tasks. Procrastinate ends its own when it begins to stop."""
+    while True:
+        await asyncio.sleep(HEARTBEAT_SECONDS)
+        if worker.worker_id is not None:
+            with contextlib.suppress(exceptions.ConnectorException):  # the next one may arrive
+                await manager.update_heartbeat(worker.worker_id)
 
 
 class QueueWorker:
@@ -250,7 +369,8 @@ class QueueWorker:
         options |= {"application_name": "fleetmap worker", "connect_timeout": 5, "keepalives_idle": 2}
         connector = _Connector(conninfo=make_conninfo(**options), min_size=1, max_size=self._slots + 4, timeout=10.0)
         queue_app = procrastinate.App(connector=connector)
-        queue_app.task(name=TASK, retry=_GiveBack())(self._perform)
+        queue_app.job_manager = _JobManager(connector, self._queue, self._stopping.is_set)
+        queue_app.task(name=TASK, retry=_GiveBack(), pass_context=True)(self._perform)
         async with queue_app.open_async():
             self._worker = Worker(
                 queue_app,
@@ -266,21 +386,28 @@ class QueueWorker:
             )
             if self._stopping.is_set():
                 return
+            beating = asyncio.create_task(_beat(queue_app.job_manager, self._worker))
             try:
                 await self._worker.run()  # type: ignore[no-untyped-call]
             finally:
+                beating.cancel()
                 self._worker = None
 
-    async def _perform(self, **arguments: Any) -> None:
+    async def _perform(self, context: procrastinate.JobContext, /, **arguments: Any) -> None:
         """Carry out a task in a thread; if cancelled, end it and wait for that."""
-        task = _as_task(arguments)
-        work = asyncio.get_running_loop().run_in_executor(self._threads, carry_out, self._performer, task)
+        task, attempt = _as_task(arguments), _attempt(context.job)
+        work = asyncio.get_running_loop().run_in_executor(self._threads, self._carry_out, task, attempt)
         try:
             await asyncio.shield(work)
         except asyncio.CancelledError:
             self._performer.stop(task)
             await asyncio.wait({work})
             raise
+
+    def _carry_out(self, task: Task, attempt: Attempt) -> None:
+        """Carry out a task; nothing of it is stored once the worker was taken for dead."""
+        with fenced_by(attempt), contextlib.suppress(TaskLostError):  # what ends the task logs it
+            carry_out(self._performer, task)
 
     async def _watch(self) -> None:
         """Put back the tasks of dead workers, every few seconds."""

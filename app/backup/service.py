@@ -168,7 +168,7 @@ def _guard_of(lead: Lead) -> Callable[[], None]:
     term = lead.term
 
     def guard() -> None:
-        if not lead.is_held or lead.term != term:
+        if term is None or not term.goes_on:
             raise LeadLostError(
                 "the connection to the database was lost for seconds, so content could have been removed meanwhile: "
                 "the backup was given up, run it again"

@@ -51,7 +51,7 @@ class Follower(LeaderThread):
             return
         # Also return periodically: a notification may have been lost, and the connection must be checked.
         last_read = time.monotonic()
-        while self._lead.is_held and not self._stopping.wait(self.commit_poll_seconds):
+        while self._term.goes_on and not self._stopping.wait(self.commit_poll_seconds):
             is_new = self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS
             if is_new or self._has_more():
                 return
@@ -63,6 +63,3 @@ class Follower(LeaderThread):
     def _has_more(self) -> bool:
         """Whether there is something to do besides new events."""
         return False
-
-    def _is_ending(self) -> bool:
-        return self._stopping.is_set() or not self._lead.is_held

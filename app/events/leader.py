@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from app.backends.documents import write_private
-from app.backends.lead import LeadLostError, Leads
+from app.backends.lead import LeadLostError, Leads, Term
 from app.errors import FleetMapError
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,9 @@ class LeaderThread(ABC):
         well: log line when the state becomes ``connected``.
         trouble: start of the log line when the state becomes ``down``.
     """
+
+    _term: Term
+    """Term in which the present ``_run_once`` began: it stores nothing in a later one."""
 
     def __init__(self, data_dir: Path, name: str, leads: Leads, *, well: str, trouble: str) -> None:
         self._data_dir, self._name, self._healthy_state, self._problem = data_dir, name, well, trouble
@@ -84,7 +87,8 @@ class LeaderThread(ABC):
                         self._lead.release()
                     self._stand_by()
                 elif self._lead.try_acquire():
-                    self._run_once()
+                    with self._lead.fenced() as self._term:
+                        self._run_once()
                 else:
                     self._stand_by()
             except LeadLostError as error:
@@ -95,6 +99,10 @@ class LeaderThread(ABC):
             except Exception:  # noqa: BLE001  logged by _on_unexpected_error
                 self._on_unexpected_error()
                 self._stopping.wait(POLL_SECONDS)
+
+    def _is_ending(self) -> bool:
+        """Whether to end ``_run_once``: the process stops, or another server may lead or have led meanwhile."""
+        return self._stopping.is_set() or not self._term.goes_on
 
     def _try_represent(self) -> bool:
         """Become the one process of this server that takes part; return whether it is this one."""

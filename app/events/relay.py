@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from app import traces
-from app.backends.lead import Leads
+from app.backends.lead import Leads, Term
 from app.events import leader
 from app.events.follower import Follower, pages_after
 from app.events.leader import POLL_SECONDS, STAND_BY_SECONDS
@@ -87,6 +87,7 @@ class Relay(Follower):
             trouble="event relay: down",
         )
         self._outlet = outlet
+        self._published_in: Term | None = None
         self._replayed_for = 0
         self._history: deque[HistoryRange] = deque()
         self._chooser = ThreadPoolExecutor(1, thread_name_prefix="fleetmap-history")
@@ -102,10 +103,8 @@ class Relay(Follower):
 
     def _stand_by(self) -> None:
         """Stay connected without publishers, so that late joiners ask only the leader for history."""
-        if self._replayed_for and not self._lead.is_held:
-            self._replayed_for, self._choice = 0, None
-            self._history.clear()
-            self._outlet.close_publishers()
+        if not self._lead.is_held:
+            self._forget()
         state = self._outlet.state
         if state["state"] != "connected":
             self._publish_state(state)
@@ -117,8 +116,18 @@ class Relay(Follower):
         self._publish_state({**state, "leader": False})
         self._stopping.wait(STAND_BY_SECONDS)
 
+    def _forget(self) -> None:
+        """Give up the publishers and the history: another server publishes, or has published meanwhile."""
+        if self._published_in is not None:
+            self._published_in, self._replayed_for, self._choice = None, 0, None
+            self._history.clear()
+            self._outlet.close_publishers()
+
     def _hand_over(self) -> bool:
         """Publish pending events, and go on with the history."""
+        if self._published_in != self._term:
+            self._forget()
+        self._published_in = self._term
         self._publish_new()
         outlet = self._outlet
         if self._replayed_for != outlet.opened:
@@ -142,12 +151,11 @@ class Relay(Follower):
     def _publish_new(self) -> None:
         for page in pages_after(self._store, self._position(), self._stopping.is_set):
             for event in page:
-                if not self._outlet.connected or not self._lead.is_held:
+                if not self._outlet.connected or not self._term.goes_on:
                     return
                 self._publish(event)
             self._outlet.flush()
-            with self._lead.fenced():
-                self._store.events.set_relayed(page[-1].position, self._outlet.relay)
+            self._store.events.set_relayed(page[-1].position, self._outlet.relay)
 
     def _take_choice(self) -> None:
         """Begin to republish the history once it is chosen, which may take a second with a long log."""

@@ -184,7 +184,7 @@ class Ros2Publisher(LeaderThread):
         self._publish_changes(self._look_up_versions())
         self._publish_state({"state": "connected", "topics": len(self._owners)})
         last_read = time.monotonic()
-        while self._lead.is_held and not self._stopping.wait(COMMIT_POLL_SECONDS):
+        while self._term.goes_on and not self._stopping.wait(COMMIT_POLL_SECONDS):
             if self._generation() != generation or time.monotonic() - last_read > VERSION_POLL_SECONDS:
                 return
 
@@ -229,7 +229,7 @@ class Ros2Publisher(LeaderThread):
             self._retire(name, ())
             del self._environments[name]
         for name, version in standing.items():
-            if self._stopping.is_set() or not self._lead.is_held:
+            if self._is_ending():
                 return
             place = self._environments.setdefault(name, _PublishedEnvironment())
             waits = place.retry is not None and time.monotonic() < place.retry

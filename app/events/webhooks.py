@@ -19,7 +19,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from app.backends.lead import Lead, LeadLostError, Leads
+from app.backends.lead import LeadLostError, Leads, Term
 from app.errors import FleetMapError, NotFound
 from app.events import messages
 from app.events.follower import Follower, pages_after
@@ -142,9 +142,9 @@ class WebhookSender(Follower):
             if key in self._working:
                 continue
             if key not in self._couriers:
-                self._couriers[key] = Courier(self._store, self._lead, self._rules, webhook)
+                self._couriers[key] = Courier(self._store, self._rules, webhook)
             if self._couriers[key].is_due(webhook, last):
-                self._working[key] = self._threads.submit(self._couriers[key].run, self._is_ending)
+                self._working[key] = self._threads.submit(self._couriers[key].run, self._term, self._stopping.is_set)
         self._publish_state({"state": "connected", "leader": True})
         return False
 
@@ -173,9 +173,8 @@ class Courier:
     So neither a filter that skips all events nor a full disk makes it write or send again and again.
     """
 
-    def __init__(self, store: Store, lead: Lead, rules: OutgoingRules, webhook: Webhook) -> None:
-        self._store, self._lead = store, lead
-        self._webhook = webhook
+    def __init__(self, store: Store, rules: OutgoingRules, webhook: Webhook) -> None:
+        self._store, self._webhook = store, webhook
         self._client = _client(webhook, rules)
         self._position = self._stored = webhook.position
         self._delivered: datetime | None = None
@@ -201,15 +200,15 @@ class Courier:
         is_stored = self._delivered is None
         return not is_stored or last > self._position or any(_is_time(lag.attempts) for lag in self._lags.values())
 
-    def run(self, is_ending: Callable[[], bool]) -> None:
-        """Send what there is, until ``is_ending()``. Logs errors: the next call continues."""
-        self._is_ending = is_ending
+    def run(self, term: Term, is_stopping: Callable[[], bool]) -> None:
+        """Send what there is, until ``is_stopping()`` or the end of the term. Logs errors: the next call continues."""
+        self._is_ending = lambda: is_stopping() or not term.goes_on
         try:
-            with self._lead.fenced():
+            with term.fenced():
                 if self._delivered is not None:  # the last attempt to store it failed
                     self._store_position()
                 for lag in [lag for lag in self._lags.values() if _is_time(lag.attempts)]:
-                    if is_ending() or not self._catch_up(lag):
+                    if self._is_ending() or not self._catch_up(lag):
                         return
                 self._follow()
         except (LeadLostError, NotFound):  # another server sends, or the webhook was deleted

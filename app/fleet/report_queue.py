@@ -19,7 +19,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from app.backends.lead import Lead
+from app.backends.lead import Lead, Term
 from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
@@ -91,7 +91,8 @@ class ReportQueue:
     ) -> None:
         self._store, self._lead, self._clock, self._bus_vouches = store, lead, clock, bus_vouches
         self._standby: deque[tuple[float, _QueuedReport]] = deque(maxlen=MAX_STAND_BY)
-        self._leads_since: float | None = None
+        self._term: Term | None = None
+        self._leads_since = 0.0
         self._is_settled = False
         self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _QueuedReport | None] = queue.Queue(QUEUE_SIZE)
         self._shares: Counter[str] = Counter()
@@ -190,14 +191,13 @@ class ReportQueue:
 
     def _share(self, batch: list[_QueuedReport]) -> list[_QueuedReport]:
         """Return what this process has to store: all reports if it leads, else only those from HTTP."""
-        now = time.monotonic()
-        if self._lead.is_held:
-            if self._leads_since is None:
-                self._leads_since, self._is_settled = now, False
+        now, term = time.monotonic(), self._lead.term
+        if term != self._term:  # also if another server has led only between two looks
+            self._term, self._leads_since, self._is_settled = term, now, False
+        if term is not None:
             earlier = [queued for came, queued in self._standby if now - came < STAND_BY_SECONDS]
             self._standby.clear()
             return [*earlier, *batch]
-        self._leads_since = None
         self._standby.extend((now, queued) for queued in batch if queued.result is None)
         while self._standby and now - self._standby[0][0] > STAND_BY_SECONDS:
             self._standby.popleft()
@@ -237,8 +237,8 @@ class ReportQueue:
         """Store reports. Raises LeadLostError for those from Zenoh if another server has taken over."""
         self._write_batch([queued for queued in batch if queued.result is not None])
         from_bus = [queued for queued in batch if queued.result is None]
-        if from_bus:
-            with self._lead.fenced():
+        if from_bus and self._term is not None:
+            with self._term.fenced():
                 self._write_batch(from_bus)
 
     def _write_batch(self, batch: list[_QueuedReport]) -> None:
@@ -272,8 +272,8 @@ class ReportQueue:
         with self._lock:
             arrived, departed = set(self._has_news), set(self._departed)
             has_robots = bool(self._present)
-        if self._leads_since is not None:
-            with self._lead.fenced():
+        if self._term is not None:
+            with self._term.fenced():
                 new, gone = self._settle(arrived, departed)
                 if new and not self._is_settled:  # a restarted server sees all robots again
                     new -= self._store.robots.present_robots()
@@ -287,7 +287,7 @@ class ReportQueue:
 
     def _settle(self, arrived: set[str], departed: set[str]) -> tuple[set[str], set[str]]:
         """Add, once after taking over, what the stored presence lacks: changes that no server has stored."""
-        if self._is_settled or self._leads_since is None or time.monotonic() - self._leads_since < SETTLE_SECONDS:
+        if self._is_settled or time.monotonic() - self._leads_since < SETTLE_SECONDS:
             return arrived, departed
         stored = self._store.robots.present_robots()
         with self._lock:

@@ -21,7 +21,7 @@ import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
-from app.backends.lead import check_fence
+from app.backends.fence import check_fences
 from app.backends.notify import LocalNotifier, Notifier, SharedNotifier, new_number
 from app.backends.room import ROOM_BYTES, check_room
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
@@ -178,8 +178,8 @@ class Database:
     def write(self, *, notify: bool = True, upkeep: bool = False) -> Iterator[Connection]:
         """Begin a transaction that writes: all or nothing, durable when it ends.
 
-        Within ``Lead.fenced()`` only the leader can commit it. notify: whether caches are notified, on all servers.
-        upkeep: no change by a user, so that it gets no row in the audit log.
+        Within a fence (``app.backends.fence``) only who still has the right can commit it. notify: whether caches are
+        notified, on all servers. upkeep: no change by a user, so that it gets no row in the audit log.
         """
         with self._write_turn(), self.connection() as connection:
             connection.execution_options(write=True)
@@ -189,7 +189,7 @@ class Database:
                 caller = None if upkeep else self._record(connection, self.now())
                 if notify:
                     self._notifier.announce(connection, number)
-                check_fence(connection)
+                check_fences(connection)
         if caller is not None:
             caller.recorded = True
         if notify:

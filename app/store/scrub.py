@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
 from app.backends.documents import Document, FileDocument
-from app.backends.lead import Lead
+from app.backends.lead import Lead, Term
 from app.errors import FleetMapError, Unavailable, system_reason
 from app.store.store import Store
 from app.store.verify import KINDS, Kind, check_root
@@ -96,6 +96,7 @@ class Scrub:
         self._state = ScrubState()
         self._saved = 0.0
         self._debt = 0.0
+        self._term: Term | None = None
         self._reason = ""
         self._thread = threading.Thread(target=self._run, daemon=True, name="fleetmap-scrub")
 
@@ -132,6 +133,7 @@ class Scrub:
 
     def pass_if_due(self) -> None:
         """Continue a pass, or begin one if the last is long enough ago."""
+        self._term = self._lead.term
         self._state = current_state(self._store)
         if not self._state.started and time.time() - self._state.completed < self._every:
             return
@@ -145,7 +147,7 @@ class Scrub:
             if step in restarting:
                 self._state.found.pop(restarting[step], None)  # the step restarts and finds it again
             step()
-            if self._stopped.is_set() or not self._lead.is_held:
+            if self._is_ending():
                 self._save()
                 return
             self._state.step, self._state.after = self._state.step + 1, ""
@@ -196,7 +198,11 @@ class Scrub:
         if self._debt > 0.05:  # one long sleep instead of many of a microsecond
             self._stopped.wait(self._debt)
             self._debt = 0.0
-        return not self._stopped.is_set() and self._lead.is_held
+        return not self._is_ending()
+
+    def _is_ending(self) -> bool:
+        """Whether to end the pass: the process stops, or another one scrubs or has scrubbed meanwhile."""
+        return self._stopped.is_set() or self._term is None or not self._term.goes_on
 
     def _note(self, kind: Kind, name: str, problem: str) -> None:
         state = self._state
@@ -210,7 +216,9 @@ class Scrub:
     def _save(self) -> None:
         self._saved = time.monotonic()
         content = json.dumps(asdict(self._state)).encode()
-        with contextlib.suppress(Unavailable, OSError), self._lead.fenced():  # a full disk must not stop the scrub
+        if self._term is None:
+            return
+        with contextlib.suppress(Unavailable, OSError), self._term.fenced():  # a full disk must not stop the scrub
             _document(self._store).update(lambda _: content, notify=False)
 
 

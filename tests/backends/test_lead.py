@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from app.backends.lead import LEASE_SECONDS, Lead, LeadLostError, Leads, SharedLeads
+from app.backends.lead import LEASE_SECONDS, Lead, LeadLostError, Leads, SharedLead, SharedLeads
 from app.store.store import Store
 from tests.events.conftest import eventually
 from tests.postgres import Cluster
@@ -111,6 +111,32 @@ def test_former_leader_cannot_write(store: Store, open_process: Callable[[], Lea
     assert [e.name for e in store.environments.page()[0]] == ["farm", "unfenced"]
 
 
+def test_work_of_an_earlier_term_is_not_stored_in_a_later_one(store: Store, open_process: Callable[[], Leads]) -> None:
+    lead, successor = open_process().lead("task"), open_process().lead("task")
+    eventually(lead.try_acquire)
+    earlier = lead.term
+    assert earlier is not None
+    assert earlier.goes_on
+
+    def write_late() -> None:
+        with earlier.fenced():
+            lead.release()
+            eventually(successor.try_acquire)
+            successor.release()
+            eventually(lead.try_acquire)
+            store.environments.create("stale")
+
+    with pytest.raises(LeadLostError):
+        write_late()
+    assert lead.is_held
+    assert not earlier.goes_on
+    with pytest.raises(LeadLostError), earlier.fenced():
+        pass
+    with lead.fenced():
+        store.environments.create("fresh")
+    assert [e.name for e in store.environments.page()[0]] == ["fresh"]
+
+
 @pytest.mark.postgres
 @pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
 class TestShared:
@@ -122,38 +148,16 @@ class TestShared:
         first, second = open_process(), open_process()
         lead, successor = first.lead("task"), second.lead("task")
         eventually(lead.try_acquire)
-        term = lead.term  # type: ignore[attr-defined]
+        assert isinstance(lead, SharedLead)
+        term = lead.won
         first.close()
         eventually(successor.try_acquire)
-        lead.term = term  # type: ignore[attr-defined]
+        lead.won = term
         monkeypatch.setattr(SharedLeads, "has_lease", True)  # a clock that stood still
         assert lead.is_held
         with pytest.raises(LeadLostError), lead.fenced():
             store.environments.create("stale")
         with successor.fenced():
-            store.environments.create("fresh")
-        assert [e.name for e in store.environments.page()[0]] == ["fresh"]
-
-    def test_work_of_an_earlier_term_is_not_stored_in_a_later_one(
-        self, store: Store, open_process: Callable[[], Leads]
-    ) -> None:
-        lead, successor = open_process().lead("task"), open_process().lead("task")
-        eventually(lead.try_acquire)
-
-        def lose_and_win_again() -> None:
-            lead.release()
-            eventually(successor.try_acquire)
-            successor.release()
-            eventually(lead.try_acquire)
-
-        def write_late() -> None:
-            with lead.fenced():
-                lose_and_win_again()
-                store.environments.create("stale")
-
-        with pytest.raises(LeadLostError):
-            write_late()
-        with lead.fenced():
             store.environments.create("fresh")
         assert [e.name for e in store.environments.page()[0]] == ["fresh"]
 

@@ -7,10 +7,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
 
 import pytest
-from sqlalchemy import text
 
 from app.backends.queue import LocalQueue, Queue, Task, Urgency
 from app.errors import Unavailable
@@ -48,17 +46,13 @@ class Recorder:
         self.stopped.add(task.key)
 
 
-class Start(Protocol):
-    """Starts the threads or the worker that take tasks."""
-
-    def __call__(self, slots: int = 1) -> None: ...
-
-
 class Case:
     """A queue whose tasks are taken once ``start`` was called."""
 
-    def __init__(self, queue: Queue, recorder: Recorder, start: Callable[[], None]) -> None:
-        self.queue, self.recorder, self.start = queue, recorder, start
+    def __init__(
+        self, queue: Queue, recorder: Recorder, start: Callable[[], None], stop: Callable[[], None] = lambda: None
+    ) -> None:
+        self.queue, self.recorder, self.start, self.stop = queue, recorder, start, stop
 
     def submit(self, key: str, environment: str = "a", urgency: Urgency = "person") -> None:
         self.queue.submit(Task("test", key, environment, urgency, {"value": 1}))
@@ -86,13 +80,15 @@ def _local() -> Iterator[Case]:
     queue.close()
 
 
-def _shared(request: pytest.FixtureRequest, folder: Path) -> Iterator[Case]:
+def shared_case(request: pytest.FixtureRequest, folder: Path) -> Iterator[Case]:
+    """A queue on PostgreSQL. Tasks named ``hold…`` are held until ``recorder.let_go`` is set, which ``start`` does."""
     from app.backends.shared_queue import QueueWorker, SharedQueue
 
     cluster: Cluster = request.getfixturevalue("postgres_cluster")
     name = cluster.create_database(request.getfixturevalue("migrated_database"))
     store, recorder = Store(cluster.url(name), folder / "blobs"), Recorder()
     queue = SharedQueue(store.transaction, waiting=WAITING)
+    stops: list[Callable[[], None]] = []
     ends: list[Callable[[], None]] = []
 
     def start() -> None:
@@ -102,14 +98,18 @@ def _shared(request: pytest.FixtureRequest, folder: Path) -> Iterator[Case]:
         thread = threading.Thread(target=loop.run_until_complete, args=(worker.run(),))
         thread.start()
 
-        def end() -> None:
+        def stop() -> None:
             loop.call_soon_threadsafe(worker.stop)
+
+        def end() -> None:
+            stop()
             thread.join(SECONDS)
             loop.close()
 
+        stops.append(stop)
         ends.append(end)
 
-    yield Case(queue, recorder, start)
+    yield Case(queue, recorder, start, lambda: stops[0]())
     for end in ends:
         end()
     store.close()
@@ -119,7 +119,7 @@ def _shared(request: pytest.FixtureRequest, folder: Path) -> Iterator[Case]:
 @pytest.fixture(params=["local", "shared"])
 def case(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Case]:
     """A queue whose only place is not free, or has no worker, until it is started."""
-    yield from _local() if request.param == "local" else _shared(request, tmp_path)
+    yield from _local() if request.param == "local" else shared_case(request, tmp_path)
 
 
 def made(case: Case) -> list[str]:
@@ -182,32 +182,6 @@ def test_waiting_task_becomes_urgent_when_a_robot_needs_it(case: Case) -> None:
     case.start()
     eventually(lambda: len(made(case)) == 2)
     assert made(case) == ["needed", "first"]
-
-
-@pytest.mark.postgres
-def test_task_becomes_urgent_although_another_server_adds_it_at_the_same_time(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from app.backends import shared_queue
-
-    case = next(cases := _shared(request, tmp_path))
-    case.submit("first")
-    add, raise_urgency = shared_queue.SharedQueue._submit, shared_queue._RAISE
-
-    def add_late(queue: shared_queue.SharedQueue, task: Task) -> None:
-        """Look for the task before the other server has added it."""
-        monkeypatch.setattr(shared_queue.SharedQueue, "_submit", add)
-        case.submit("same")
-        with monkeypatch.context() as before:
-            before.setattr(shared_queue, "_RAISE", text(raise_urgency.text.replace("'todo'", "'failed'")))
-            add(queue, task)
-
-    monkeypatch.setattr(shared_queue.SharedQueue, "_submit", add_late)
-    case.submit("same", urgency="robot")
-    case.start()
-    eventually(lambda: len(made(case)) == 2)
-    assert made(case) == ["same", "first"]
-    next(cases, None)
 
 
 def test_cancelled_task_is_not_made(case: Case) -> None:

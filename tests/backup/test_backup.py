@@ -455,7 +455,7 @@ def test_backup_that_lost_its_hold_is_given_up(
     real = sqlite_store.backup_source.chunk_names
 
     def chunk_names() -> Iterator[list[bytes]]:
-        monkeypatch.setattr(LocalLead, "is_held", property(lambda _: False))
+        monkeypatch.setattr(LocalLead, "term", None)
         return real()
 
     monkeypatch.setattr(sqlite_store.backup_source, "chunk_names", chunk_names)

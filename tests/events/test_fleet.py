@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -285,3 +286,35 @@ def test_presence_is_written_when_it_changes_and_by_the_leader(
         for intake in intakes:
             intake.close()
         successor.release()
+
+
+def test_presence_is_settled_again_although_the_lead_was_lost_for_a_moment_only(
+    api: Api, lead: LocalLead, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Meanwhile another server has stored what it saw itself."""
+    monkeypatch.setattr("app.fleet.report_queue.SETTLE_SECONDS", 0.2)
+    monkeypatch.setattr("app.fleet.report_queue.PRESENCE_REFRESH_SECONDS", 0.3)
+    store: Store = api.app.state.services.store
+    intake, renew, lost = ReportQueue(store, lead), store.robots.renew_presence, []
+
+    def lose_the_lead(now: datetime) -> None:
+        if not lost:
+            lead.release()
+            other = threading.Thread(target=store.robots.note_presence, args=({"b"}, {"a"}, now))
+            other.start()
+            other.join()
+            assert lead.try_acquire()
+            lost.append(store.robots.present_robots() == {"b"})
+        renew(now)
+
+    intake.start()
+    try:
+        intake.set_presence("a", on_bus=True)
+        eventually(lambda: store.robots.present_robots() == {"a"})
+        eventually(lambda: intake._is_settled)
+        monkeypatch.setattr(store.robots, "renew_presence", lose_the_lead)  # which the thread itself calls
+        eventually(lambda: lost)
+        eventually(lambda: store.robots.present_robots() == {"a"})
+        assert lost == [True]
+    finally:
+        intake.close()

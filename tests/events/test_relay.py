@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import threading
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -191,18 +192,61 @@ class Deaf:
 
     def __init__(self) -> None:
         self.put: list[int] = []
+        self.environments: list[str] = []
+        self.closed = 0
 
     def ensure_connected(self) -> bool:
         return True
 
-    def publish(self, _: str, body: Any) -> None:
+    def publish(self, environment: str, body: Any) -> None:
         self.put.append(body["sequence"])
+        self.environments.append(environment)
+
+    def close_publishers(self) -> None:
+        self.closed += 1
 
     def flush(self) -> None:
         """Everything is accepted."""
 
     def close(self) -> None:
         """Nothing is open."""
+
+
+def test_relay_notices_that_another_server_has_led_for_a_moment(tmp_path: Path) -> None:
+    """It publishes nothing that it read before, and the history again: late joiners ask its publishers alone."""
+    store = Store(f"sqlite:///{tmp_path / 'store.sqlite'}", tmp_path / "blobs")
+    store.migrate()
+    for name in "abcd":
+        store.environments.create(name)
+    leads = LocalLeads(tmp_path)
+    bus, lead = Deaf(), leads.lead("events")
+    publish = bus.publish
+
+    def publish_and_lose_the_lead(environment: str, body: Any) -> None:
+        publish(environment, body)
+        if bus.environments == ["a", "b"]:
+            lead.release()
+            other = threading.Thread(target=store.events.set_relayed, args=(store.events.last_position(),))
+            other.start()
+            other.join()
+            assert lead.try_acquire()
+
+    bus.publish = publish_and_lose_the_lead  # type: ignore[method-assign]
+    relay = Relay(store, bus, tmp_path, leads)  # type: ignore[arg-type]
+    relay.start()
+    try:
+        eventually(lambda: len(bus.environments) == 6)
+        assert bus.environments[:2] == ["a", "b"]
+        assert sorted(bus.environments[2:]) == ["a", "b", "c", "d"], "the history, which the other one published"
+        assert bus.closed == 1, "late joiners get nothing from publishers of an earlier term"
+        bus.environments.clear()
+        lead.release()
+        assert lead.try_acquire()
+        eventually(lambda: len(bus.environments) == 4)
+        assert bus.closed == 2
+    finally:
+        relay.close()
+        store.close()
 
 
 def test_database_outage_is_logged_once(

@@ -11,6 +11,7 @@ from typing import Any
 from app.api.http import problems
 from app.api.http.outcomes import commit_as_json, error_as_json
 from app.api.http.responses import api_path
+from app.backends.fence import FenceError
 from app.backends.queue import Task
 from app.convert.maps import Maps
 from app.convert.recipe import MapOrder
@@ -87,8 +88,8 @@ class TaskPerformer:
             outcome, location = carry_out(task, stop)
         except Cancelled:
             self._store.jobs.release_task(task.key)  # unless all were cancelled, this worker stops
-        except NoRoom:
-            raise  # try again: another worker may have room
+        except (NoRoom, FenceError):
+            raise  # another worker may have room, or has the task already
         except Exception as error:  # noqa: BLE001  the outcome is for who waits
             self._fail(task, error)
         else:
