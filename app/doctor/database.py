@@ -6,9 +6,10 @@ import os
 from collections.abc import Iterator
 from datetime import timedelta
 
+from app.doctor.disks import FREE
 from app.doctor.registry import Finding, check, error, human_size, ok, warning
 from app.doctor.site import Site
-from app.errors import DatabaseDamaged, FleetMapError
+from app.errors import DatabaseDamaged, FleetMapError, NoRoom
 from app.store.database import REPAIR
 from app.store.scrub import current_state, figures
 
@@ -41,8 +42,7 @@ def database(site: Site) -> Iterator[Finding]:
     try:
         site.store.check()
     except FleetMapError as failure:
-        advice = "run `fleetmap migrate` with this release, or this server with the release of the schema"
-        yield error(failure.detail, place, advice)
+        yield error(failure.detail, place, "its reason says which release or command; back up before a migration")
     else:
         yield ok("the schema suits this release", place)
 
@@ -87,9 +87,18 @@ def stored_files(site: Site) -> Iterator[Finding]:
     try:
         site.store.blobs.files.check()
     except FleetMapError as failure:
-        yield error(failure.detail, place, "check address, keys and rights of the store, and whether it has space")
+        yield error(failure.detail, place, _files_advice(site, failure))
     else:
         yield ok("can be written", place)
+
+
+def _files_advice(site: Site, failure: FleetMapError) -> str:
+    """Say what to do with a store of files that cannot be written."""
+    if (site.settings.blob_url or "").startswith("s3://"):
+        return "check its address, its keys and their rights, and whether it has space"
+    if isinstance(failure, NoRoom):
+        return FREE
+    return f"let the user of the server, who runs this, write it and all below: chown -R {os.getuid()} (check folders)"
 
 
 @check
