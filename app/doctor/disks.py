@@ -56,18 +56,20 @@ def folders(site: Site) -> Iterator[Finding]:
     if user == 0 and owner != 0 and data.exists():
         advice = f"run it as the user of the server, whose rights it then examines: sudo -u '#{owner}' fleetmap doctor"
         yield warning(f"this examination runs as root, and the folder belongs to user {owner}", str(data), advice)
+    closed = set[Path]()
     for name, folder in _folders(site).items():
         place = f"{folder} ({name})"
         if folder.exists() and not folder.is_dir():
             yield error("is no folder", place, "set another path")
         elif not os.access(_existing(folder), os.R_OK | os.W_OK | os.X_OK):
+            closed.add(folder)
             yield _inaccessible(_existing(folder), place)
         elif not folder.exists():
             yield ok("will be created at the first start", place)
         else:
             yield ok("can be written", place)
     for path in _necessary(site):
-        if path.exists() and not os.access(path, os.R_OK | os.W_OK):
+        if path.parent not in closed and path.exists() and not os.access(path, os.R_OK | os.W_OK):
             yield _inaccessible(path, str(path))
 
 
