@@ -491,13 +491,20 @@ def start_ros2(settings: Settings, services: Services) -> Ros2Publisher | None:
     return publishing
 
 
-def start_mqtt(settings: Settings, services: Services) -> Relay | None:
-    """Start the relay of events to an MQTT broker; None if there is none."""
+def mqtt_broker(settings: Settings) -> MqttBroker | None:
+    """Return the connection to the MQTT broker of the settings, not connected yet; None if there is none."""
     if settings.mqtt_url is None:
         return None
     url, password_file = settings.mqtt_url.get_secret_value(), settings.mqtt_password_file
-    options = MqttOptions.from_url(url, settings.zenoh_prefix, password_file, settings.mqtt_ca)
-    thread = Relay(services.store, MqttBroker(options), settings.data_dir, services.leads)
+    return MqttBroker(MqttOptions.from_url(url, settings.zenoh_prefix, password_file, settings.mqtt_ca))
+
+
+def start_mqtt(settings: Settings, services: Services) -> Relay | None:
+    """Start the relay of events to an MQTT broker; None if there is none."""
+    broker = mqtt_broker(settings)
+    if broker is None:
+        return None
+    thread = Relay(services.store, broker, settings.data_dir, services.leads)
     thread.start()
     return thread
 

@@ -36,9 +36,9 @@ def doctor(
 ) -> None:
     """Look at everything that keeps a server alive, and say what is wrong, where, and what to do.
 
-    Settings, ports, certificates, clock, disks, memory, database, file store, Zenoh router, keys, backups and worker
-    processes of this machine, with the settings of the server. With --server (or FLEETMAP_SERVER) also the running
-    server. It changes nothing and does not disturb a running server.
+    Settings, ports, certificates, clock, disks, memory, database, file store, Zenoh router, MQTT broker, webhooks,
+    keys, backups and worker processes of this machine, with the settings of the server. With --server (or
+    FLEETMAP_SERVER) also the running server. It changes nothing and does not disturb a running server.
 
     Exit status: 0 if there is no error (there may be warnings), 1 otherwise, 2 for a wrong option.
 

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 
 from app.doctor.registry import CHECKS, Check, Finding, Result
 from app.doctor.site import Site
-from app.errors import FleetMapError, system_reason
+from app.errors import FleetMapError, Unavailable, system_reason
 
 
 def all_checks() -> Mapping[str, Check]:
@@ -30,7 +30,7 @@ def examine(site: Site, only: Collection[str] = ()) -> Iterator[Result]:
         try:
             findings = list(function(site))
         except FleetMapError as error:
-            findings = [Finding("error", error.detail)]
+            findings = [_finding_of(error, site)]
         except OSError as error:
             findings = [Finding("error", system_reason(error), str(error.filename or ""))]
         except Exception as error:  # noqa: BLE001  a defect in one check must not hide the others
@@ -38,6 +38,13 @@ def examine(site: Site, only: Collection[str] = ()) -> Iterator[Result]:
             findings = [Finding("error", defect, "", "report it with this line")]
         for finding in findings:
             yield Result(name, finding)
+
+
+def _finding_of(error: FleetMapError, site: Site) -> Finding:
+    """Return the result of a check that could not be made: its cause is reported once, by the check of the database."""
+    if isinstance(error, Unavailable) and not site.is_database_usable:
+        return Finding("ok", "not checked without a usable database: see the check database")
+    return Finding("error", error.detail)
 
 
 __all__ = ["CHECKS", "Finding", "Result", "Site", "all_checks", "examine"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from datetime import timedelta
 
+from app.doctor.disks import FREE
 from app.doctor.registry import Finding, check, error, human_size, ok, warning
 from app.doctor.site import Site
-from app.errors import FleetMapError
+from app.errors import DatabaseDamaged, FleetMapError, NoRoom
+from app.store.database import REPAIR
 from app.store.scrub import current_state, figures
 
 MAX_PAGES_BYTES = 2**30
@@ -15,7 +18,9 @@ MAX_PAGES_BYTES = 2**30
 
 OLD_SCRUB = timedelta(days=14)
 OLD_BACKUP = timedelta(days=2)
-FIRST_START = "start the server: it creates the database"
+FIRST_START = (
+    "start the server: it creates it; if it has run before, pass the server's own settings (--data-dir, its variables)"
+)
 
 
 @check
@@ -28,8 +33,7 @@ def database(site: Site) -> Iterator[Finding]:
     try:
         versions = site.store.database_versions()
     except FleetMapError as failure:
-        advice = "start the database; check address, user and password (FLEETMAP_DATABASE_URL) and the network"
-        yield error(failure.detail, place, advice)
+        yield error(failure.detail, place, _advice(site, failure))
         return
     yield ok("answers: " + ", ".join(f"{name} {version}" for name, version in versions.items()), place)
     if versions.get("PostGIS") == "missing":
@@ -38,10 +42,18 @@ def database(site: Site) -> Iterator[Finding]:
     try:
         site.store.check()
     except FleetMapError as failure:
-        advice = "run `fleetmap migrate` with this release, or this server with the release of the schema"
-        yield error(failure.detail, place, advice)
+        yield error(failure.detail, place, "its reason says which release or command; back up before a migration")
     else:
         yield ok("the schema suits this release", place)
+
+
+def _advice(site: Site, failure: FleetMapError) -> str:
+    """Say what to do with a database that does not answer."""
+    if site.database_file is None:
+        return "start the database; check address, user and password (FLEETMAP_DATABASE_URL) and the network"
+    if isinstance(failure, DatabaseDamaged):
+        return f"{REPAIR}; or set the right file with --data-dir or FLEETMAP_DATABASE_URL"
+    return f"let the user of the server (now number {os.getuid()}) read and write the file and its folder (chown)"
 
 
 @check
@@ -75,9 +87,18 @@ def stored_files(site: Site) -> Iterator[Finding]:
     try:
         site.store.blobs.files.check()
     except FleetMapError as failure:
-        yield error(failure.detail, place, "check address, keys and rights of the store, and whether it has space")
+        yield error(failure.detail, place, _files_advice(site, failure))
     else:
         yield ok("can be written", place)
+
+
+def _files_advice(site: Site, failure: FleetMapError) -> str:
+    """Say what to do with a store of files that cannot be written."""
+    if (site.settings.blob_url or "").startswith("s3://"):
+        return "check its address, its keys and their rights, and whether it has space"
+    if isinstance(failure, NoRoom):
+        return FREE
+    return f"let the user of the server, who runs this, write it and all below: chown -R {os.getuid()} (check folders)"
 
 
 @check

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -55,17 +56,41 @@ def folders(site: Site) -> Iterator[Finding]:
     if user == 0 and owner != 0 and data.exists():
         advice = f"run it as the user of the server, whose rights it then examines: sudo -u '#{owner}' fleetmap doctor"
         yield warning(f"this examination runs as root, and the folder belongs to user {owner}", str(data), advice)
+    closed = set[Path]()
     for name, folder in _folders(site).items():
         place = f"{folder} ({name})"
         if folder.exists() and not folder.is_dir():
             yield error("is no folder", place, "set another path")
         elif not os.access(_existing(folder), os.R_OK | os.W_OK | os.X_OK):
-            advice = f"give it to the user of the server (chown), now user number {os.getuid()}, or set another folder"
-            yield error("cannot be read and written by this user", place, advice)
+            closed.add(folder)
+            yield _inaccessible(_existing(folder), place)
         elif not folder.exists():
             yield ok("will be created at the first start", place)
         else:
             yield ok("can be written", place)
+    for path in _necessary(site):
+        if path.parent not in closed and path.exists() and not os.access(path, os.R_OK | os.W_OK):
+            yield _inaccessible(path, str(path))
+
+
+def _necessary(site: Site) -> Iterator[Path]:
+    """Return what the server must read and write within its folders, and may have been created by another user."""
+    yield site.settings.data_dir / "keys"
+    if site.database_file is not None:
+        yield from (Path(f"{site.database_file}{end}") for end in ("", "-wal", "-shm"))
+
+
+def _inaccessible(path: Path, place: str) -> Finding:
+    """Say why a file or folder cannot be used, as far as the system says."""
+    if os.statvfs(path).f_flag & os.ST_RDONLY:
+        advice = "mount it writable; if the system has closed it after an error of the disk, see `dmesg`"
+        return error("its file system is read-only", place, advice)
+    status, user = path.stat(), os.getuid()
+    detail = f"cannot be read and written by this user (mode {stat.S_IMODE(status.st_mode):04o}, owner {status.st_uid})"
+    if status.st_uid == user:
+        return error(detail, place, f"chmod -R u+rwX {path}")
+    advice = f"give it to the user of the server, who runs this: chown -R {user} {path}; or run this as its owner"
+    return error(detail, place, advice)
 
 
 @check

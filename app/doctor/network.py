@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import socket
 from collections.abc import Iterator
@@ -16,6 +17,9 @@ from app.events.security import PASSWORD_FILE, read_users
 from app.main import bus_options
 
 PROBE_SECONDS = 3.0
+TAKEN_ERRNOS = (errno.EADDRINUSE, errno.EACCES)
+"""Errors of a port that another process may have: below 1024 the privilege is missed first."""
+
 ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  nothing is bound here
 
 
@@ -25,10 +29,12 @@ def http_port(site: Site) -> Iterator[Finding]:
     settings = site.settings
     host, port = settings.host.strip("[]"), settings.port
     place = f"{settings.host} port {port}"
-    if port == 0:
-        yield ok("the system chooses a free port", place)
-    elif not _listens(ANY_ADDRESS.get(host, host), port):
-        yield _bindable(host, port, place)
+    problem = None if port == 0 else _bind_problem(host, port)
+    if problem is None:
+        yield ok("the system chooses a free port" if port == 0 else "free; no server runs on it", place)
+    elif problem.errno not in TAKEN_ERRNOS or not _listens(ANY_ADDRESS.get(host, host), port):
+        advice = "set FLEETMAP_HOST to an address of this machine; ports below 1024 need a privilege"
+        yield error(f"cannot listen: {problem.strerror or problem}", place, advice)
     else:
         scheme = "https" if settings.tls_certificate is not None else "http"
         shown = ANY_ADDRESS.get(host, host)
@@ -44,17 +50,16 @@ def http_port(site: Site) -> Iterator[Finding]:
             yield error("another program uses the port", place, "stop it (`ss -ltnp`), or set another FLEETMAP_PORT")
 
 
-def _bindable(host: str, port: int, place: str) -> Finding:
-    """Bind a port of which nobody makes use, and free it at once."""
+def _bind_problem(host: str, port: int) -> OSError | None:
+    """Bind a port, and free it at once; return why that fails."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as listener:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does, after a stop
             listener.bind(address)
     except OSError as failure:
-        advice = "set FLEETMAP_HOST to an address of this machine; ports below 1024 need a privilege"
-        return error(f"cannot listen: {failure.strerror or failure}", place, advice)
-    return ok("free; no server runs on it", place)
+        return failure
+    return None
 
 
 def _listens(host: str, port: int) -> bool:
@@ -124,10 +129,17 @@ def zenoh_router(site: Site) -> Iterator[Finding]:
     try:
         version = probe_router(bus_options(settings), PROBE_SECONDS)
     except FleetMapError as failure:
-        advice = "start the router; check address, user and password, and the certificates (check certificate-zenoh)"
+        advice = f"{_router_advice(site)} the certificates (check certificate-zenoh)"
         yield error(failure.detail, place, advice)
         return
     yield _compare(version, place)
+
+
+def _router_advice(site: Site) -> str:
+    """Say what to do about a router that cannot be reached, up to its certificates."""
+    if site.settings.zenoh_mode == "router":
+        return "a program has the port (`ss -ltnp`): stop it or set FLEETMAP_ZENOH_LISTEN; if it is the server, check"
+    return "start the router; check address, user and password, and"
 
 
 def _compare(router: str | None, place: str) -> Finding:

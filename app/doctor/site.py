@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 
 from app.config import Settings
-from app.errors import Unavailable
+from app.errors import FleetMapError, Unavailable
 from app.events.credentials import server_ssl_context
 from app.main import open_store
 from app.store.store import Store
@@ -76,6 +76,16 @@ class Site:
     def store(self) -> Store:
         """Store of the settings, opened only for reading, once."""
         return open_store(self.settings, readonly=True)
+
+    @cached_property
+    def is_database_usable(self) -> bool:
+        """Whether the database answers, is one, and has a schema for this release."""
+        try:
+            self.store.database_versions()
+            self.store.check()
+        except FleetMapError:
+            return False
+        return True
 
     def close(self) -> None:
         """Close the store, if a check has opened it."""

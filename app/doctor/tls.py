@@ -81,6 +81,8 @@ def _examine(site: Site, path: Path, key: Path, ca: Path | None, hosts: set[str 
     """Look at a certificate with its key, as a client of these hosts sees it."""
     findings = list(_read(site, path))
     yield from findings
+    if not path.is_file():
+        return
     try:
         server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         server.load_cert_chain(path, key, password="")

@@ -49,7 +49,8 @@ def workers(site: Site) -> Iterator[Finding]:
         try:
             writes, listens, memory = pool.run(probe)
         except FleetMapError as failure:
-            advice = "raise FLEETMAP_MAX_MEMORY_BYTES; allow the user of the server to start processes (`ulimit -u`)"
+            advice = "raise FLEETMAP_MAX_MEMORY_BYTES; allow the user of the server to start processes (`ulimit -u`); "
+            advice += "on a busy machine run it again"
             yield error(f"a worker process does not start: {failure.detail}", "", advice)
             return
     if memory != limit:

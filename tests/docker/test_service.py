@@ -133,6 +133,7 @@ def test_backup_unit_fits_the_server_unit() -> None:
     assert backup["ExecStart"][0].split()[0] == server["ExecStart"][0].split()[0]
     assert data in backup["ReadWritePaths"][0].split()
     assert f"FLEETMAP_DATA_DIR={data}\n" in text
+    assert int(backup["CPUWeight"][0]) * 8 <= int(server["CPUWeight"][0])
 
 
 def test_doctor_unit_has_the_settings_of_the_server_unit() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import socket
 import sqlite3
@@ -26,8 +27,10 @@ from app.events.security import RouterSecurity
 from app.main import open_store
 from app.pool import Pool
 from app.store.backups import BackupRecord
+from app.store.webhooks import Attempts
 from tests.api.conftest import Api, empty_database, settings_for
 from tests.certificates import Authority
+from tests.mosquitto import Broker
 from tests.ports import free_port
 from tests.postgres import Cluster
 
@@ -183,6 +186,22 @@ def with_failed_backup(place: Place) -> Site:
     return site
 
 
+def with_webhook(place: Place, failing: timedelta) -> Site:
+    """A webhook whose receiver has failed for a time, and an event that waits for it."""
+    site = place.site()
+    with closing(open_store(site.settings)) as store:
+        webhook = store.webhooks.create("https://user:password@hooks.example.org/path-with-a-secret")
+        store.environments.create("farm")
+        store.webhooks.note_failure(webhook.id, 0, Attempts(3, NOW - failing, NOW, "no answer"))
+    return site
+
+
+def with_broker(place: Place) -> Site:
+    broker = Broker(place.folder / "broker")
+    place.request.addfinalizer(broker.kill)
+    return place.site(mqtt_url=f"mqtt://127.0.0.1:{broker.port}")
+
+
 def postgres(place: Place) -> Site:
     cluster: Cluster = place.request.getfixturevalue("postgres_cluster")
     return place.site(database_url=cluster.url(cluster.create_database()), blob_url=str(place.data / "blobs"))
@@ -227,6 +246,22 @@ def foreign_router(place: Place) -> Site:
     users = place.secret("users", 0o600, USERS)
     listen = f"tcp/127.0.0.1:{place.request.getfixturevalue('zenoh_port')}"
     return place.site(zenoh_mode="router", zenoh_listen=listen, zenoh_users=users)
+
+
+def closed(place: Place, name: str, mode: int) -> Site:
+    """A file or folder that this user cannot write, which tests by root cannot have."""
+    path = place.data / name
+    if not path.exists():
+        path.mkdir()
+    path.chmod(mode)
+    is_accessible = os.access
+    place.patch.setattr(os, "access", lambda p, how: Path(p) != path and is_accessible(p, how))
+    return place.site()
+
+
+def read_only(place: Place) -> Site:
+    place.patch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=os.ST_RDONLY))
+    return closed(place, "blobs", 0o700)
 
 
 def few_files(place: Place) -> Site:
@@ -291,6 +326,7 @@ CASES: list[Case] = [
     ("database", "warning", "no database yet", lambda p: p.site(database_url=f"sqlite:///{p.data}/none.sqlite3")),
     ("database", "error", "0015", old_schema),
     ("database", "error", "newer release", newer_schema),
+    ("database", "error", "is damaged", lambda p: (p.database.write_text("no database"), p.site())[-1]),
     ("database", "error", "unavailable", lambda p: p.site(
         database_url=f"postgresql+psycopg://fleetmap:pw@127.0.0.1:{free_port()}/x", blob_url=str(p.data)
     )),
@@ -306,6 +342,9 @@ CASES: list[Case] = [
     ("folders", "ok", "can be written", lambda p: p.site()),
     ("folders", "ok", "will be created", lambda p: p.site(blob_url=str(p.folder / "new" / "blobs"))),
     ("folders", "error", "no folder", lambda p: p.site(blob_url=str(p.database))),
+    ("folders", "error", "by this user (mode 0400", lambda p: closed(p, "fleetmap.sqlite3", 0o400)),
+    ("folders", "error", "by this user (mode 0500", lambda p: closed(p, "keys", 0o500)),
+    ("folders", "error", "file system is read-only", read_only),
     ("folders", "warning", "runs as root", lambda p: (
         p.patch.setattr("app.doctor.disks._users", lambda _: (0, 1000)), p.site()
     )[-1]),
@@ -313,9 +352,13 @@ CASES: list[Case] = [
     ("http-port", "ok", "a server answers", running_server),
     ("http-port", "error", "another program", taken_port),
     ("http-port", "error", "cannot listen", reserved_port),
+    ("http-port", "error", "cannot listen", lambda p: p.site(host="192.0.2.1", port=free_port())),
     ("memory", "ok", "need", lambda p: p.site(memory=lambda: 64 * 2**30)),
     ("memory", "warning", "address space", lambda p: p.site(memory=lambda: 2 * 2**30)),
     ("memory", "error", "4 server processes", lambda p: p.site(memory=lambda: 2**30, workers=4)),
+    ("mqtt", "ok", "no MQTT broker", lambda p: p.site()),
+    ("mqtt", "ok", "accepts", with_broker),
+    ("mqtt", "error", "refused", lambda p: p.site(mqtt_url=f"mqtt://127.0.0.1:{free_port()}")),
     ("open-files", "ok", "allowed", lambda p: p.site(max_connections=16)),
     ("open-files", "warning", "1024 open files", few_files),
     ("program", "ok", __version__, lambda p: p.site()),
@@ -373,6 +416,8 @@ CASES: list[Case] = [
         p.patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}"),
         p.site(blob_url="s3://maps", blob_access_key="a", blob_secret_key="b"),
     )[-1]),
+    ("webhooks", "ok", "1 webhooks", lambda p: with_webhook(p, timedelta(minutes=5))),
+    ("webhooks", "warning", "1 events wait", lambda p: with_webhook(p, timedelta(hours=2))),
     ("workers", "ok", "starts", lambda p: p.site()),
     ("workers", "error", "does not start", dying_workers),
     ("workers", "error", "not confined", unconfined_workers),
@@ -383,6 +428,9 @@ CASES: list[Case] = [
     )),
     ("zenoh-router", "error", "no router at", lambda p: zenoh_client(p, "a-wrong-password")),
     ("zenoh-router", "error", "has not started", foreign_router),
+    ("zenoh-router", "error", "no router at", lambda p: p.site(
+        zenoh_mode="router", zenoh_listen=f"tcp/127.0.0.1:{p.stub({}).port}"
+    )),
     ("zenoh-router", "error", "NAME:PASSWORD", lambda p: p.site(
         zenoh_mode="router", zenoh_listen=f"tcp/127.0.0.1:{free_port()}", zenoh_users=p.secret("users", 0o600, "x")
     )),
@@ -467,6 +515,23 @@ def test_confinement_is_judged_by_what_a_worker_can_do() -> None:
     assert level(3, True, True) == "error"
     assert level(7, False, True) == "error"
     assert level(7, False, False) == "ok"
+
+
+@pytest.mark.parametrize("name", ["backup", "webhooks"])
+def test_broken_database_is_one_error(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    place = Place(tmp_path, request)
+    place.database.write_text("no database")
+    results = list(examine(place.site(), [name, "database"]))
+    assert {r.check: r.finding.level for r in results} == {name: "ok", "database": "error"}
+    (finding,) = [r.finding for r in results if r.check == name]
+    assert "see the check database" in finding.detail
+
+
+def test_secrets_of_addresses_are_not_shown(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    site = with_webhook(Place(tmp_path, request), timedelta(hours=2))
+    (result,) = examine(site, ["webhooks"])
+    assert result.finding.place.endswith("https://hooks.example.org")
+    assert "secret" not in str(result.as_dict())
 
 
 def test_large_files_are_left_to_verify(tmp_path: Path, request: pytest.FixtureRequest) -> None:
