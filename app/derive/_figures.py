@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.derive._centrelines import straighten_lines, wall_boxes
 from app.derive._shapes import Box, Disc, MaskShapes, ShapeLimits
 from app.derive._walls import find_tables, fit_arc, join_faces, join_walls
 from app.errors import CannotConvert
@@ -60,12 +61,6 @@ MAX_PIECES = 2_000_000
 
 ROWS_PER_BLOCK = 1024
 """Rows that are processed together."""
-
-STEP = 0.25
-"""Distance in cells between the positions at which a wall's width is sampled."""
-
-MAX_SAMPLES = 64
-"""Maximum number of positions along a wall at which its width is sampled."""
 
 
 def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits) -> MaskShapes:
@@ -422,11 +417,9 @@ def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShape
     graph, _ = _skeleton.skeleton(free_space, merge=2.0, spur=sizes.speck, tolerance=sizes.tolerance, island=0.0)
     if len(graph.edges) > MAX_FIGURES:
         raise CannotConvert(f"the grid shows no walls: its thin pieces have more than {MAX_FIGURES} edges")
-    ends = straighten_lines(graph.nodes[:, ::-1].astype(np.float64), graph.edges, sizes.tolerance)
-    for a, b in ends:
-        wall = _wall(thin, a + 0.5, b + 0.5, sizes.wall)
+    for wall in wall_boxes(thin, straighten_lines(graph.nodes[:, ::-1], graph.edges, sizes.tolerance), sizes.wall):
         if wall.length >= sizes.speck:
-            shapes.walls.append(Box(wall.x + at[0], wall.y + at[1], wall.length, wall.width, wall.yaw))
+            shapes.walls.append(replace(wall, x=wall.x + float(at[0]), y=wall.y + float(at[1])))
     return out
 
 
@@ -474,90 +467,3 @@ def _areas(thick: NDArray[np.uint8], sizes: ShapeLimits, mask_shapes: MaskShapes
                 continue
         out.append(area)
     return out
-
-
-def straighten_lines(
-    nodes: NDArray[np.float64], edges: NDArray[np.int64], tolerance: float
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Join edges into straight lines within ``tolerance`` and return the end points of each line.
-
-    At each node the straightest pair is joined first. Lines are in the order of their first edges.
-    """
-    lines: dict[int, list[int]] = {k: [int(a), int(b)] for k, (a, b) in enumerate(edges)}
-    at: dict[int, set[int]] = {}
-    for k, (a, b) in lines.items():
-        at.setdefault(a, set()).add(k)
-        at.setdefault(b, set()).add(k)
-    for node in sorted(at):
-        while len(at[node]) > 1:
-            best: tuple[float, int, int, list[int]] | None = None
-            neighbours = sorted(at[node])
-            for i, one in enumerate(neighbours):
-                for other in neighbours[i + 1 :]:
-                    joined = _join_lines(lines[one], lines[other], node)
-                    away = _distance_from_line(nodes[joined], tolerance)
-                    if away is not None and (best is None or away < best[0]):
-                        best = (away, one, other, joined)
-            if best is None:
-                break
-            _, one, other, joined = best
-            for k in (one, other):
-                for end in (lines[k][0], lines[k][-1]):
-                    at[end].discard(k)
-            del lines[other]
-            lines[one] = joined
-            at[joined[0]].add(one)
-            at[joined[-1]].add(one)
-    return [(nodes[line[0]], nodes[line[-1]]) for _, line in sorted(lines.items())]
-
-
-def _join_lines(one: list[int], other: list[int], node: int) -> list[int]:
-    """Join two lines at a common end."""
-    first = one if one[-1] == node else one[::-1]
-    second = other if other[0] == node else other[::-1]
-    return [*first, *second[1:]]
-
-
-def _distance_from_line(line: NDArray[np.float64], tolerance: float) -> float | None:
-    """Return the maximum distance of the corners from the chord; None if above tolerance, or if the line turns back."""
-    chord = line[-1] - line[0]
-    length = float(np.hypot(*chord))
-    if length == 0.0:
-        return None
-    along = (line - line[0]) @ chord / length
-    if (np.diff(along) <= 0).any():
-        return None
-    away = np.abs((line - line[0]) @ np.array([-chord[1], chord[0]])) / length
-    worst = float(away.max())
-    return worst if worst <= tolerance else None
-
-
-def _wall(thin: NDArray[np.uint8], a: NDArray[np.float64], b: NDArray[np.float64], widest: float) -> Box:
-    """Fit a straight wall to a centreline: as wide as its cells, centred in them, up to where they end."""
-    length = float(np.hypot(*(b - a)))
-    along = (b - a) / length
-    across = np.array([-along[1], along[0]])
-    n = min(MAX_SAMPLES, max(3, round(length)))
-    share = (np.arange(n) + 0.5) / n
-    middle = a + (b - a) * share[:, None]
-    left, right = _reach(thin, middle, across, widest), _reach(thin, middle, -across, widest)
-    usual = float(np.median(left + right))  # at junctions other walls count as width
-    shift = float(np.median((left - right) / 2))
-    before, after = (float(_reach(thin, p[None] + shift * across, d, widest)[0]) for p, d in ((a, -along), (b, along)))
-    ends = a - along * before, b + along * after
-    centre = (ends[0] + ends[1]) / 2 + shift * across
-    yaw = (math.atan2(along[1], along[0]) + math.pi / 2) % math.pi - math.pi / 2
-    return Box(float(centre[0]), float(centre[1]), length + before + after, max(usual, 1.0), yaw)
-
-
-def _reach(
-    mask: NDArray[np.uint8], places: NDArray[np.float64], direction: NDArray[np.float64], max_distance: float
-) -> NDArray[np.float64]:
-    """Measure how far the mask continues from positions in a direction, in cells; at most ``max_distance``."""
-    steps = np.arange(0.0, max_distance + 1.0, STEP) + STEP / 2
-    at = np.floor(places[:, None, :] + direction * steps[:, None]).astype(np.int64)
-    x = np.clip(at[..., 0], 0, mask.shape[1] - 1)
-    y = np.clip(at[..., 1], 0, mask.shape[0] - 1)
-    out = mask[y, x] == 0
-    ends = np.where(out.any(axis=1), out.argmax(axis=1), len(steps))
-    return np.asarray(ends * STEP, np.float64)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -24,6 +25,9 @@ MAX_ROUNDS = 50
 
 MAX_TURN = 0.35
 """Maximum angle in radians between a wall and a piece longer than ``SHORT`` that is joined to it."""
+
+ROUNDING = 1e-6
+"""Length in cells by which maximum distances are exceeded, so that machines that round differently join the same."""
 
 SHORT = 4.0
 """Length in cells up to which a piece has no direction of its own."""
@@ -43,13 +47,86 @@ LEG_NOISE = 1.5
 
 @dataclass(slots=True)
 class _Line:
-    """A wall that grows: a point of it, its direction, its extent along it, and the pieces in it."""
+    """A wall that grows: a point of it, its direction (a unit vector), its extent along it, and the pieces in it.
+
+    Several lines may share one object: the arrays then have a row for each.
+    """
 
     at: NDArray[np.float64]
     along: NDArray[np.float64]
-    low: float
-    high: float
+    low: Any
+    high: Any
     members: list[int]
+
+
+class _Pieces:
+    """Pieces of walls as arrays, and what may be joined to them.
+
+    noise: maximum distance of a piece's ends from the line. gap: maximum gap between pieces.
+    """
+
+    def __init__(self, walls: Sequence[Box], noise: float, gap: float, main: Sequence[float]) -> None:
+        self.ends = _all_ends(walls)
+        self.yaws = np.array([wall.yaw for wall in walls])
+        self.lengths = np.array([wall.length for wall in walls])
+        self.widths = np.array([wall.width for wall in walls])
+        self.noise, self.gap, self.main = noise + ROUNDING, gap + ROUNDING, main
+        self._tree = shapely.STRtree(shapely.linestrings(self.ends))
+
+    def mates(self) -> list[NDArray[np.int64]]:
+        """Return for each piece the pieces on its line, itself included, in order."""
+        turned = [_straightened(*p, self.noise, self.main) for p in zip(self.yaws, self.lengths, strict=True)]
+        along = np.column_stack([np.cos(turned), np.sin(turned)])
+        lines = _Line(self.ends.mean(axis=1), along, -self.lengths / 2, self.lengths / 2, [])
+        first, second = self._tree.query(_strips(lines, self.gap, self.noise), predicate="intersects")
+        chosen = _Line(lines.at[first], along[first], lines.low[first], lines.high[first], [])
+        on = self._are_on(second, chosen)
+        first, second = first[on], second[on]
+        order = np.lexsort((second, first))
+        return np.split(second[order], np.cumsum(np.bincount(first, minlength=len(self.ends)))[:-1])
+
+    def on(self, line: _Line) -> NDArray[np.int64]:
+        """Return the pieces on a line, in order."""
+        candidates = np.sort(self._tree.query(_strips(line, self.gap, self.noise), predicate="intersects"))
+        return np.asarray(candidates[self._are_on(candidates, line)])
+
+    def _are_on(self, pieces: NDArray[np.int64], line: _Line) -> NDArray[np.bool_]:
+        """Return which pieces are on a line, or each on its own line: within the noise, and the gap from its ends."""
+        c, s = line.along[..., None, 0], line.along[..., None, 1]
+        apart = self.ends[pieces] - line.at[..., None, :]
+        aside = np.abs(apart[..., 1] * c - apart[..., 0] * s).max(axis=1)
+        ahead = apart[..., 0] * c + apart[..., 1] * s
+        turn = self.yaws[pieces] - np.arctan2(line.along[..., 1], line.along[..., 0])
+        turn = np.abs(np.remainder(turn + math.pi / 2, math.pi) - math.pi / 2)
+        is_along = (self.lengths[pieces] <= SHORT) | (turn <= MAX_TURN)
+        is_near = (ahead.min(axis=1) <= line.high + self.gap) & (ahead.max(axis=1) >= line.low - self.gap)
+        return np.asarray((aside <= self.noise) & is_along & is_near)
+
+    def fit(self, members: list[int]) -> _Line:
+        """Fit a line to the ends of pieces, weighted by length."""
+        points = self.ends[members].reshape(-1, 2)
+        weights = np.repeat(self.lengths[members], 2)
+        middle = weights @ points / weights.sum()
+        apart = points - middle
+        (xx, xy), (_, yy) = ((apart * weights[:, None]).T @ apart).tolist()
+        angle = math.atan2(2 * xy, xx - yy) / 2
+        length = float(np.ptp(apart @ np.array([math.cos(angle), math.sin(angle)])))
+        angle = _straightened(angle, length, self.noise, self.main)
+        along = np.array([math.cos(angle), math.sin(angle)])
+        reach = apart @ along
+        return _Line(middle, along, float(reach.min()), float(reach.max()), members)
+
+    def wall(self, line: _Line) -> Box:
+        """Return the wall around the pieces of a line."""
+        across = np.array([-line.along[1], line.along[0]])
+        lengths = self.lengths[line.members]
+        # the usual width, and as much more as the pieces lie beside each other
+        offsets = (self.ends[line.members].mean(axis=1) - line.at) @ across
+        width = float(self.widths[line.members] @ lengths / lengths.sum())
+        width += 2 * math.sqrt(float(offsets**2 @ lengths / lengths.sum()))
+        x, y = (line.at + line.along * (line.low + line.high) / 2).tolist()
+        yaw = (math.atan2(line.along[1], line.along[0]) + math.pi / 2) % math.pi - math.pi / 2
+        return Box(x, y, line.high - line.low, width, yaw)
 
 
 def join_walls(walls: Sequence[Box], noise: float, gap: float, main: Sequence[float] = ()) -> list[Box]:
@@ -60,103 +137,60 @@ def join_walls(walls: Sequence[Box], noise: float, gap: float, main: Sequence[fl
         gap: maximum gap between pieces.
         main: dominant directions, and those across them, in radians.
 
-    Returns walls in the order of their first pieces.
+    Returns walls in the order of their first pieces; a piece that is joined to none is unchanged.
     """
     if len(walls) < 2:
         return list(walls)
-    ends = np.array([_ends(wall) for wall in walls])
-    tree = shapely.STRtree(shapely.linestrings(ends))
+    pieces = _Pieces(walls, noise, gap, main)
+    mates = pieces.mates()
     free = np.ones(len(walls), bool)
     joined: list[tuple[int, Box]] = []
-    lengths = np.array([wall.length for wall in walls])
-    for seed in np.lexsort((np.arange(len(walls)), -lengths)):
+    for seed in np.lexsort((np.arange(len(walls)), -pieces.lengths)).tolist():
         if free[seed]:
             free[seed] = False
-            line = _grow(int(seed), walls, ends, tree, free, noise, gap, main)
-            joined.append((min(line.members), _wall_of(line, walls, ends)))
+            # most are alone: no line is fitted to these
+            new = mates[seed][free[mates[seed]]] if len(mates[seed]) > 1 else mates[seed][:0]
+            line = _grow(seed, new, pieces, free) if len(new) else None
+            joined.append((min(line.members), pieces.wall(line)) if line else (seed, walls[seed]))
     return [wall for _, wall in sorted(joined, key=lambda item: item[0])]
 
 
-def _ends(wall: Box) -> NDArray[np.float64]:
-    half = np.array([math.cos(wall.yaw), math.sin(wall.yaw)]) * wall.length / 2
-    middle = np.array([wall.x, wall.y])
-    return np.stack([middle - half, middle + half])
-
-
-def _grow(
-    seed: int,
-    walls: Sequence[Box],
-    ends: NDArray[np.float64],
-    tree: shapely.STRtree,
-    free: NDArray[np.bool_],
-    noise: float,
-    gap: float,
-    main: Sequence[float],
-) -> _Line:
-    """Join to a piece all free pieces on its line, and mark them as not free."""
-    line = _fit([seed], walls, ends, noise, main)
+def _grow(seed: int, new: NDArray[np.int64], pieces: _Pieces, free: NDArray[np.bool_]) -> _Line:
+    """Join to a piece the new ones, and all free pieces on the line that they make; mark them as not free."""
+    members = [seed]
     for _ in range(MAX_ROUNDS):
-        a, b = (line.at + line.along * s for s in (line.low - gap, line.high + gap))
-        around = shapely.linestrings(np.stack([a, b])).buffer(noise, cap_style="flat")
-        candidates = np.sort(tree.query(around))
-        new = [int(k) for k in candidates if free[k] and _is_on(ends[k], walls[k], line, noise, gap)]
-        if not new:
-            break
         free[new] = False
-        line = _fit([*line.members, *new], walls, ends, noise, main)
+        members = [*members, *new.tolist()]
+        line = pieces.fit(members)
+        new = pieces.on(line)
+        new = new[free[new]]
+        if not len(new):
+            break
     return line
 
 
-def _is_on(ends: NDArray[np.float64], wall: Box, line: _Line, noise: float, gap: float) -> bool:
-    """Return whether a piece is on a line within the noise and no further than the gap from its ends."""
-    across = np.array([-line.along[1], line.along[0]])
-    if np.abs((ends - line.at) @ across).max() > noise:
-        return False
-    turn = abs(math.remainder(wall.yaw - math.atan2(line.along[1], line.along[0]), math.pi))
-    if wall.length > SHORT and turn > MAX_TURN:
-        return False
-    along = (ends - line.at) @ line.along
-    return bool(along.min() <= line.high + gap and along.max() >= line.low - gap)
+def _all_ends(walls: Sequence[Box]) -> NDArray[np.float64]:
+    """Return the ends of the centrelines of walls: float64 [n, 2, 2]."""
+    middle = np.array([(wall.x, wall.y) for wall in walls])
+    half = np.array([(math.cos(wall.yaw) * wall.length / 2, math.sin(wall.yaw) * wall.length / 2) for wall in walls])
+    return np.stack([middle - half, middle + half], axis=1)
 
 
-def _fit(
-    members: list[int], walls: Sequence[Box], ends: NDArray[np.float64], noise: float, main: Sequence[float]
-) -> _Line:
-    """Fit a line to the ends of pieces, weighted by length; along a main direction if only noise is between them."""
-    points = ends[members].reshape(-1, 2)
-    weights = np.repeat([walls[k].length for k in members], 2)
-    middle = np.average(points, axis=0, weights=weights)
-    apart = (points - middle) * weights[:, None]
-    spread = apart.T @ (points - middle)
-    _, vectors = np.linalg.eigh(spread)
-    along = vectors[:, 1]
-    # the sign of an eigenvector is arbitrary
-    along = along if (along[0], along[1]) > (0.0, 0.0) else -along
-    length = float(np.ptp((points - middle) @ along))
+def _strips(line: _Line, gap: float, noise: float) -> Any:
+    """Return the rectangles around lines that pieces on them touch, a little wider than these."""
+    across = np.stack([-line.along[..., 1], line.along[..., 0]], axis=-1) * (noise + ROUNDING)
+    reach = gap + ROUNDING
+    low, high = (line.at + line.along * np.expand_dims(end, -1) for end in (line.low - reach, line.high + reach))
+    return shapely.polygons(np.stack([low - across, high - across, high + across, low + across], axis=-2))
+
+
+def _straightened(angle: float, length: float, noise: float, main: Sequence[float]) -> float:
+    """Return the direction of a line; a main direction if only noise is between them."""
     for direction in main:
-        turn = math.remainder(direction - math.atan2(along[1], along[0]), math.pi / 2)
+        turn = math.remainder(direction - angle, math.pi / 2)
         if abs(turn) <= min(MAX_TURN, noise / max(length, 1.0)):
-            c, s = math.cos(turn), math.sin(turn)
-            along = np.array([c * along[0] - s * along[1], s * along[0] + c * along[1]])
-            break
-    reach = (points - middle) @ along
-    return _Line(middle, along, float(reach.min()), float(reach.max()), members)
-
-
-def _wall_of(line: _Line, walls: Sequence[Box], ends: NDArray[np.float64]) -> Box:
-    """Return the wall around the pieces of a line; a single piece is unchanged."""
-    if len(line.members) == 1:
-        # its own direction covers its cells best
-        return walls[line.members[0]]
-    across = np.array([-line.along[1], line.along[0]])
-    lengths = np.array([walls[k].length for k in line.members])
-    # the usual width, and as much more as the pieces lie beside each other
-    offsets = (ends[line.members].mean(axis=1) - line.at) @ across
-    width = float(np.average([walls[k].width for k in line.members], weights=lengths))
-    width += 2 * float(np.sqrt(np.average(offsets**2, weights=lengths)))
-    middle = line.at + line.along * (line.low + line.high) / 2
-    yaw = (math.atan2(line.along[1], line.along[0]) + math.pi / 2) % math.pi - math.pi / 2
-    return Box(float(middle[0]), float(middle[1]), line.high - line.low, width, yaw)
+            return angle + turn
+    return angle
 
 
 def join_faces(walls: Sequence[Box], free: NDArray[np.bool_], widest: float) -> list[Box]:
@@ -167,18 +201,21 @@ def join_faces(walls: Sequence[Box], free: NDArray[np.bool_], widest: float) -> 
     """
     if len(walls) < 2:
         return list(walls)
-    tree = shapely.STRtree(shapely.linestrings(np.array([_ends(wall) for wall in walls])))
+    ends = _all_ends(walls)
+    tree = shapely.STRtree(shapely.linestrings(ends))
+    apart = ends[:, 1] - ends[:, 0]
+    aside = np.abs(apart[:, ::-1]) * (widest / np.maximum(np.hypot(*apart.T), 1e-9))[:, None]
+    around = shapely.box(*(ends.min(axis=1) - aside).T, *(ends.max(axis=1) + aside).T)
     left: dict[int, Box] = dict(enumerate(walls))
     for k in sorted(left, key=lambda k: (-walls[k].length, k)):
         if k not in left:
             continue
-        around = shapely.linestrings(_ends(walls[k])).buffer(widest, cap_style="flat")
-        for other in np.sort(tree.query(around)):
-            if other != k and int(other) in left:
-                joined = _joined_faces(left[k], left[int(other)], free, widest)
+        for other in np.sort(tree.query(around[k])).tolist():
+            if other != k and other in left:
+                joined = _joined_faces(left[k], left[other], free, widest)
                 if joined is not None:
                     left[k] = joined
-                    del left[int(other)]
+                    del left[other]
     return [left[k] for k in sorted(left)]
 
 
@@ -189,7 +226,7 @@ def _joined_faces(one: Box, other: Box, free: NDArray[np.bool_], widest: float) 
     along = np.array([math.cos(one.yaw), math.sin(one.yaw)])
     across = np.array([-along[1], along[0]])
     middle = np.array([one.x, one.y])
-    ends = (_ends(other) - middle) @ along
+    ends = (_all_ends([other])[0] - middle) @ along
     low, high = float(ends.min()), float(ends.max())
     aside = float((np.array([other.x, other.y]) - middle) @ across)
     width = abs(aside) + (one.width + other.width) / 2

@@ -124,7 +124,7 @@ class Parameters:
     )
 
 
-@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=5)
+@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=6)
 def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Objects from a grid: posts or trees, walls and furniture by shape, with heights of a context.
 

@@ -12,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import DerivationNotes
+from app.derive._centrelines import wall_boxes
 from app.derive._shapes import Box
 from app.derive._walls import fit_arc, join_faces, join_walls
 from app.derive.occupancy_to_objects import Parameters, occupancy_to_objects
@@ -86,6 +87,32 @@ def test_joined_walls_follow_their_line_and_keep_others_apart() -> None:
     assert joined.length == pytest.approx(math.hypot(40, 4) + 8, rel=1e-6)
     assert joined.yaw == pytest.approx(math.atan(0.1))
     assert join_walls(pieces, 2.0, 0.5) == pieces, "the gaps are wider"
+
+
+def test_gap_and_noise_at_their_maximum_are_joined_whatever_is_rounded() -> None:
+    for yaw in np.linspace(-1.5, 1.5, 61).tolist():
+        c, s = math.cos(yaw), math.sin(yaw)
+        places = [(100.0, 0.0), (114.0, 0.0), (100.0, 6.0)]  # a gap of 4 cells; 6 cells aside
+        pieces = [Box(50.0 + c * u - s * v, 50.0 + s * u + c * v, 10.0, 1.0, yaw) for u, v in places]
+        assert len(join_walls(pieces[:2], 2.0, 4.0)) == 1, yaw
+        assert len(join_walls(pieces[::2], 6.0, 4.0)) == 1, yaw
+        assert join_walls(pieces, 5.999, 3.999) == pieces, yaw
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5, 1.2, -0.8])
+def test_wall_is_as_wide_and_long_as_its_cells(yaw: float) -> None:
+    along = np.array([math.cos(yaw), math.sin(yaw)])
+    rows, columns = np.mgrid[0:120, 0:120] + 0.5
+    ahead = (columns - 60) * along[0] + (rows - 55) * along[1]
+    aside = (rows - 55) * along[0] - (columns - 60) * along[1]
+    thin = ((np.abs(ahead) <= 40) & (np.abs(aside) <= 3)).astype(np.uint8)
+    aside_of_line = np.array([-along[1], along[0]])  # the centreline is a cell beside the middle
+    ends = np.array([60.0, 55.0]) - 0.5 + aside_of_line + np.array([[-30.0], [35.0]]) * along
+    (wall,) = wall_boxes(thin, ends[None], 12.0)
+    assert (wall.x, wall.y) == pytest.approx((60.0, 55.0), abs=0.6)
+    assert wall.length == pytest.approx(80.0, abs=1.5)
+    assert wall.width == pytest.approx(6.0, abs=0.8)
+    assert wall.yaw == pytest.approx(yaw)
 
 
 def test_faces_of_a_wall_are_joined_unless_there_is_free_ground_between() -> None:

@@ -77,15 +77,14 @@ class Point:
 
 def judge(case: Case) -> Result:
     """Derive objects and a grid from the picture, and compare them with the labelled points."""
-    pixels = _read(case.file())
-    picture = _picture(case, pixels)
+    picture = read_picture(case)
     layers = Layers({PartKey("imagery", "ground", "satellite"): picture})
     (objects,) = imagery_to_objects(layers, ObjectParameters(), DerivationNotes()).parts.values()
     grid = imagery_to_occupancy(layers, GridParameters(), DerivationNotes()).parts[PartKey("occupancy", "ground", MAP)]
     assert isinstance(objects, Features)
     assert isinstance(grid, OccupancyGrid)
     points = _verdicts(case, picture, objects, grid)
-    return Result(_figures(points), _draw(pixels, picture, grid, points))
+    return Result(_figures(points), _draw(picture, grid, points))
 
 
 def _read(path: Path) -> NDArray[Any]:
@@ -95,8 +94,9 @@ def _read(path: Path) -> NDArray[Any]:
             return np.moveaxis(source.read(), 0, 2)
 
 
-def _picture(case: Case, pixels: NDArray[Any]) -> GeoImage:
-    """Return the picture in metres; what is black in all bands is outside."""
+def read_picture(case: Case) -> GeoImage:
+    """Return the labelled picture in metres; what is black in all bands is outside."""
+    pixels = _read(case.file())
     bands = [str(word) for word in case.labels["bands"]]
     if len(bands) != pixels.shape[2]:
         raise BadLabels(f"{case.path}: bands has {len(bands)} entries, the picture {pixels.shape[2]} bands")
@@ -172,9 +172,9 @@ def _figures(points: list[Point]) -> list[Figure]:
     return figures
 
 
-def _draw(pixels: NDArray[Any], picture: GeoImage, grid: OccupancyGrid, points: list[Point]) -> Image.Image:
+def _draw(picture: GeoImage, grid: OccupancyGrid, points: list[Point]) -> Image.Image:
     """Draw the grid over the picture (free green, occupied red, unknown as it is), and the points by verdict."""
-    size, height = picture.transform[0], picture.pixels.shape[0]
+    pixels, size, height = picture.pixels, picture.transform[0], picture.pixels.shape[0]
     scale = min(1.0, SIDE / max(pixels.shape[:2]))
     shown = Image.fromarray(np.ascontiguousarray(pixels[..., :3])).resize(
         (round(pixels.shape[1] * scale), round(pixels.shape[0] * scale))

@@ -38,17 +38,10 @@ COLOURS = {"free": (150, 220, 150), "wrong": (230, 40, 40), "wall": (20, 60, 200
 def judge(case: Case) -> Result:
     """Fill in the holes; figures are NaN where there is nothing to count, and have no bound then."""
     grid = read_grid(case)
-    draw = np.random.default_rng(case.labels["seed"])
-    valid = grid.cells != UNKNOWN
-    occupied = valid & (grid.cells >= grid.occupied_thresh * OCCUPIED)
-    side = round(HOLE_METRES / grid.resolution)
-    anywhere = draw.choice(np.flatnonzero(valid), TRIES).tolist()
+    valid, occupied = _known(grid)
     sums = dict.fromkeys(("free", "free_right", "wall", "wall_right", "straight", "back", "cells"), 0)
     pictures = []
-    for centres, over_walls in ((anywhere, False), (_along_walls(occupied, side // 2, draw), True)):
-        hole = _holes(valid, side, centres)
-        if not hole.any():
-            continue
+    for hole, over_walls in holes(grid, case.labels["seed"]):
         result = _completed(grid, hole)
         if not (result == grid.cells)[valid & ~hole].all():
             raise AssertionError(f"{case.name}: known cells have changed")
@@ -68,12 +61,33 @@ def read_grid(case: Case) -> OccupancyGrid:
     return grid
 
 
+def _known(grid: OccupancyGrid) -> tuple[Bool, Bool]:
+    """Return the known cells, and the occupied ones."""
+    valid = grid.cells != UNKNOWN
+    return valid, valid & (grid.cells >= grid.occupied_thresh * OCCUPIED)
+
+
+def holes(grid: OccupancyGrid, seed: int) -> list[tuple[Bool, bool]]:
+    """Return masks of holes, one of holes anywhere and one of holes over walls, and whether they are over walls."""
+    draw = np.random.default_rng(seed)
+    valid, occupied = _known(grid)
+    side = round(HOLE_METRES / grid.resolution)
+    anywhere = _holes(valid, side, draw.choice(np.flatnonzero(valid), TRIES).tolist())
+    over_walls = _holes(valid, side, _along_walls(occupied, side // 2, draw))
+    return [(hole, over) for hole, over in ((anywhere, False), (over_walls, True)) if hole.any()]
+
+
+def cut(grid: OccupancyGrid, hole: Bool) -> OccupancyGrid:
+    """Return the grid with unknown cells in a hole."""
+    return OccupancyGrid(np.where(hole, UNKNOWN, grid.cells).astype(np.uint8), grid.resolution)
+
+
 def _completed(grid: OccupancyGrid, hole: Bool) -> NDArray[np.uint8]:
-    cut = OccupancyGrid(np.where(hole, UNKNOWN, grid.cells).astype(np.uint8), grid.resolution)
+    damaged = cut(grid, hole)
     try:
-        return generate.run("complete_grid", 7, {}, Layers({KEY: cut}), DerivationNotes()).grids()[KEY].cells
+        return generate.run("complete_grid", 7, {}, Layers({KEY: damaged}), DerivationNotes()).grids()[KEY].cells
     except CannotGenerate:  # nothing is certain: all stays unknown
-        return cut.cells
+        return damaged.cells
 
 
 def _masks(result: NDArray[np.uint8], hole: Bool, valid: Bool, occupied: Bool, *, over_walls: bool) -> dict[str, Bool]:

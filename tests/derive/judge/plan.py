@@ -43,16 +43,12 @@ Line = tuple[float, NDArray[np.float64]]
 def judge(case: Case) -> Result:
     """Derive a grid from a labelled plan and compare it with its walls, floors and outside."""
     try:
-        path = case.file()
+        picture = read_picture(case)
     except BadLabels:
         if "source" not in case.labels:
             raise
         return Result([Figure(f"not measured: get {case.labels['map']} from {case.labels['source']}", float("nan"))])
-    with Image.open(path) as image:
-        pixels = np.array(image if image.mode in ("L", "LA", "RGB", "RGBA") else image.convert("RGBA"))
-    pixels = pixels.reshape(*pixels.shape[:2], -1)
-    size = float(case.labels["metres_per_pixel"])
-    picture = GeoImage(pixels, (size, 0.0, 0.0, 0.0, -size, 0.0))
+    pixels, size = picture.pixels, picture.transform[0]
     derived = imagery_to_occupancy(
         Layers({PartKey("imagery", "ground", "plan"): picture}), Parameters(), DerivationNotes()
     )
@@ -61,6 +57,14 @@ def judge(case: Case) -> Result:
     value = _values(grid, pixels.shape[:2], size)
     walls, unclear = _labels(case, pixels.shape[:2], size)
     return Result(_figures(case, value, walls, unclear, size), _picture(pixels, value, walls, unclear))
+
+
+def read_picture(case: Case) -> GeoImage:
+    """Return the labelled plan in metres, its upper left corner at the origin."""
+    with Image.open(case.file()) as image:
+        pixels = np.array(image if image.mode in ("L", "LA", "RGB", "RGBA") else image.convert("RGBA"))
+    size = float(case.labels["metres_per_pixel"])
+    return GeoImage(pixels.reshape(*pixels.shape[:2], -1), (size, 0.0, 0.0, 0.0, -size, 0.0))
 
 
 def _values(grid: OccupancyGrid, shape: tuple[int, int], size: float) -> NDArray[np.uint8]:

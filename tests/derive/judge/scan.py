@@ -40,13 +40,8 @@ Row = tuple[Any, Any]
 
 def judge(case: Case) -> Result:
     """Derive objects from a labelled grid and compare its walls with those that a person drew."""
-    with Image.open(case.file()) as image:
-        grey = np.array(image.convert("L"))
-    size = float(case.labels["resolution"])
-    cells = np.full(grey.shape, FREE, np.uint8)
-    cells[grey < 100] = OCCUPIED
-    cells[grey == 205] = UNKNOWN
-    grid = OccupancyGrid(np.ascontiguousarray(cells[::-1]), size, (0.0, 0.0, 0.0))
+    grey, grid = read_grid(case)
+    size = grid.resolution
     derived = occupancy_to_objects(Layers({PartKey("occupancy", "ground", MAP): grid}), Parameters(), DerivationNotes())
     (part,) = derived.parts.values()
     assert isinstance(part, Features)
@@ -68,6 +63,16 @@ def judge(case: Case) -> Result:
         *_places(case, rows, size, height),
     ]
     return Result(figures, _picture(grey, rows, labelled, size))
+
+
+def read_grid(case: Case) -> tuple[NDArray[np.uint8], OccupancyGrid]:
+    """Return the labelled picture, and the grid that it shows."""
+    with Image.open(case.file()) as image:
+        grey = np.array(image.convert("L"))
+    cells = np.full(grey.shape, FREE, np.uint8)
+    cells[grey < 100] = OCCUPIED
+    cells[grey == 205] = UNKNOWN
+    return grey, OccupancyGrid(np.ascontiguousarray(cells[::-1]), float(case.labels["resolution"]), (0.0, 0.0, 0.0))
 
 
 def _to_metres(line: Any, size: float, height: float) -> Any:
