@@ -140,9 +140,37 @@ def spanner(count: int, edges: I64, length: F64, wanted: I64, straight: F64, det
             used += 2
 
 
+@native
+def pieces(edges: I64, out: I64) -> int:
+    """Compute the connected piece of each node, numbered by their first nodes; return the number of pieces.
+
+    edges: [m, 2]. out: [number of nodes]. The root of a piece is its first node.
+    """
+    for k in range(len(out)):
+        out[k] = k
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        while out[a] != a:
+            out[a] = out[out[a]]
+            a = out[a]
+        while out[b] != b:
+            out[b] = out[out[b]]
+            b = out[b]
+        out[max(a, b)] = min(a, b)
+    count = 0
+    for k in range(len(out)):
+        if out[k] == k:
+            out[k] = count
+            count += 1
+        else:  # the parent is an earlier node, so it has the number of its piece already
+            out[k] = out[out[k]]
+    return count
+
+
 def compile_all() -> None:
     """Compile all kernels: call each one once on a tiny graph."""
     pairs, lengths = np.array([[0, 1]], np.int64), np.ones(1)
+    pieces(pairs, np.zeros(2, np.int64))
     spanner(2, pairs, lengths, pairs, lengths, 1.5, np.zeros(1, np.uint8))
     mask, at = np.ones((3, 3), np.uint8), np.arange(3)
     meeting(mask, 1, 1, 0.0, 1.0, pairs)

@@ -124,9 +124,8 @@ def skeleton(
     along = line[1:] == line[:-1]
     pairs = np.stack([corner[:-1][along], corner[1:][along]], axis=1)
     used = np.unique(np.concatenate([corner, lone]))
-    edges = np.sort(np.searchsorted(used, pairs), axis=1)
-    edges = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0)
-    graph = Graph(cells[used].astype(np.int64), edges.astype(np.int64))
+    edges = distinct_pairs(np.searchsorted(used, pairs).astype(np.int64))
+    graph = Graph(cells[used].astype(np.int64), edges)
     return drop_islands(graph, free_space, island)
 
 
@@ -194,17 +193,11 @@ def drop_islands(graph: Graph, free_space: FreeSpace, island: float) -> tuple[Gr
 
 
 def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
-    """Return the number of connected pieces of a graph, and the piece of each node."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    """Return the number of connected pieces of a graph, and the piece of each node, numbered by their first nodes."""
+    from app.derive import _kernels_roadmap as kernels
 
-    n = len(graph.nodes)
-    if not n:
-        return 0, np.empty(0, np.int64)
-    ones = np.ones(len(graph.edges), np.uint8)
-    links = coo_array((ones, (graph.edges[:, 0], graph.edges[:, 1])), (n, n))
-    count, piece = connected_components(links, directed=False)
-    return int(count), piece.astype(np.int64)
+    piece = np.empty(len(graph.nodes), np.int64)
+    return int(kernels.pieces(graph.edges, piece)), piece
 
 
 def subgraph(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
@@ -213,19 +206,21 @@ def subgraph(graph: Graph, mask: NDArray[np.bool_]) -> Graph:
     return Graph(graph.nodes[mask], place[graph.edges[mask[graph.edges[:, 0]]]])
 
 
-def add_edges(graph: Graph, free_space: FreeSpace, cells: NDArray[np.int64], detour: float, longest: float) -> Graph:
-    """Add nodes at these cells, and straight edges up to ``longest`` cells that avoid a detour.
+NEIGHBOURS = 32
+"""Maximum number of nearest nodes that a node is paired with for edges in open ground: bounds time and memory."""
 
-    Of the collision-free lines of a Delaunay triangulation of all nodes, those are added without which the path between
+
+def add_edges(graph: Graph, free_space: FreeSpace, cells: NDArray[np.int64], detour: float, longest: float) -> Graph:
+    """Add nodes at these cells, and straight edges shorter than ``longest`` cells that avoid a detour.
+
+    Of the collision-free lines between all nodes and their nearest ones, those are added without which the path between
     their ends would be more than ``detour`` times as long. Nodes that no line joins to the graph are left out.
     """
     from app.derive import _kernels_roadmap as kernels
 
     node_count = len(graph.nodes)
     nodes = np.concatenate([graph.nodes, cells])
-    pairs = _triangulate(nodes)
-    pairs = pairs[lengths(nodes, pairs) <= longest]
-    pairs = drop_blocked(pairs, nodes, free_space)
+    pairs = drop_blocked(near_pairs(nodes, longest, NEIGHBOURS), nodes, free_space)
     straight = lengths(nodes, pairs)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], straight))
     pairs, straight = pairs[order], straight[order]
@@ -250,10 +245,34 @@ def drop_blocked(pairs: NDArray[np.int64], nodes: NDArray[np.int64], free_space:
 
 def tidy(nodes: NDArray[np.int64], edges: NDArray[np.int64]) -> Graph:
     """Sort nodes by row and column, merge equal ones, and keep each edge once."""
-    distinct, place = np.unique(nodes, axis=0, return_inverse=True)
-    linked = np.sort(place.reshape(-1)[edges], axis=1)
-    linked = np.unique(linked[linked[:, 0] != linked[:, 1]], axis=0)
-    return Graph(distinct, linked)
+    distinct, place = _distinct(nodes)
+    return Graph(distinct, distinct_pairs(place[edges]))
+
+
+def distinct_pairs(pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return pairs of two nodes sorted, each once."""
+    return _distinct(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1))[0]
+
+
+def _distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the distinct rows ([n, 2], from 0 to 2^31) sorted, and the index of each row among them.
+
+    One number for each row: np.unique of rows takes several times as long on few of them.
+    """
+    base = int(rows[:, 1].max(initial=0)) + 1
+    numbers, place = np.unique(rows[:, 0] * base + rows[:, 1], return_inverse=True)
+    return np.stack(np.divmod(numbers, base), axis=1), place
+
+
+def near_pairs(nodes: NDArray[np.int64], distance: float, count: int) -> NDArray[np.int64]:
+    """Return the pairs of each node and its ``count`` nearest ones less than ``distance`` away, each pair once."""
+    from scipy.spatial import cKDTree
+
+    if len(nodes) < 2:
+        return np.empty((0, 2), np.int64)
+    away, near = cKDTree(nodes).query(nodes, k=min(count + 1, len(nodes)), distance_upper_bound=distance)
+    node, place = np.nonzero(np.isfinite(away))
+    return distinct_pairs(np.stack([node, near[node, place]], axis=1).astype(np.int64))
 
 
 def lengths(nodes: NDArray[np.int64], pairs: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -282,15 +301,3 @@ def divide_edges(graph: Graph, free_space: FreeSpace, spacing: float) -> Graph:
     cells = ends.reshape(-1, 2, 2)[~undivided[edge]].reshape(-1, 2)
     divided = np.arange(len(cells), dtype=np.int64).reshape(-1, 2) + len(graph.nodes)
     return tidy(np.concatenate([graph.nodes, cells]), np.concatenate([graph.edges[undivided], divided]))
-
-
-def _triangulate(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the edges of a Delaunay triangulation; none if all nodes are collinear."""
-    from scipy.spatial import Delaunay, QhullError
-
-    try:
-        corners = Delaunay(nodes).simplices
-    except (QhullError, ValueError):
-        return np.empty((0, 2), np.int64)
-    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [0, 2]]])
-    return np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from app.derive._skeleton import FreeSpace, Graph, add_edges, lengths, tidy
+from app.derive._skeleton import FreeSpace, Graph, add_edges, lengths, near_pairs, tidy
 
 ROUNDS = 8
 """Maximum number of times that all close pairs are looked at: merged nodes may be close to others."""
@@ -35,7 +35,7 @@ def merge_close(graph: Graph, free_space: FreeSpace, *, distance: float, island:
     for _ in range(ROUNDS):
         pairs = [
             (a, b)
-            for a, b in _shortest_first(graph, _close_pairs(graph, distance))
+            for a, b in _shortest_first(graph, near_pairs(graph.nodes, distance * (1.0 - 1e-9), NEAREST))
             if tuple(graph.nodes[a]) in changed or tuple(graph.nodes[b]) in changed
         ]
         if not pairs:
@@ -46,19 +46,6 @@ def merge_close(graph: Graph, free_space: FreeSpace, *, distance: float, island:
         graph, changed = merging.graph(), merging.changed
         dropped += merging.pieces
     return graph, dropped
-
-
-def _close_pairs(graph: Graph, distance: float) -> NDArray[np.int64]:
-    """Return the pairs of each node and its nearest ones less than ``distance`` away, at most NEAREST of them."""
-    from scipy.spatial import cKDTree
-
-    if len(graph.nodes) < 2:
-        return np.empty((0, 2), np.int64)
-    count = min(NEAREST + 1, len(graph.nodes))
-    away, near = cKDTree(graph.nodes).query(graph.nodes, k=count, distance_upper_bound=distance * (1.0 - 1e-9))
-    node, place = np.nonzero(np.isfinite(away))
-    pairs = np.sort(np.stack([node, near[node, place]], axis=1), axis=1).astype(np.int64)
-    return np.asarray(np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0))
 
 
 def thin_out(graph: Graph, free_space: FreeSpace, *, share: float, radius: float, tolerance: float) -> Graph:

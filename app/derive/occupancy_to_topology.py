@@ -130,7 +130,7 @@ class Parameters:
     seed: int = parameter(0, "roadmap: seed of the samples", minimum=0, maximum=2**31 - 1)
 
 
-@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0, version=2, also=frozenset({"zones"}))
+@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0, version=3, also=frozenset({"zones"}))
 def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of nodes and directed edges along the paths through a grid's free space.
 

@@ -97,7 +97,7 @@ class ForestOptions(SiteOptions):
 
 
 @generates(
-    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"}, version=2
+    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"}, version=3
 )
 def cave(given: Layers, options: CaveOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Cave: halls and passages in rock, grown by a cellular automaton."""
@@ -105,7 +105,7 @@ def cave(given: Layers, options: CaveOptions, source: RandomSource, notes: Deriv
 
 
 @generates(
-    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"}, version=2
+    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"}, version=3
 )
 def cluttered_hall(given: Layers, options: HallOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Hall full of clutter, heaped up by a cellular automaton."""
@@ -113,7 +113,7 @@ def cluttered_hall(given: Layers, options: HallOptions, source: RandomSource, no
 
 
 @generates(
-    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"}, version=2
+    {"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"}, version=3
 )
 def forest(given: Layers, options: ForestOptions, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Forest: trees with trunks and crowns, and clearings, from a cellular automaton."""

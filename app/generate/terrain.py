@@ -75,7 +75,7 @@ class Options(SiteOptions):
     {"location", "objects", "occupancy", "topology", "imagery", "resources"},
     parameters=Options,
     also={"location"},
-    version=2,
+    version=3,
 )
 def terrain(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Hilly ground with woods: a height map for Gazebo, trees, and a grid of slope costs."""

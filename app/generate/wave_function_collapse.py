@@ -134,7 +134,7 @@ class Options(SiteOptions):
     {"location", "objects", "occupancy", "topology", "imagery"},
     parameters=Options,
     also={"location", "occupancy"},
-    version=3,
+    version=4,
 )
 def wave_function_collapse(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Site by wave-function collapse, in which every window occurs in a sample.

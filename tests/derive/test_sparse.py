@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import networkx as nx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from app.derive import DerivationNotes
+from app.derive import DerivationNotes, _skeleton
 from app.generate import run
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED
@@ -81,6 +83,66 @@ def test_open_ground_gets_few_nodes() -> None:
     small = np.full((30, 30), FREE)
     small[[0, -1]], small[:, [0, -1]] = OCCUPIED, OCCUPIED
     assert len(derived(grid(small)).select_kinds("edge")) >= 2, "a room smaller than reach has an edge, too"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nodes_that_see_each_other_have_a_short_path(seed: int) -> None:
+    """Every pair within reach in a hall with pillars, by brute force; a triangulation has longer paths between some."""
+    random = np.random.default_rng(seed)
+    mask = np.zeros((202, 202), np.uint8)
+    mask[1:-1, 1:-1] = 1
+    for y, x in random.integers(10, 190, (12, 2)):
+        mask[y : y + 6, x : x + 6] = 0
+    at = random.permutation(np.argwhere(mask))[:40]
+    space = _skeleton.space(mask.copy(), 0, 0, 0.0)
+    graph = _skeleton.add_edges(_skeleton.Graph(at[:1], np.empty((0, 2), np.int64)), space, at[1:], 1.25, 80.0)
+    assert len(graph.nodes) == 40
+    assert len(graph.edges) < 40 * 3
+    network = nx.Graph()
+    for a, b in graph.edges.tolist():
+        network.add_edge(a, b, weight=float(np.hypot(*(graph.nodes[a] - graph.nodes[b]))))
+    paths = dict(nx.all_pairs_dijkstra_path_length(network))
+    compared = 0
+    for a, b in combinations(range(40), 2):
+        straight = float(np.hypot(*(graph.nodes[a] - graph.nodes[b])))
+        share = np.linspace(0.0, 1.0, 2000)[:, None]
+        line = np.rint(graph.nodes[a] + (graph.nodes[b] - graph.nodes[a]) * share).astype(np.int64)
+        near = ndimage.minimum_filter(mask, 3)[line[:, 0], line[:, 1]].all()  # a line that only touches is left out
+        if straight < 80.0 and near:
+            compared += 1
+            assert paths[a][b] <= 1.25 * straight + 1e-9, (a, b)
+    assert compared > 100
+
+
+def test_nearest_pairs_and_pieces_are_those_of_brute_force() -> None:
+    random = np.random.default_rng(5)
+    for count in (0, 1, 2, 3, 50):
+        at = np.unique(random.integers(0, 2**31 if count == 3 else 60, (count, 2)), axis=0)
+        away = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1)) if count else np.empty((0, 0))
+        expected = {
+            (min(a, b), max(a, b))
+            for a in range(len(at))
+            for b in range(len(at))
+            if a != b and away[a, b] < 20.0 and (away[a] < away[a, b]).sum() <= 4
+        }
+        pairs = _skeleton.near_pairs(at, 20.0, 4)
+        assert {*map(tuple, pairs.tolist())} <= expected
+        distinct = {(a, b) for a, b in expected if (away[a] == away[a, b]).sum() == (away[b] == away[a, b]).sum() == 1}
+        assert {*map(tuple, pairs.tolist())} >= distinct
+        graph = nx.Graph(pairs.tolist())
+        graph.add_nodes_from(range(len(at)))
+        number, piece = _skeleton.pieces(_skeleton.Graph(at, pairs))
+        parts = sorted(nx.connected_components(graph), key=min)
+        assert number == len(parts)
+        assert piece.tolist() == [next(k for k, part in enumerate(parts) if node in part) for node in range(len(at))]
+
+
+def test_equal_nodes_become_one_and_edges_are_kept_once() -> None:
+    last = 2**31 - 2
+    nodes = np.array([[5, last], [0, 3], [5, last], [last, 0]])
+    graph = _skeleton.tidy(nodes, np.array([[0, 1], [1, 2], [0, 2], [3, 1]]))
+    assert graph.nodes.tolist() == [[0, 3], [5, last], [last, 0]]
+    assert graph.edges.tolist() == [[0, 1], [0, 2]]
 
 
 def test_lines_stay_in_the_middle_of_aisles() -> None:
