@@ -124,11 +124,17 @@ def read_drawing(rgb: NDArray[np.uint8], grey: NDArray[np.uint8], ink: Mask, siz
     return Drawing(walls, kept & ~walls, others | symbols, thick, count, is_thick=is_thick, tinted=tinted)
 
 
-def chroma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the difference between the strongest and the weakest channel: uint8 [...]."""
+def extremes(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the weakest and the strongest channel: uint8 [...] each."""
     # channel by channel: numpy is slow along a short last axis
     r, g, b = (rgb[..., k] for k in range(3)) if rgb.shape[-1] == 3 else (rgb[..., 0],) * 3
-    return np.asarray(np.maximum(np.maximum(r, g), b) - np.minimum(np.minimum(r, g), b))
+    return np.minimum(np.minimum(r, g), b), np.maximum(np.maximum(r, g), b)
+
+
+def chroma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the difference between the strongest and the weakest channel: uint8 [...]."""
+    low, high = extremes(rgb)
+    return np.asarray(high - low)
 
 
 def even_ground(grey: NDArray[np.uint8]) -> Mask:
