@@ -119,9 +119,10 @@ def plan_to_grid(
     is a multiple of a cell. Raises CannotConvert for an image without ink or without a closed room.
     """
     rgb = to_rgb(picture)
-    grey = _luma(rgb)
+    grey, tone = _luma(rgb), chroma(rgb)
+    del rgb  # a third of the memory of a large plan
     ink, level = _ink(grey, name)
-    unknown = _ros_unknown(rgb, grey, level, notes, name)
+    unknown = _ros_unknown(tone, grey, level, notes, name)
     a, b, _, d, e, _ = picture.transform
     size = math.sqrt(abs(a * e - b * d))
     if size > MAX_PIXEL_METRES:
@@ -131,7 +132,7 @@ def plan_to_grid(
         )
     frame = _frame(picture, how.resolution or max(RESOLUTION, float(f"{size:.6g}")), name)
     has_unknown = bool(unknown.any())
-    drawing = plain_drawing(ink, size) if has_unknown else read_drawing(rgb, grey, ink, size)
+    drawing = plain_drawing(ink, size) if has_unknown else read_drawing(tone, grey, ink, size)
     notes.drop(
         "symbols", drawing.count, f"{name}: letters, icons and furniture apart from walls are unknown, not walls"
     )
@@ -226,17 +227,17 @@ def _drop_far(
 
 
 def _ros_unknown(
-    rgb: NDArray[np.uint8], grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: str
+    tone: NDArray[np.uint8], grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: str
 ) -> NDArray[np.bool_]:
     """Mark the grey of a ROS map that means unknown: an even grey that surrounds the map, or the one of map_saver.
 
-    Other plans have no such grey, whatever the shade of their rooms.
+    Other plans have no such grey, whatever the shade of their rooms. tone: chroma.
     """
     counts = np.bincount(grey.ravel(), minlength=256)
     shades = np.argsort(counts, kind="stable")[::-1][:3]
     bright = [int(k) for k in shades if k > level and counts[k] >= SHADE * grey.size]
     few = len(bright) > 1 and counts[shades].sum() >= ROS_LEVELS * grey.size
-    if not few or (chroma(rgb) == 0).mean() < ROS_LEVELS:
+    if not few or (tone == 0).mean() < ROS_LEVELS:
         return np.zeros(grey.shape, bool)
     shade, paper = min(bright), max(bright)
     edge = np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])
