@@ -18,7 +18,7 @@ STEP = 0.25
 MAX_SAMPLES = 64
 """Maximum number of positions along a wall at which its width is sampled."""
 
-BATCH = 2**20
+BATCH = 2**12
 """Number of positions that are looked up together."""
 
 

@@ -244,10 +244,10 @@ def _remains(left: NDArray[np.uint8]) -> list[Any]:
     from app.derive.imagery_to_objects import polygons
 
     count, label = cv2.connectedComponents(cv2.dilate(left, np.ones((3, 3), np.uint8)), connectivity=8)
-    label = np.where(left == 1, label, 0)
-    single = np.bincount(label.ravel(), minlength=count) < 2
+    label[left == 0] = 0
+    single = np.bincount(label[left == 1], minlength=count) < 2
     label[single[label]] = 0
-    areas = polygons(label.astype(np.int32), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0) if label.any() else {}
+    areas = polygons(label.astype(np.int32, copy=False), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), 0.0) if label.any() else {}
     return [area for _, area in sorted(areas.items())]
 
 

@@ -109,11 +109,14 @@ def plain_drawing(ink: Mask, size: float) -> Drawing:
     return Drawing(ink, none, none, _thick(ink, size), 0, is_thick=False, tinted=False)
 
 
-def read_drawing(rgb: NDArray[np.uint8], grey: NDArray[np.uint8], ink: Mask, size: float) -> Drawing:
-    """Divide the ink of a plan. ink: what is darker than paper as a whole; size: metres per pixel."""
+def read_drawing(tone: NDArray[np.uint8], grey: NDArray[np.uint8], ink: Mask, size: float) -> Drawing:
+    """Divide the ink of a plan.
+
+    tone: chroma, uint8 [h, w]. ink: what is darker than paper as a whole. size: metres per pixel.
+    """
     tinted = is_tinted(grey, ink)
     # among tinted rooms a coloured outline may be a wall
-    ink, others = _tinted_ink(grey, size) if tinted else _drop_marks(rgb, ink)
+    ink, others = _tinted_ink(grey, size) if tinted else _drop_marks(tone, ink)
     thick = _thick(ink, size)
     is_thick = bool(ink.any()) and float(thick.sum()) >= THICK * float(ink.sum())
     width = _wall_width(thick) if is_thick else 0.0
@@ -124,11 +127,17 @@ def read_drawing(rgb: NDArray[np.uint8], grey: NDArray[np.uint8], ink: Mask, siz
     return Drawing(walls, kept & ~walls, others | symbols, thick, count, is_thick=is_thick, tinted=tinted)
 
 
-def chroma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the difference between the strongest and the weakest channel: uint8 [...]."""
+def extremes(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the weakest and the strongest channel: uint8 [...] each."""
     # channel by channel: numpy is slow along a short last axis
     r, g, b = (rgb[..., k] for k in range(3)) if rgb.shape[-1] == 3 else (rgb[..., 0],) * 3
-    return np.asarray(np.maximum(np.maximum(r, g), b) - np.minimum(np.minimum(r, g), b))
+    return np.minimum(np.minimum(r, g), b), np.maximum(np.maximum(r, g), b)
+
+
+def chroma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the difference between the strongest and the weakest channel: uint8 [...]."""
+    low, high = extremes(rgb)
+    return np.asarray(high - low)
 
 
 def even_ground(grey: NDArray[np.uint8]) -> Mask:
@@ -169,15 +178,13 @@ def _tinted_ink(grey: NDArray[np.uint8], size: float) -> tuple[Mask, Mask]:
     return ink, (ground < dark) | ((grey < dark) & ~ink)
 
 
-def _drop_marks(rgb: NDArray[np.uint8], ink: Mask) -> tuple[Mask, Mask]:
+def _drop_marks(tone: NDArray[np.uint8], ink: Mask) -> tuple[Mask, Mask]:
     """Divide ink into (the main ink, coloured ink on a plan in black or grey)."""
     import cv2
 
     if not ink.any():
         return ink, np.zeros_like(ink)
-    coloured = np.zeros_like(ink)
-    drawn = rgb[ink]
-    coloured[ink] = chroma(drawn) > CHROMA
+    coloured = ink & (tone > CHROMA)
     if not coloured.any() or float(coloured.sum()) > (1 - NEUTRAL) * float(ink.sum()):
         return ink, np.zeros_like(ink)
     # blended pixels around a coloured line belong to it, unless they touch black ink
@@ -196,7 +203,7 @@ def _drop_symbols(ink: Mask, windows: Mask, width: float, size: float) -> tuple[
     """
     import cv2
 
-    _, label, stats, _ = cv2.connectedComponentsWithStats(ink.astype(np.uint8), connectivity=8)
+    _, label, stats, _ = cv2.connectedComponentsWithStats(ink.view(np.uint8), connectivity=8)
     sides = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]] * size
     short = sides.max(axis=1) <= SYMBOL_METRES
     short[0] = False
@@ -205,7 +212,10 @@ def _drop_symbols(ink: Mask, windows: Mask, width: float, size: float) -> tuple[
         short &= ~piers
         ink, windows = ink | (windows & ~panes), panes
         label = np.where(windows, 0, label)
-    separate = short[label] | (ink & (label == 0))
+    separate = short[label]
+    if windows.any():
+        separate |= ink & (label == 0)
+    del label  # four bytes for each pixel
     contours, _ = cv2.findContours(separate.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     outlines = [contour for contour in contours if not _is_wall_piece(contour, separate, size)]
     filled = np.zeros(ink.shape, np.uint8)

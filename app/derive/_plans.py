@@ -21,6 +21,7 @@ from app.derive._plan_ink import (
     Drawing,
     chroma,
     even_ground,
+    extremes,
     plain_drawing,
     read_drawing,
 )
@@ -81,13 +82,13 @@ def looks_like_plan(rgb: NDArray[np.uint8], valid: NDArray[np.bool_]) -> bool:
     """
     if not valid.any():
         return False
-    pixels = rgb[valid]
-    grey = pixels.max(axis=1)
+    low, high = extremes(rgb)
+    low, grey = low[valid], high[valid]
     # require ink, too: a bright field with nothing darker in it is no floor plan
-    if not (pixels.min(axis=1) < 128).any():
+    if not (low < 128).any():
         return False
-    if float((chroma(pixels) > CHROMA).mean()) > COLOURFUL:
-        return float(np.median(grey)) >= BRIGHT and float(even_ground(rgb.max(axis=2))[valid].mean()) >= FLAT
+    if float((grey - low > CHROMA).mean()) > COLOURFUL:
+        return float(np.median(grey)) >= BRIGHT and float(even_ground(high)[valid].mean()) >= FLAT
     counts = np.bincount(grey, minlength=256)
     around = np.convolve(counts, np.ones(17, np.int64), "same")
     return bool(around[180:].max() >= PAPER * len(grey)) and bool((grey < 128).any())
@@ -97,7 +98,7 @@ def to_rgb(picture: GeoImage) -> NDArray[np.uint8]:
     """Return the image in colours on white paper: uint8 [h, w, 3]."""
     shown = display_pixels(picture)
     rgb = shown[..., :3] if shown.shape[2] >= 3 else np.repeat(shown[..., :1], 3, axis=2)
-    if shown.shape[2] in (2, 4):
+    if shown.shape[2] in (2, 4) and (shown[..., -1] < 255).any():
         alpha = shown[..., -1:].astype(np.uint16)
         rgb = ((rgb.astype(np.uint16) * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
     return np.ascontiguousarray(rgb)
@@ -118,9 +119,10 @@ def plan_to_grid(
     is a multiple of a cell. Raises CannotConvert for an image without ink or without a closed room.
     """
     rgb = to_rgb(picture)
-    grey = _luma(rgb)
+    grey, tone = _luma(rgb), chroma(rgb)
+    del rgb  # a third of the memory of a large plan
     ink, level = _ink(grey, name)
-    unknown = _ros_unknown(rgb, grey, level, notes, name)
+    unknown = _ros_unknown(tone, grey, level, notes, name)
     a, b, _, d, e, _ = picture.transform
     size = math.sqrt(abs(a * e - b * d))
     if size > MAX_PIXEL_METRES:
@@ -130,7 +132,7 @@ def plan_to_grid(
         )
     frame = _frame(picture, how.resolution or max(RESOLUTION, float(f"{size:.6g}")), name)
     has_unknown = bool(unknown.any())
-    drawing = plain_drawing(ink, size) if has_unknown else read_drawing(rgb, grey, ink, size)
+    drawing = plain_drawing(ink, size) if has_unknown else read_drawing(tone, grey, ink, size)
     notes.drop(
         "symbols", drawing.count, f"{name}: letters, icons and furniture apart from walls are unknown, not walls"
     )
@@ -225,17 +227,17 @@ def _drop_far(
 
 
 def _ros_unknown(
-    rgb: NDArray[np.uint8], grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: str
+    tone: NDArray[np.uint8], grey: NDArray[np.uint8], level: int, notes: DerivationNotes, name: str
 ) -> NDArray[np.bool_]:
     """Mark the grey of a ROS map that means unknown: an even grey that surrounds the map, or the one of map_saver.
 
-    Other plans have no such grey, whatever the shade of their rooms.
+    Other plans have no such grey, whatever the shade of their rooms. tone: chroma.
     """
     counts = np.bincount(grey.ravel(), minlength=256)
     shades = np.argsort(counts, kind="stable")[::-1][:3]
     bright = [int(k) for k in shades if k > level and counts[k] >= SHADE * grey.size]
     few = len(bright) > 1 and counts[shades].sum() >= ROS_LEVELS * grey.size
-    if not few or (chroma(rgb) == 0).mean() < ROS_LEVELS:
+    if not few or (tone == 0).mean() < ROS_LEVELS:
         return np.zeros(grey.shape, bool)
     shade, paper = min(bright), max(bright)
     edge = np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])
@@ -257,9 +259,9 @@ def _walls(ink: NDArray[np.bool_], picture: GeoImage, frame: RasterFrame, size: 
     """
     walls = np.zeros((frame.height, frame.width), np.uint8)
     if size <= frame.resolution * 1.5:
-        rows, columns = np.nonzero(ink)
-        for k in range(0, len(rows), 2**20):
-            u, v = (np.asarray(n[k : k + 2**20], np.float64) + 0.5 for n in (columns, rows))
+        pixels = np.flatnonzero(ink)  # numpy is slow with two axes
+        for k in range(0, len(pixels), 2**20):
+            v, u = (n.astype(np.float64) + 0.5 for n in np.divmod(pixels[k : k + 2**20], ink.shape[1]))
             at = pixel_positions(picture.transform, u, v)
             x, y = np.floor(frame.to_cells(at)).astype(np.int64).T
             walls[np.clip(y, 0, frame.height - 1), np.clip(x, 0, frame.width - 1)] = 1
