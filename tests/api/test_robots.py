@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from app.errors import Unavailable
-from tests.api.conftest import Api
+from tests.api.conftest import Api, running, settings_for
 
 
 def status(env: str, root: str, state: str = "active", **more: Any) -> dict[str, Any]:
@@ -43,6 +44,23 @@ def test_robot_reports_its_status(api: Api, farm: str) -> None:
     assert api.get(f"robots?environment={farm}&channel=staging").json() == []
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
     assert api.get(f"robots/mower-1?environment={farm}").json()["lag"]["events"] == 0
+
+
+def test_operator_limits_the_robots_of_an_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEETMAP_MAX_ROBOTS", "2")
+    with running(settings_for(tmp_path)) as api:
+        for name in ("farm", "garden"):
+            api.post("environments", {"name": name})
+        body = status("farm", "a" * 64)
+        for robot in ("r1", "r2", "r1"):
+            api("PUT", f"robots/{robot}/status", 200, json=body)
+        problem = api("PUT", "robots/r3/status", 409, json=body).json()
+        assert problem["type"].endswith("conflict")
+        assert problem["detail"] == "farm has 2 robots: remove robots that no longer exist, or raise the limit"
+        assert {robot["robot"] for robot in api.get("robots?environment=farm").json()} == {"r1", "r2"}
+        api("PUT", "robots/r3/status", 200, json={**body, "environment": "garden"})
+        api("DELETE", "robots/r2?environment=farm", 204)
+        api("PUT", "robots/r3/status", 200, json=body)
 
 
 def test_concurrent_reports_share_transactions(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
