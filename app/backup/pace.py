@@ -1,40 +1,56 @@
-"""Rests of a backup while other programs want the processors.
+"""Rests of a backup while other programs use the processors.
 
-A low priority is not enough: a server's thread that wakes up waits for the end of the backup's time slice (some
-milliseconds since Linux 6.6), dozens of times in one commit, and caches are shared. The kernel counts how long a
-thread was ready and had no processor: that is the sign that others want it.
+A low priority is not enough: where two processors are threads of one core, as in most virtual machines, a backup on one
+of them slows a server on the other by half, although neither waits. So the backup leaves time between its pieces of
+work, as much as others use the machine.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-SCHEDSTAT: Final = Path("/proc/thread-self/schedstat")
-"""Times in nanoseconds: on a processor, and ready without one (Linux, Documentation/scheduler/sched-stats.rst)."""
+PROC_STAT: Final = Path("/proc/stat")
+"""Times of all processors since the start of the system (Linux, proc(5))."""
 
 PIECE_SECONDS: Final = 0.02
 """Work on a processor between two rests."""
 
-REST_PER_WAIT: Final = 20.0
-"""Rest per second without a processor: an accidental wait of a millisecond costs little."""
+LOOK_SECONDS: Final = 0.5
+"""Interval in which it is looked how busy the machine is: the times have steps of 10 ms."""
+
+BUSY_SHARE: Final = 0.25
+"""Share of the processors that others use from which on the rests are longest."""
 
 MAX_REST: Final = 5.0
-"""Maximum rest per second of work, waits included: a backup beside others gets a sixth of a processor, or more."""
+"""Longest rest per second of work, waits for disks and processors included: a sixth of a processor is left."""
 
 MAX_REST_SECONDS: Final = 1.0
 """Maximum duration of one rest, also after a large piece of work."""
 
 
-def thread_times() -> tuple[float, float] | None:
-    """Return for how many seconds this thread ran, and was ready without a processor; None if the system hides it."""
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Times in seconds: elapsed, of this thread and of this process on processors, and of all processors at work."""
+
+    elapsed: float
+    thread: float
+    process: float
+    machine: float
+
+
+def current_times() -> Times | None:
+    """Read the times; None if the system does not show how busy it is."""
     try:
-        ran, waited, _ = map(int, SCHEDSTAT.read_bytes().split())
+        user, nice, system, _, _, irq, softirq = map(int, PROC_STAT.read_text().split(maxsplit=8)[1:8])
     except (OSError, ValueError):
         return None
-    return ran / 1e9, waited / 1e9
+    machine = (user + nice + system + irq + softirq) / os.sysconf("SC_CLK_TCK")
+    return Times(time.monotonic(), time.thread_time(), time.process_time(), machine)
 
 
 class Pace:
@@ -42,21 +58,33 @@ class Pace:
 
     def __init__(
         self,
-        times: Callable[[], tuple[float, float] | None] = thread_times,
+        times: Callable[[], Times | None] = current_times,
         sleep: Callable[[float], None] = time.sleep,
+        processors: int | None = None,
     ) -> None:
         self._times, self._sleep = times, sleep
-        self._before = times()
+        self._processors = processors or os.cpu_count() or 1
+        self._piece = self._look = times()
+        self._share = 0.0
 
     def rest(self) -> None:
-        """Sleep if others wanted the processors since the last rest."""
+        """Sleep in proportion to the work since the last rest, and to how busy others keep the machine."""
         now = self._times()
-        if now is None or self._before is None:
+        if now is None or self._piece is None or now.thread - self._piece.thread < PIECE_SECONDS:
             return
-        ran, waited = now[0] - self._before[0], now[1] - self._before[1]
-        if ran < PIECE_SECONDS:
-            return
-        rest = min(REST_PER_WAIT * waited, MAX_REST * ran - waited, MAX_REST_SECONDS)
+        self._note_others(now)
+        worked = now.thread - self._piece.thread
+        idle = now.elapsed - self._piece.elapsed - worked
+        rest = MAX_REST * min(1.0, self._share / BUSY_SHARE) * worked - idle
         if rest > 0:
-            self._sleep(rest)
-        self._before = now
+            self._sleep(min(rest, MAX_REST_SECONDS))
+            now = self._times()
+        self._piece = now
+
+    def _note_others(self, now: Times) -> None:
+        """Update the share of the machine's processors that other programs use."""
+        before = self._look
+        if before is not None and now.elapsed - before.elapsed >= LOOK_SECONDS:
+            others = now.machine - before.machine - (now.process - before.process)
+            self._share = max(0.0, others / (now.elapsed - before.elapsed) / self._processors)
+            self._look = now

@@ -2,89 +2,75 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import subprocess
-import sys
 import time
+from pathlib import Path
 
 import pytest
 
-from app.backup.pace import MAX_REST, MAX_REST_SECONDS, PIECE_SECONDS, Pace, thread_times
+from app.backup import pace
+from app.backup.pace import MAX_REST, MAX_REST_SECONDS, Pace, Times, current_times
 
-BURN = "import os; os.sched_setaffinity(0, {int(os.environ['CPU'])})\nwhile True: pass"
 
+class Machine:
+    """Times of a machine with two processors, of which others use a share. wait: seconds per second of work."""
 
-class Clock:
-    """Times of a thread that works in pieces, and gets a processor after a wait."""
+    def __init__(self, others: float, wait: float = 0.0) -> None:
+        self.others, self.wait = others, wait
+        self.elapsed = self.worked = self.rested = 0.0
 
-    def __init__(self) -> None:
-        self.ran = self.waited = self.rested = 0.0
-
-    def __call__(self) -> tuple[float, float]:
-        return self.ran, self.waited
+    def __call__(self) -> Times:
+        return Times(self.elapsed, self.worked, self.worked, self.worked + 2 * self.others * self.elapsed)
 
     def sleep(self, seconds: float) -> None:
         self.rested += seconds
+        self.elapsed += seconds
 
-    def work(self, pace: Pace, seconds: float, wait_per_second: float, piece: float = 0.005) -> float:
+    def work(self, seconds: float, piece: float = 0.005) -> float:
         """Work for some seconds; return the share of a processor that the thread had."""
-        begin = self.ran + self.waited + self.rested
+        paced = Pace(self, self.sleep, processors=2)
         for _ in range(round(seconds / piece)):
-            self.ran += piece
-            self.waited += piece * wait_per_second
-            pace.rest()
-        return seconds / (self.ran + self.waited + self.rested - begin)
+            self.worked += piece
+            self.elapsed += piece * (1 + self.wait)
+            paced.rest()
+        return seconds / self.elapsed
 
 
 def test_free_machine_gives_full_speed() -> None:
-    clock = Clock()
-    assert clock.work(Pace(clock, clock.sleep), 10, 0.0) == pytest.approx(1)
-    assert clock.rested == 0
+    assert Machine(0.0).work(20) == pytest.approx(1)
 
 
-@pytest.mark.parametrize(("wait", "share"), [(0.01, 0.83), (0.1, 0.32), (1.0, 1 / 6), (4.0, 1 / 6)])
-def test_rests_grow_with_the_waits_up_to_a_sixth_of_a_processor(wait: float, share: float) -> None:
-    clock = Clock()
-    assert clock.work(Pace(clock, clock.sleep), 10, wait) == pytest.approx(share, abs=0.02)
+@pytest.mark.parametrize(("others", "share"), [(0.01, 0.83), (0.1, 1 / 3), (0.25, 1 / 6), (1.0, 1 / 6)])
+def test_rests_grow_with_the_use_by_others(others: float, share: float) -> None:
+    assert Machine(others).work(60) == pytest.approx(share, abs=0.02)
 
 
-def test_who_gets_little_anyway_does_not_rest() -> None:
-    clock = Clock()
-    clock.work(Pace(clock, clock.sleep), 10, MAX_REST + 1)
-    assert clock.rested == 0
+@pytest.mark.parametrize("others", [0.0, 0.5])
+def test_waits_count_as_rests(others: float) -> None:
+    machine = Machine(others, wait=MAX_REST + 1)
+    machine.work(20)
+    assert machine.rested == 0
 
 
 def test_large_piece_of_work_ends_in_a_short_rest() -> None:
-    clock = Clock()
-    clock.work(Pace(clock, clock.sleep), 100, 1.0, piece=100)
-    assert clock.rested == MAX_REST_SECONDS
+    machine = Machine(0.5)
+    machine.work(100, piece=100)
+    assert machine.rested == MAX_REST_SECONDS
 
 
-def test_system_without_these_times_is_no_problem() -> None:
+def test_system_without_these_times_is_no_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pace, "PROC_STAT", tmp_path / "stat")
     rests: list[float] = []
-    pace = Pace(lambda: None, rests.append)
-    pace.rest()
-    assert rests == []
+    Pace(sleep=rests.append).rest()
+    assert (current_times(), rests) == (None, [])
 
 
-def test_busy_processor_is_noticed() -> None:
-    """One other program on this thread's processor: the thread waits, and rests."""
-    if thread_times() is None:
-        pytest.skip("this system does not count how long a thread waits for a processor")
-    former, cpu = os.sched_getaffinity(0), min(os.sched_getaffinity(0))
-    rests: list[float] = []
-    other = subprocess.Popen([sys.executable, "-c", BURN], env={**os.environ, "CPU": str(cpu)})
-    try:
-        os.sched_setaffinity(0, {cpu})
-        pace, deadline = Pace(sleep=rests.append), time.monotonic() + 60
-        while not rests and time.monotonic() < deadline:
-            begin = time.thread_time()
-            while time.thread_time() - begin < PIECE_SECONDS:
-                hashlib.sha256(bytes(2**16)).digest()
-            pace.rest()
-    finally:
-        os.sched_setaffinity(0, former)
-        other.kill()
-        other.wait()
-    assert rests
+def test_times_are_those_of_the_machine() -> None:
+    before = current_times()
+    if before is None:
+        pytest.skip("this system does not show how busy it is")
+    while time.thread_time() - before.thread < 0.3:
+        pass
+    after = current_times()
+    assert after is not None
+    assert after.thread - before.thread >= 0.3
+    assert after.machine - before.machine > 0.2
