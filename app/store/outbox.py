@@ -24,6 +24,9 @@ _RELAYS: Mapping[RelayName, int] = {"zenoh": 1, "mqtt": 2}
 LOG_SEARCH_WINDOW = 100_000
 """Number of newest log positions in which former names are searched, and in which environments compete for history."""
 
+MAX_IDLE_SECONDS = 10
+"""Maximum time for which a server that stands still, or has no network, blocks the commits of all others."""
+
 
 @dataclass(frozen=True, slots=True)
 class HistoryRange:
@@ -86,12 +89,7 @@ def append_event(
         "author": author,
         "time": rfc3339(time),
     }
-    position = connection.execute(
-        update(tables.log)
-        .where(tables.log.c.id == 1)
-        .values(position=tables.log.c.position + 1)
-        .returning(tables.log.c.position)
-    ).scalar_one()
+    position = _advance(connection, 1)
     connection.execute(
         insert(tables.event).values(
             position=position,
@@ -108,12 +106,7 @@ def append_copies(connection: Connection, environment_id: str, events: Sequence[
     """Add events of another server with their own sequences, in order. Call it last, as ``append_event``."""
     if not events:
         return
-    last = connection.execute(
-        update(tables.log)
-        .where(tables.log.c.id == 1)
-        .values(position=tables.log.c.position + len(events))
-        .returning(tables.log.c.position)
-    ).scalar_one()
+    last = _advance(connection, len(events))
     rows = [
         {
             "position": last - len(events) + 1 + k,
@@ -126,6 +119,18 @@ def append_copies(connection: Connection, environment_id: str, events: Sequence[
         for k, event in enumerate(events)
     ]
     connection.execute(insert(tables.event), rows)
+
+
+def _advance(connection: Connection, count: int) -> int:
+    """Take the next positions of the log; return the last one.
+
+    The commits of all servers wait for each other here, so PostgreSQL ends the transaction of one that stands still.
+    """
+    advanced = update(tables.log).where(tables.log.c.id == 1).values(position=tables.log.c.position + count)
+    if connection.dialect.name != "postgresql":
+        return int(connection.execute(advanced.returning(tables.log.c.position)).scalar_one())
+    limit = func.set_config("idle_in_transaction_session_timeout", f"{MAX_IDLE_SECONDS}s", True)
+    return int(connection.execute(advanced.returning(tables.log.c.position, limit)).one().position)
 
 
 def as_event(row: Row[Any]) -> Event:

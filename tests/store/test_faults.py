@@ -9,7 +9,9 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -354,3 +356,32 @@ def test_blob_is_damaged_only_with_broken_storage(
     else:
         with pytest.raises(Unavailable, match=os.strerror(number)):
             sqlite_store.blob_upkeep.verify()
+
+
+@pytest.mark.postgres
+def test_server_that_stands_still_in_a_commit_does_not_block_the_others(
+    postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.store.outbox.MAX_IDLE_SECONDS", 1)
+    servers = [Store(postgres_url, tmp_path / name) for name in ("a", "b")]
+    servers[0].migrate()
+    is_still, may_go_on = threading.Event(), threading.Event()
+
+    def stand_still(_: object) -> None:
+        if not is_still.is_set():
+            is_still.set()
+            may_go_on.wait(60)
+
+    monkeypatch.setattr("app.store.database.check_fences", stand_still)  # right before the commit
+    with ThreadPoolExecutor(2) as pool:
+        try:
+            late = pool.submit(servers[0].environments.create, "late")
+            assert is_still.wait(60)
+            pool.submit(servers[1].environments.create, "farm").result(20)
+        finally:
+            may_go_on.set()
+        with pytest.raises(Unavailable, match="idle-in-transaction"):
+            late.result(60)
+    assert [e.name for e in servers[0].environments.page()[0]] == ["farm"]
+    for server in servers:
+        server.close()
