@@ -1,7 +1,8 @@
-"""Server processes that are forked from one in which the server's modules are imported already.
+"""Processes of ``fleetmap`` that are forked from one in which its modules are imported already.
 
-Importing them takes two seconds of processor time, and tests start some hundred servers. Everything else is as if
-``python -m app.cli`` was started: environment, folder, output, signals, exit status, and a session of its own.
+Importing them takes half a second of processor time for a command and two for a server, and tests start some hundred
+of each. Everything else is as if ``python -m app.cli`` was started: environment, folder, input and output, signals,
+exit status, and a session of its own.
 
 Run as a program, with a socket as its argument, this is the process that forks: it has one thread, and one pytest
 process as its client. Each message is a request in JSON and gets a response.
@@ -12,10 +13,12 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import gc
 import importlib
 import io
 import json
 import os
+import pkgutil
 import runpy
 import select
 import signal
@@ -23,12 +26,18 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = ("app.ingest.prepare", "app.convert.warm", "app.main", "app.cli.server", "uvicorn", "pydantic_settings")
+MODULES = (
+    *("app.ingest.prepare", "app.convert.warm", "app.main", "uvicorn", "pydantic_settings"),
+    *("app.agent.agent", "zenoh"),
+)
+COMMANDS = "app.cli"
+"""The module that is run, and the package whose modules are imported as well."""
+
 LARGEST = 1 << 20
 
 SHARES_FORK_SERVER = sys.version_info[:2] in ((3, 11), (3, 12), (3, 13))
@@ -39,22 +48,46 @@ class PreloadedProcess:
     """``python -m app.cli ARGUMENTS``, with the attributes and methods of a ``subprocess.Popen`` with text output."""
 
     def __init__(
-        self, arguments: list[str], *, env: Mapping[str, str], cwd: Path, output: IO[bytes] | None = None
+        self,
+        arguments: list[str],
+        *,
+        env: Mapping[str, str],
+        cwd: Path,
+        output: IO[Any] | None = None,
+        module: str = COMMANDS,
     ) -> None:
-        """Start a process that prints into the file ``output``; by default ``stdout`` reads what it prints."""
-        self.returncode: int | None = None
+        """Start a process that prints into the file ``output``; by default ``stdout`` reads what it prints.
+
+        module: what is run instead of ``app.cli``.
+        """
         self.stdout: IO[str] | None = None
         if output is None:
             ours, theirs = os.pipe()
             self.stdout, output = os.fdopen(ours), os.fdopen(theirs, "wb")
-        request = {"arguments": arguments, "environment": dict(env), "folder": str(cwd)}
+        request = {"module": module, "arguments": arguments, "environment": dict(env), "folder": str(cwd)}
         try:
-            self.pid: int = _forker().ask(request, output.fileno())["pid"]
+            with Path(os.devnull).open() as nothing:
+                self._start(request, nothing.fileno(), output.fileno(), output.fileno())
         finally:
             if self.stdout is not None:
                 output.close()
+
+    def _start(self, request: dict[str, Any], *streams: int) -> None:
+        self.returncode: int | None = None
+        self.pid: int = _forker().ask(request, *streams)["pid"]
         self._ended = os.pidfd_open(self.pid)
         self._lock = threading.Lock()
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, None]:
+        """Wait for the end, and return what it and its children printed. Raises TimeoutExpired."""
+        assert self.stdout is not None
+        text: list[str] = []
+        reader = threading.Thread(target=lambda stdout: text.append(stdout.read()), args=(self.stdout,), daemon=True)
+        reader.start()
+        self.wait(timeout)
+        reader.join()
+        self.stdout.close()
+        return text[0], None
 
     def poll(self) -> int | None:
         """Return the exit status, negative for a signal, or None while the process runs."""
@@ -87,6 +120,84 @@ class PreloadedProcess:
     def kill(self) -> None:
         """Send SIGKILL."""
         self.send_signal(signal.SIGKILL)
+
+
+def run_preloaded(
+    arguments: list[str], *, env: Mapping[str, str], cwd: Path, timeout: float = 120.0
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; ``stdout`` has what it printed on both streams."""
+    process = PreloadedProcess(arguments, env=env, cwd=cwd)
+    try:
+        output, _ = process.communicate(timeout)
+    finally:
+        process.kill()
+    return subprocess.CompletedProcess(arguments, process.wait(), output)
+
+
+class _StreamedProcess(PreloadedProcess):
+    """A process with these files as its input, output and errors."""
+
+    def __init__(self, request: dict[str, Any], *streams: int) -> None:
+        self.stdout = None
+        self._start(request, *streams)
+
+
+COMMAND = """#!{python} -IS
+import json, os, signal, socket, sys
+client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+client.connect({address!r})
+request = {{"arguments": sys.argv[1:], "environment": dict(os.environ), "folder": os.getcwd()}}
+socket.send_fds(client, [json.dumps(request).encode()], [0, 1, 2])
+process = int(client.recv(32))
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, _: os.kill(process, number))
+status = int(client.recv(32))
+sys.exit(status if status >= 0 else 128 - status)
+"""
+
+
+@contextlib.contextmanager
+def preloaded_command(file: Path, env: Mapping[str, str]) -> Iterator[None]:
+    """Make ``file`` a program that is ``fleetmap`` for shells. env: variables in addition to the caller's."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        address = f"{file}.socket"
+        listener.bind(address)
+        listener.listen()
+        file.write_text(COMMAND.format(python=sys.executable, address=address))
+        file.chmod(0o755)
+        thread = threading.Thread(target=_accept, args=(listener, env), daemon=True)
+        thread.start()
+        yield
+        listener.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+def _accept(listener: socket.socket, env: Mapping[str, str]) -> None:
+    while True:
+        try:
+            client, _ = listener.accept()
+        except OSError:  # shut down
+            return
+        threading.Thread(target=_run_for, args=(client, env), daemon=True).start()
+
+
+def _run_for(client: socket.socket, env: Mapping[str, str]) -> None:
+    """Run what a client asks for, and end it if the client is killed."""
+    with client:
+        data, streams, _, _ = socket.recv_fds(client, LARGEST, 3)
+        request = json.loads(data)
+        try:
+            request["environment"] |= env
+            process = _StreamedProcess({"module": COMMANDS, **request}, *streams)
+        finally:
+            for stream in streams:
+                os.close(stream)
+        client.send(str(process.pid).encode())
+        if client.fileno() in select.select([client.fileno(), process._ended], [], [])[0]:
+            process.terminate()
+        status = process.wait()
+        with contextlib.suppress(OSError):
+            client.send(str(status).encode())
 
 
 class _Forker:
@@ -124,10 +235,10 @@ def _forker() -> _Forker:
     return forker
 
 
-def _serve(client: socket.socket) -> list[str]:
-    """Fork for each request, until the client is gone. In the new process, return its arguments."""
+def _serve(client: socket.socket) -> tuple[str, list[str]]:
+    """Fork for each request, until the client is gone. In the new process, return its module and arguments."""
     while True:
-        data, descriptors, _, _ = socket.recv_fds(client, LARGEST, 1)
+        data, descriptors, _, _ = socket.recv_fds(client, LARGEST, 3)
         if not data:
             os._exit(0)
         request = json.loads(data)
@@ -139,28 +250,25 @@ def _serve(client: socket.socket) -> list[str]:
         if pid == 0:
             client.close()
             _become(request, *descriptors)
-            arguments: list[str] = request["arguments"]
-            return arguments
+            return request["module"], request["arguments"]
         for descriptor in descriptors:
             os.close(descriptor)
         client.send(json.dumps({"pid": pid}).encode())
 
 
-def _become(request: dict[str, Any], output: int) -> None:
-    """Take the session, folder, environment and output of a new process."""
+def _become(request: dict[str, Any], *streams: int) -> None:
+    """Take the session, folder, environment, input and output of a new process."""
     os.setsid()
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"])
-    with Path(os.devnull).open() as nothing:
-        os.dup2(nothing.fileno(), 0)
-    os.dup2(output, 1)
-    os.dup2(output, 2)
-    os.close(output)
-    for stream in (sys.stdout, sys.stderr):
-        assert isinstance(stream, io.TextIOWrapper)
-        stream.reconfigure(line_buffering=True, write_through=True)
-    if SHARES_FORK_SERVER:
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+        os.close(stream)
+    for file in (sys.stdout, sys.stderr):
+        assert isinstance(file, io.TextIOWrapper)
+        file.reconfigure(line_buffering=True, write_through=True)
+    if SHARES_FORK_SERVER and request["arguments"][:1] in (["serve"], ["worker"]):
         _fork_the_fork_server()
 
 
@@ -189,8 +297,17 @@ def _fork_the_fork_server() -> None:
         server._forkserver_address, server._forkserver_alive_fd, server._forkserver_pid = address, writing, pid
 
 
+def _preload() -> None:
+    commands = importlib.import_module(COMMANDS)
+    for name in (*MODULES, *(f"{COMMANDS}.{found.name}" for found in pkgutil.iter_modules(commands.__path__))):
+        if not name.endswith("__main__"):
+            importlib.import_module(name)
+    gc.collect()
+    gc.freeze()  # the collector of a new process would copy this memory by marking it
+
+
 if __name__ == "__main__":
-    for name in MODULES:
-        importlib.import_module(name)
-    sys.argv = ["fleetmap", *_serve(socket.socket(fileno=int(sys.argv[1])))]
-    runpy.run_module("app.cli", run_name="__main__", alter_sys=True)
+    _preload()
+    module, sys.argv[1:] = _serve(socket.socket(fileno=int(sys.argv[1])))
+    sys.argv[0] = "fleetmap"
+    runpy.run_module(module, run_name="__main__", alter_sys=True)

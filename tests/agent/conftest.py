@@ -27,6 +27,7 @@ from tests.ports import free_port
 
 if sys.version_info >= (3, 11):  # the server's
     from tests.api.conftest import ADMIN, Api, running, settings_for
+    from tests.preloaded import PreloadedProcess
 
 ROOT = Path(__file__).parents[2]
 
@@ -88,7 +89,7 @@ def network(moved: float = 0.0, count: int = 600) -> bytes:
 class Robot:
     """Process ``fleetmap agent --json``; ``lines`` is its output.
 
-    FLEETMAP_TEST_PYTHON: interpreter to use.
+    FLEETMAP_TEST_PYTHON: interpreter to start, instead of a fork of a process that has imported the agent.
     """
 
     def __init__(self, server: str, env: str, into: Path, *more: str, formats: str = "tmap2", **variables: str) -> None:
@@ -97,14 +98,20 @@ class Robot:
         if "--robot" not in more:
             arguments += ["--robot", into.name]
         self.into = into
-        self.process = subprocess.Popen(
-            [os.environ.get("FLEETMAP_TEST_PYTHON", sys.executable), "-m", "app.cli", *arguments, *more],
-            env={**clean, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT), **variables},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            text=True,
-        )
+        environment = {**clean, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT), **variables}
+        python = os.environ.get("FLEETMAP_TEST_PYTHON")
+        self.process: subprocess.Popen[str] | PreloadedProcess
+        if python is None:
+            self.process = PreloadedProcess([*arguments, *more], env=environment, cwd=Path.cwd())
+        else:
+            self.process = subprocess.Popen(
+                [python, "-m", "app.cli", *arguments, *more],
+                env=environment,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                text=True,
+            )
         self.lines: list[dict[str, Any]] = []
         self._news = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)

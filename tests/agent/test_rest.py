@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
+
+import pytest
 
 from tests.agent.conftest import Start
 from tests.api.conftest import Api
@@ -26,7 +29,8 @@ def processor_seconds(pid: int) -> float:
     return sum(int((thread / "schedstat").read_text().split()[0]) for thread in threads) / 1e9
 
 
-def test_agent_at_rest_costs_little(api: Api, place: str, robot: Start) -> None:
+def test_agent_at_rest_costs_little(api: Api, place: str, robot: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEETMAP_TEST_PYTHON", sys.executable)  # a fork would share memory with other processes
     one = robot("--on-change", "true")
     one.wait("active", version=1)
     one.wait("connected")

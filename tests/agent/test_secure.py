@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import ssl
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from tests.certificates import Authority
 from tests.events.conftest import eventually
 from tests.events.test_fleet import robot_of
 from tests.ports import free_port
+from tests.preloaded import run_preloaded
 
 
 @pytest.fixture(scope="module")
@@ -135,14 +134,7 @@ def test_agent_checks_credentials_before_start(authority: Authority, tmp_path: P
 
 def test_command_line_uses_https(secure: Api, authority: Authority) -> None:
     clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
-    variables = {**clean, "FLEETMAP_SERVER": secure.url, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT)}
+    variables = {**clean, "FLEETMAP_SERVER": secure.url, "FLEETMAP_TOKEN": ADMIN}
     for more, status in (({"FLEETMAP_CA": str(authority.pem)}, 0), ({}, 1)):
-        process = subprocess.run(
-            [sys.executable, "-m", "app.cli", "versions", "--json"],
-            env={**variables, **more},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        assert process.returncode == status, process.stderr
+        process = run_preloaded(["versions", "--json"], env={**variables, **more}, cwd=ROOT)
+        assert process.returncode == status, process.stdout

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import yaml
 
 from app.derive import _kernels_roadmap, _kernels_skeleton, _kernels_space
 from tests.api.conftest import Api
+from tests.preloaded import run_preloaded
 
 HERE = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/metric/map"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / HERE
@@ -80,20 +80,9 @@ def test_command_line_derives_the_same_networks(files: dict[str, bytes], tmp_pat
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
     out = tmp_path / "network.tmap2.yaml"
-    command = [
-        sys.executable,
-        "-m",
-        "app.cli",
-        "convert",
-        str(tmp_path / "map.yaml"),
-        str(tmp_path / "map.png"),
-        "--to",
-        "tmap2",
-        "-o",
-        str(out),
-    ]
-    process = subprocess.run([*command, "-O", "robot_radius=0.7"], capture_output=True, text=True)
-    assert process.returncode == 0, process.stderr
+    arguments = ["convert", "map.yaml", "map.png", "--to", "tmap2", "-o", str(out), "-O", "robot_radius=0.7"]
+    process = run_preloaded(arguments, env=os.environ, cwd=tmp_path)
+    assert process.returncode == 0, process.stdout
     assert 100 < len(network_in(out.read_bytes())) < 2000
 
 

@@ -7,8 +7,6 @@ import hashlib
 import os
 import random
 import shutil
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +27,7 @@ from app.worker import create_worker
 from tests.api import samples
 from tests.api.conftest import Api, parts, running, settings_for
 from tests.events.conftest import eventually
+from tests.preloaded import run_preloaded
 from tests.seaweed import Fault, FaultyStore, Seaweed
 
 pytestmark = pytest.mark.postgres
@@ -226,16 +225,16 @@ def test_verify_repairs_files_wherever_they_are(settings: list[Settings], tmp_pa
     shared = {key: f"made/{sha256_of(key)[:2]}/{sha256_of(key)}" for key in ("damaged", "lost")}
     store.blobs.files.write({shared["damaged"]: b"x" * len("damaged")})
     store.blobs.files.delete([shared["lost"]])
-    command = [sys.executable, "-m", "app.cli", "verify"]
-    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
-    assert found.returncode == 1, found.stdout + found.stderr
+    found = run_preloaded(["verify"], env=environment, cwd=tmp_path)
+    assert found.returncode == 1, found.stdout
     assert name[:16] in found.stdout
     assert "3 shared maps" in found.stdout
     for key, path in shared.items():
         assert [key in line for line in found.stdout.splitlines() if path[8:24] in line] == [True]
-    command += ["--repair", "--from", str(tmp_path / "originals")]
-    repaired = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
-    assert repaired.returncode == 0, repaired.stdout + repaired.stderr
+    repaired = run_preloaded(
+        ["verify", "--repair", "--from", str(tmp_path / "originals")], env=environment, cwd=tmp_path
+    )
+    assert repaired.returncode == 0, repaired.stdout
     assert store.blobs.get(name) == data
     assert len(list(store.made_maps.iterate_checks())) == len(list(store.blobs.files.list("made/"))) == 1
     assert store.made_maps.load("intact") is not None

@@ -5,8 +5,7 @@ The settings are those of the environment, as for a server.
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import logging
 import time
 from collections.abc import Mapping
 from datetime import timedelta
@@ -15,6 +14,7 @@ from pathlib import Path
 from app.config import Settings
 from app.errors import Unavailable
 from app.main import open_store
+from tests.preloaded import PreloadedProcess
 
 GRACE = timedelta(seconds=90)
 """Longer than an upload of these tests takes."""
@@ -23,6 +23,7 @@ PAUSE_SECONDS = 2.0
 
 
 def collect_forever() -> None:
+    logging.getLogger("sqlalchemy").setLevel(logging.CRITICAL)  # else a killed database is logged with a traceback
     store = open_store(Settings())
     while True:
         try:
@@ -32,17 +33,10 @@ def collect_forever() -> None:
         time.sleep(PAUSE_SECONDS)
 
 
-def start(variables: Mapping[str, str], folder: Path, log: Path) -> subprocess.Popen[bytes]:
+def start(variables: Mapping[str, str], folder: Path, log: Path) -> PreloadedProcess:
     """Start the process; its output is appended to ``log``."""
     with log.open("ab") as output:
-        return subprocess.Popen(
-            [sys.executable, "-m", "tests.chaos.collector"],
-            env={**variables, "PYTHONPATH": str(Path(__file__).parents[2])},
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        )
+        return PreloadedProcess([], env=variables, cwd=folder, output=output, module="tests.chaos.collector")
 
 
 if __name__ == "__main__":

@@ -10,8 +10,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +20,7 @@ import pytest
 
 from app.errors import Unavailable
 from app.store.store import Store
+from tests.preloaded import PreloadedProcess
 from tests.store.samples import GRID, grid, replaces, save
 
 ROUNDS = max(1, int(os.environ.get("FLEETMAP_CHAOS", "4")) // 4)
@@ -61,26 +60,18 @@ class Writer:
             raise self.problem
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
+def start(*arguments: str) -> PreloadedProcess:
     clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
-    command = [sys.executable, "-m", "app.cli", *arguments]
-    return subprocess.Popen(
-        command,
-        cwd=ROOT,
-        env=clean | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
+    return PreloadedProcess(list(arguments), env=clean, cwd=ROOT)
 
 
-def finish(process: subprocess.Popen[str]) -> str:
+def finish(process: PreloadedProcess) -> str:
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 0, out
     return out
 
 
-def kill_at(process: subprocess.Popen[str], marks: Path, seconds: float) -> bool:
+def kill_at(process: PreloadedProcess, marks: Path, seconds: float) -> bool:
     """Kill a process so many seconds after it has begun to write there; returns whether it still ran."""
     deadline = time.monotonic() + 120
     while process.poll() is None and not any(marks.rglob("*")) and time.monotonic() < deadline:

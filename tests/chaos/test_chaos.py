@@ -12,8 +12,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -25,6 +23,7 @@ from tests.agent.conftest import ROOT
 from tests.chaos.world import ANY, COMMIT, DOWNLOAD, ENVIRONMENT, RELAY, Fleet, World, fleet_of
 from tests.events.conftest import eventually
 from tests.postgres import Cluster, postgres_cluster
+from tests.preloaded import run_preloaded
 
 __all__ = ["postgres_cluster"]
 
@@ -149,9 +148,8 @@ def check_stored_data(fleet: Fleet) -> None:
     """Check that all versions are whole, by ``fleetmap verify``, and that garbage was collected meanwhile."""
     world = fleet.world
     variables = {**os.environ, **world.variables, "FLEETMAP_DATA_DIR": str(world.folder / "data")}
-    command = [sys.executable, "-m", "app.cli", "verify", "--json"]
-    done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = run_preloaded(["verify", "--json"], env=variables, cwd=ROOT)
+    assert done.returncode == 0, done.stdout
     log = (world.folder / "collector.log").read_text()
     assert "'chunks':" in log, f"nothing was collected:\n{log[-2000:]}"
     assert "Traceback" not in log, log[-2000:]

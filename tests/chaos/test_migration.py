@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -22,6 +20,7 @@ from app.store.schema import config
 from app.store.store import Store
 from tests.agent.conftest import ROOT
 from tests.postgres import Cluster, postgres_cluster
+from tests.preloaded import PreloadedProcess
 
 __all__ = ["postgres_cluster"]
 
@@ -73,13 +72,7 @@ def downgrade(url: str) -> None:
 
 def migrate_and_kill(url: str, blobs: Path, seconds: float | None) -> float:
     """Start a migration and kill it so long after it began; None: let it end. Returns how long it ran."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.chaos.migrator", url, str(blobs)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    process = PreloadedProcess([url, str(blobs)], env=os.environ, cwd=ROOT, module="tests.chaos.migrator")
     assert process.stdout is not None
     with process.stdout:
         assert process.stdout.readline() == "migrating\n"

@@ -10,7 +10,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import pytest
 
 from tests.cli.conftest import ServerProcess
 from tests.ports import free_port
+from tests.preloaded import preloaded_command
 
 ROOT = Path(__file__).resolve().parents[2]
 README_SECTIONS = ("Tour",)
@@ -57,9 +57,6 @@ class Place:
         binaries = folder / ".venv" / "bin"
         binaries.mkdir(parents=True)
         (binaries / "activate").write_text(f'PATH="{binaries}:$PATH"\n')
-        command = binaries / "fleetmap"
-        command.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m app.cli "$@"\n')
-        command.chmod(0o755)
         shutil.copytree(ROOT / "docker", folder / "docker", ignore=shutil.ignore_patterns("secrets", ".env"))
         (folder / "app").symlink_to(ROOT / "app")
         self.server = ServerProcess(
@@ -104,7 +101,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     try:
         place.server.ready()
         place.server.wait_for("administrator's token")
-        yield place
+        with preloaded_command(place.folder / ".venv" / "bin" / "fleetmap", {"PYTHONPATH": str(ROOT)}):
+            yield place
     finally:
         place.server.stop()
 

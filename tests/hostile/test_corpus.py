@@ -20,7 +20,8 @@ SECONDS = 15.0
 """CPU time limit of one case, in seconds; the slowest ones take one or two."""
 
 MEMORY = 6 * 2**30
-COPIES = 60
+COPIES, COPIES_OF_A_FILE = 60, 15
+"""Damaged copies of a map, and at least so many of each of its files; ``make fuzz`` makes them for minutes."""
 
 LIMITS = Limits()
 
@@ -77,8 +78,9 @@ def test_hostile_cases_have_unique_names() -> None:
 @pytest.mark.parametrize(("name", "files"), [pytest.param(n, f, id=f"{n}/{min(f)}") for n, f in sample_maps()])
 def test_damaged_samples_are_read_or_rejected(name: str, files: dict[str, bytes]) -> None:
     results = set()
+    copies = max(COPIES_OF_A_FILE, COPIES // len(files))
     for victim in sorted(files):
-        for k, data in enumerate(damaged(files[victim], seed=len(files[victim]), count=COPIES)):
+        for k, data in enumerate(damaged(files[victim], seed=len(files[victim]), count=copies)):
             case = Case(f"{victim}, damage {k}", {**files, victim: data}, "any", name if k % 2 else None)
             results.add(outcome(case))
     assert "refused" in results, "no damage was detected"

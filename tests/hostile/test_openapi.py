@@ -12,7 +12,6 @@ from typing import Any
 
 import httpx
 import pytest
-import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
@@ -37,6 +36,8 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 
 @pytest.mark.filterwarnings("ignore:Do not use the `random` module inside strategies")  # the server's threads do
 def test_every_response_is_declared_and_no_call_fails_the_server(api: Api) -> None:
+    import schemathesis  # here, since it takes seconds and each worker imports this module
+
     schema = schemathesis.openapi.from_dict(api.get("/openapi.json").json())
     failures: list[str] = []
     count = 0

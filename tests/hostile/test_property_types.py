@@ -54,7 +54,7 @@ WORDS = (
     "value", "expires", "pose", "size", "datum", "bounds", "attribution", "data", "style", "layer", "level", "part", "more",
     *formats.all_formats(),
 )  # fmt: skip
-ROUNDS = int(os.environ.get("FLEETMAP_WORDS", "4"))
+ROUNDS = int(os.environ.get("FLEETMAP_WORDS", "2"))
 FOR_EACH = 6
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,9 +15,9 @@ from tests.api.conftest import Api, create_farm
 from tests.events.conftest import eventually
 from tests.mirror.conftest import mirror_token
 from tests.mirror.test_mirror import rows
+from tests.preloaded import PreloadedProcess
 
-ROOT = Path(__file__).parents[2]
-Start = Callable[[str], subprocess.Popen[str]]
+Start = Callable[[str], PreloadedProcess]
 
 
 @pytest.fixture
@@ -28,14 +26,14 @@ def start(centre: Api, postgres_url: str, s3_url: str, tmp_path: Path) -> Iterat
     token = tmp_path / "token"
     token.write_text(mirror_token(centre))
     clean = {name: value for name, value in os.environ.items() if not name.startswith("FLEETMAP_")}
-    shared = {"FLEETMAP_DATABASE_URL": postgres_url, "FLEETMAP_BLOB_URL": s3_url, "PYTHONPATH": str(ROOT)}
-    started: list[subprocess.Popen[str]] = []
+    shared = {"FLEETMAP_DATABASE_URL": postgres_url, "FLEETMAP_BLOB_URL": s3_url}
+    started: list[PreloadedProcess] = []
 
-    def launch(name: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "app.cli", "mirror", centre.url, "--token-file", str(token), "-e", "shared-*"]
+    def launch(name: str) -> PreloadedProcess:
+        arguments = ["mirror", centre.url, "--token-file", str(token), "-e", "shared-*"]
         environment = {**clean, **shared, "FLEETMAP_DATA_DIR": str(tmp_path / name)}
         with (tmp_path / f"{name}.log").open("w") as log:
-            started.append(subprocess.Popen(command, env=environment, cwd=tmp_path, stdout=log, stderr=log, text=True))
+            started.append(PreloadedProcess(arguments, env=environment, cwd=tmp_path, output=log))
         return started[-1]
 
     yield launch
