@@ -34,8 +34,12 @@ from tests.mosquitto import Broker
 from tests.ports import free_port
 from tests.postgres import Cluster
 
-NOW = datetime.now(UTC)
 USERS = "tractor-7:a-long-random-password\n"
+
+
+def now() -> datetime:
+    """Return the time, when a case is made: a long run reaches it a quarter of an hour after it reads this file."""
+    return datetime.now(UTC)
 
 
 class StubServer:
@@ -175,14 +179,14 @@ def with_backup(place: Place, age: timedelta | None) -> Site:
     site = place.site()
     with closing(open_store(site.settings)) as store:
         if age is not None:
-            store.backups.note_success(BackupRecord(NOW - age, "s3://backups", "1", 1, 1, 1.0))
+            store.backups.note_success(BackupRecord(now() - age, "s3://backups", "1", 1, 1, 1.0))
     return site
 
 
 def with_failed_backup(place: Place) -> Site:
     site = with_backup(place, timedelta(hours=1))
     with closing(open_store(site.settings)) as store:
-        store.backups.note_failure(NOW, "disk full")
+        store.backups.note_failure(now(), "disk full")
     return site
 
 
@@ -192,7 +196,7 @@ def with_webhook(place: Place, failing: timedelta) -> Site:
     with closing(open_store(site.settings)) as store:
         webhook = store.webhooks.create("https://user:password@hooks.example.org/path-with-a-secret")
         store.environments.create("farm")
-        store.webhooks.note_failure(webhook.id, 0, Attempts(3, NOW - failing, NOW, "no answer"))
+        store.webhooks.note_failure(webhook.id, 0, Attempts(3, now() - failing, now(), "no answer"))
     return site
 
 
@@ -304,10 +308,10 @@ CASES: list[Case] = [
     )),
     ("certificate-https", "error", "cannot be used", swapped_keys),
     ("certificate-https", "warning", "not trusted by this machine", lambda p: Site(
-        tls_site(p, 90).settings, now=lambda: NOW
+        tls_site(p, 90).settings, now=now
     )),
     ("certificate-https", "error", "not valid before", lambda p: tls_site(
-        p, 90, now=lambda: NOW - timedelta(days=30)
+        p, 90, now=lambda: now() - timedelta(days=30)
     )),
     ("certificate-zenoh", "ok", "trusted authority", lambda p: zenoh_site(p, 90)),
     ("certificate-zenoh", "error", "not signed by", lambda p: zenoh_site(p, 90, other_authority=True)),
@@ -319,7 +323,7 @@ CASES: list[Case] = [
     ("clock", "warning", "database's clock is 10.0 s ahead", lambda p: skewed_database(p, 10)),
     ("clock", "error", "database's clock is 100.0 s behind", lambda p: skewed_database(p, -100)),
     ("clock", "error", "server's clock", lambda p: p.site(
-        server=p.stub({"/healthz": (200, {})}, NOW + timedelta(hours=1)).url
+        server=p.stub({"/healthz": (200, {})}, now() + timedelta(hours=1)).url
     )),
     ("database", "ok", "SQLite 3", lambda p: p.site()),
     ("database", "error", "schema is missing", postgres),
@@ -403,10 +407,10 @@ CASES: list[Case] = [
     ("settings", "error", "can be guessed", lambda p: p.site(admin_token="short")),
     ("stored-data", "ok", "no damage", lambda p: p.site()),
     ("stored-data", "ok", "2.0 days ago", lambda p: (
-        p.scrub(completed=(NOW - timedelta(days=2)).timestamp()), p.site()
+        p.scrub(completed=(now() - timedelta(days=2)).timestamp()), p.site()
     )[-1]),
     ("stored-data", "warning", "20 days ago", lambda p: (
-        p.scrub(completed=(NOW - timedelta(days=20)).timestamp()), p.site()
+        p.scrub(completed=(now() - timedelta(days=20)).timestamp()), p.site()
     )[-1]),
     ("stored-data", "warning", "never checked", lambda p: p.site(scrub_hours=0)),
     ("stored-data", "error", "3 blobs", lambda p: (p.scrub(completed=1.0, findings={"blob": 3}), p.site())[-1]),
