@@ -31,6 +31,7 @@ AT_ONCE: Final = 8
 DELETED_AT_ONCE: Final = 500
 
 _FULL: Final = ("507 ", "InsufficientStorage", "QuotaExceeded", "XMinioStorageFull", "no space left", "ServiceFull")
+_BEYOND: Final = "416 Range Not Satisfiable"
 _REFUSED: Final = ("401 ", "403 ", "AccessDenied", "SignatureDoesNotMatch", "InvalidAccessKeyId")
 
 
@@ -89,6 +90,8 @@ class S3Files:
                 raise Unreadable(f"{self._place} cannot be read (no such bucket): create it") from error
             raise
         except (exceptions.BaseError, OSError) as error:
+            if _BEYOND in str(error):  # the file was cut off
+                return
             raise Unreadable(f"{self._place} cannot be read ({_reason(error)}): try again later") from error
 
     def _range(self, key: str, start: int, size: int | None) -> obstore.GetResult:
