@@ -32,6 +32,8 @@ PROBE: Final = "probe"
 AT_ONCE: Final = 8
 DELETED_AT_ONCE: Final = 500
 
+_BEYOND: Final = "416 Range Not Satisfiable"
+
 
 class S3Files:
     """Files in a bucket, below the URL ``s3://bucket[/prefix]``.
@@ -92,6 +94,8 @@ class S3Files:
                 raise Unreadable(f"{self._place} cannot be read (no such bucket): create it") from error
             raise
         except (exceptions.BaseError, OSError) as error:
+            if _BEYOND in str(error):  # the file was cut off
+                return
             raise Unreadable(f"{self._place} cannot be read ({fault_of(error)}): try again later") from error
 
     def _range(self, key: str, start: int, size: int | None) -> obstore.GetResult:
