@@ -42,11 +42,11 @@ DISK = "512m"
 START_SECONDS = 60.0
 """Time without faults at the beginning."""
 
-KILLS_SHARE = 0.4
+KILLS_SHARE = 0.25
 """Share of the time after which the server is not killed any more: its memory is measured in the rest."""
 
-WARM_SECONDS = 300.0
-"""Age of a server from which its memory is measured; its caches have then what robots and readers ask for."""
+WARM_SECONDS = 1200.0
+"""Age of a server from which its memory is compared: until then its worker fills its cache of chunks (64 MiB)."""
 
 SAMPLE_SECONDS = 10.0
 SAMPLES = 12
@@ -218,36 +218,39 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        self._lives: list[dict[int, list[float]]] = [{}]
+        self._lives: list[list[tuple[float, int, float]]] = [[]]
         self._started = self._sampled = time.monotonic()
 
     def restart(self) -> None:
         """Begin the next life."""
-        self._lives.append({})
+        self._lives.append([])
         self._started = time.monotonic()
 
     def sample(self, world: World) -> None:
-        """Measure, if the server is warm and the last sample is some seconds old."""
+        """Measure, if the last sample is some seconds old."""
         now = time.monotonic()
-        if now - self._started < WARM_SECONDS or now - self._sampled < SAMPLE_SECONDS or world.server is None:
+        if now - self._sampled < SAMPLE_SECONDS or world.server is None:
             return
         self._sampled = now
         sizes = process_memory(world.server.process.pid)
-        self._lives[-1].setdefault(len(sizes), []).append(sum(sizes))
+        self._lives[-1].append((now - self._started, len(sizes), sum(sizes)))
 
     def change(self) -> tuple[float, float] | None:
-        """Return the memory at the begin and at the end of a life, of that which grew most; None: none was so long.
+        """Return the memory of a warm server and that at the end, of the life in which it grew most.
 
-        Each is the median of some samples.
+        Each is the median of some samples. None: no life was long enough.
         """
-        long = [samples for life in self._lives for samples in life.values() if len(samples) >= 2 * SAMPLES]
-        changes = [(statistics.median(some[:SAMPLES]), statistics.median(some[-SAMPLES:])) for some in long]
+        changes = []
+        for life in self._lives:
+            for processes in {count for _, count, _ in life}:
+                sizes = [size for age, count, size in life if age >= WARM_SECONDS and count == processes]
+                if len(sizes) >= 2 * SAMPLES:
+                    changes.append((statistics.median(sizes[:SAMPLES]), statistics.median(sizes[-SAMPLES:])))
         return max(changes, key=lambda change: change[1] - change[0], default=None)
 
     def table(self) -> str:
-        """Return the samples of the last life, every minute."""
-        samples = max(self._lives[-1].values(), key=len, default=[])
-        return " ".join(f"{one:.0f}" for one in samples[:: round(60 / SAMPLE_SECONDS)])
+        """Return the memory in the last life, every minute."""
+        return " ".join(f"{size:.0f}" for _, _, size in self._lives[-1][:: round(60 / SAMPLE_SECONDS)])
 
 
 def process_memory(pid: int) -> list[float]:
@@ -432,7 +435,7 @@ def report(run: Soak, fleet: Fleet, readers: list[Reader], seconds: float, seed:
     print(f"\n{seconds / 60:.1f} minutes with the seed {seed}\n\n| what | measured | bound |\n| --- | --- | --- |")
     for row in rows:
         print(f"| {' | '.join(row)} |")
-    print(f"MB every minute since it was warm: {run.memory.table()}")
+    print(f"MB every minute of the last life: {run.memory.table()}")
     for text, count in reads.problems.most_common(10):
         print(f"failed outside restarts, {count} x: {text}")
     if problem is not None:
@@ -451,7 +454,7 @@ def main() -> int:
     parser.add_argument("--sqlite", action="store_true", help="SQLite instead of PostgreSQL")
     given = parser.parse_args()
     if given.minutes < 4:
-        parser.error("give at least 4 minutes; 20 to measure the server's memory, once it is warm")
+        parser.error("give at least 4 minutes; 35 to compare the server's memory, once it is warm")
     seed = random.SystemRandom().randrange(10**6) if given.seed is None else given.seed
     compile_first()
     folder = Path(tempfile.mkdtemp(prefix="soak"))
