@@ -19,6 +19,7 @@ from app.backends.lead import LeadLostError
 from app.errors import FleetMapError
 from app.fleet import next_step
 from app.formats import writable_formats
+from app.heap import OldGarbage, release_free_memory
 from app.store.garbage_collection import CONTENT_LEAD
 
 log = logging.getLogger(__name__)
@@ -26,6 +27,12 @@ log = logging.getLogger(__name__)
 NAME = "housekeeping"
 TICK_SECONDS = 1.0
 """Interval of housekeeping, and so the maximum delay of a planned channel move."""
+
+GARBAGE_SECONDS = 300.0
+"""Interval of looks whether Python has collected the garbage among old objects."""
+
+RELEASE_SECONDS = 30.0
+"""Interval in which free memory is returned to the system."""
 
 CLOCK_TOLERANCE = timedelta(seconds=60)
 """Maximum backward step of the clock that is not logged."""
@@ -66,6 +73,9 @@ class _Housekeeping:
         self._newest = datetime.now(UTC)
         self._collect_at = self._newest + COLLECT_EVERY
         self._thinning: Iterator[None] = iter(())
+        self._release_at = time.monotonic() + RELEASE_SECONDS
+        self._collect_garbage_at = time.monotonic() + GARBAGE_SECONDS
+        self._garbage = OldGarbage()
 
     async def run(self) -> None:
         """Run the tasks every TICK_SECONDS, until cancelled."""
@@ -99,6 +109,12 @@ class _Housekeeping:
         if is_beat:
             services.maps.cache.leave_room()
             services.jobs.send_heartbeats()
+        if time.monotonic() >= self._collect_garbage_at:
+            self._collect_garbage_at = time.monotonic() + GARBAGE_SECONDS
+            self._garbage.collect()
+        if time.monotonic() >= self._release_at:
+            self._release_at = time.monotonic() + RELEASE_SECONDS
+            release_free_memory()
 
     def _run_as_leader(self, is_beat: bool) -> None:
         """Run the tasks of which one process of all servers is enough. Another leader's transactions fail."""

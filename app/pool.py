@@ -26,6 +26,7 @@ from typing import Any
 
 from app import progress
 from app.errors import FleetMapError, TooLarge, Unavailable
+from app.heap import release_free_memory
 from app.progress import Progress
 from app.sandbox import SandboxPolicy, confine
 
@@ -37,6 +38,9 @@ PRELOADED_MODULES = ("app.ingest.prepare", "app.convert.warm")
 """Modules that the server's worker processes import before their first job."""
 
 FORK_SERVER_TRIES, FORK_SERVER_SECONDS = 40, 0.05
+
+IDLE_SECONDS = 1.0
+"""Seconds without a job after which a worker returns its free memory to the system."""
 
 CANCEL_POLL_SECONDS = 0.2
 """Seconds between two checks of a queued job for its cancellation."""
@@ -320,6 +324,8 @@ def _work(
         importlib.import_module(name)
     while True:
         try:
+            if not pipe.poll(IDLE_SECONDS):
+                release_free_memory()
             module, function, args = pipe.recv()
         except (EOFError, OSError):
             return

@@ -31,18 +31,24 @@ FOLDERS = ("/usr/local/bin", *(f"/usr/lib/postgresql/{n}/bin" for n in range(20,
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Running server: one superuser, trusted on the loopback address. run: prefix of commands as the server's user."""
+    """Running server: one superuser, trusted on the loopback address.
+
+    run: prefix of commands as the server's user. synced: whether commits wait for the disk.
+    """
 
     port: int
     bin: Path
     data: Path
     run: Callable[..., subprocess.CompletedProcess[str]]
+    synced: bool = False
 
     def start(self) -> subprocess.CompletedProcess[str]:
         """Start the server and wait until it responds."""
         home = self.data.parent
         options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories='{home}'"
-        options += " -c max_connections=80 -c fsync=off"  # its files outlive its processes; tests cut no power
+        options += " -c max_connections=80"
+        if not self.synced:
+            options += " -c fsync=off"  # its files outlive its processes; tests cut no power
         command = [str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "60", "-l", str(home / "log")]
         return self.run(*command, "-o", options, "start")
 
@@ -136,8 +142,8 @@ def postgres_cluster() -> Iterator[Cluster]:
 
 
 @contextmanager
-def running_cluster(kept: Path | None = None) -> Iterator[Cluster]:
-    """Run a cluster outside of tests. kept: folder where its data stay, and are found again."""
+def running_cluster(kept: Path | None = None, *, synced: bool = False) -> Iterator[Cluster]:
+    """Run a cluster outside of tests. kept: folder where its data stay, and are found again. synced: see Cluster."""
     folder = _binaries()
     if folder is None:
         _missing("PostgreSQL is not installed (initdb is not to be found)")
@@ -162,7 +168,7 @@ def running_cluster(kept: Path | None = None) -> Iterator[Cluster]:
     try:
         if not (data / "PG_VERSION").exists():
             _create_cluster(folder, data, run)
-        cluster = _started_cluster(folder, data, run)
+        cluster = _started_cluster(folder, data, run, synced=synced)
         try:
             _create_template(cluster)
             yield cluster
@@ -183,9 +189,11 @@ def _create_cluster(folder: Path, data: Path, run: Callable[..., subprocess.Comp
         pytest.fail(f"initdb failed: {process.stderr}")
 
 
-def _started_cluster(folder: Path, data: Path, run: Callable[..., subprocess.CompletedProcess[str]]) -> Cluster:
+def _started_cluster(
+    folder: Path, data: Path, run: Callable[..., subprocess.CompletedProcess[str]], *, synced: bool
+) -> Cluster:
     for _ in range(5):
-        cluster = Cluster(free_port(), folder, data, run)
+        cluster = Cluster(free_port(), folder, data, run, synced)
         started = cluster.start()
         if started.returncode == 0:
             return cluster

@@ -33,6 +33,7 @@ from typing import IO, Any
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = (
     *("app.ingest.prepare", "app.convert.warm", "app.main", "uvicorn", "pydantic_settings"),
+    *("alembic.command", "geoalchemy2"),  # what migrations import
     *("app.agent.agent", "zenoh"),
 )
 COMMANDS = "app.cli"
@@ -302,6 +303,8 @@ def _preload() -> None:
     for name in (*MODULES, *(f"{COMMANDS}.{found.name}" for found in pkgutil.iter_modules(commands.__path__))):
         if not name.endswith("__main__"):
             importlib.import_module(name)
+    for name in ("app.api", "app.ogc"):  # their modules are discovered when an application is made
+        list(importlib.import_module(name).routers())
     gc.collect()
     gc.freeze()  # the collector of a new process would copy this memory by marking it
 

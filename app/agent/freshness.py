@@ -80,7 +80,12 @@ class Freshness:
         self._time_text = time_text
         self._newest = self._newest_ahead = 0.0
         self._newest_at: tuple[float, str] = (time.monotonic(), time_text())
+        self._responded_at = self._newest_at[0]
         self._announced: tuple[int, float, str] | None = None
+
+    def note_response(self) -> None:
+        """Record that the server has just returned a channel's manifest, also an unchanged one."""
+        self._responded_at = time.monotonic()
 
     def observe(self, manifest: Manifest, clock: float) -> None:
         """Record a channel's verified manifest. Without a signed time (older server) its expiry is used.
@@ -99,9 +104,12 @@ class Freshness:
         self._newest_at = (time.monotonic(), self._time_text())
 
     def stale_problem(self) -> str | None:
-        """Return the problem if the server counts as frozen, else None."""
+        """Return the problem if the server counts as frozen, else None.
+
+        The age counts until the server's last response: downloads and hooks that take long are no fault of the server.
+        """
         at, text = self._newest_at
-        if time.monotonic() - at <= self._stale_after:
+        if self._responded_at - at <= self._stale_after:
             return None
         return (
             f"no new signed response since {text}: the server or a proxy repeats old responses. "

@@ -65,6 +65,7 @@ class Manifests:
             if manifest.mark == mark and manifest.expires.timestamp() > now:
                 etag, cached = latest_etag, manifest
         response = self._web.manifest(self._options.environment, channel, self._query, etag)
+        self._freshness.note_response()
         if response is None:
             return cached if cached is not None and accept(cached) else None
         manifest, trust = self._verify(response[0], response[1], channel, mark)

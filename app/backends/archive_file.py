@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
-import os
 import tarfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
-from app.backends.blobs import BLOCK, StoredFile, unreadable_error, unwritable_error
+from app.backends.blobs import BLOCK, StoredFile, sync, unreadable_error, unwritable_error
 from app.backends.workspaces import Workspaces
 from app.errors import Conflict, Damaged
 
@@ -52,11 +52,9 @@ class ArchiveFiles:
         part = self._path.with_name(self._path.name + PART)
         try:
             self._archive.close()
-            for path, flags in ((part, os.O_RDONLY), (part.parent, os.O_RDONLY)):
-                descriptor = os.open(path, flags)
-                os.fsync(descriptor)
-                os.close(descriptor)
+            sync(part)
             part.replace(self._path)
+            sync(part.parent)
         except OSError as error:
             raise unwritable_error(error) from error
         self._archive, self._new = None, False
@@ -70,7 +68,8 @@ class ArchiveFiles:
     def discard(self) -> None:
         """Remove an archive that is not complete."""
         if self._archive is not None and self._new:
-            self._archive.close()
+            with contextlib.suppress(OSError):  # the disk may be full
+                self._archive.close()
             self._path.with_name(self._path.name + PART).unlink(missing_ok=True)
             self._archive = None
 

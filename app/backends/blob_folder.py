@@ -15,7 +15,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Final
 
-from app.backends.blobs import BLOCK, StoredFile, unreadable_error, unwritable_error
+from app.backends.blobs import BLOCK, StoredFile, sync, unreadable_error, unwritable_error
 from app.backends.room import check_room
 from app.backends.workspaces import Workspaces
 from app.errors import BROKEN_STORAGE_ERRNOS
@@ -70,7 +70,7 @@ class FolderFiles:
                 temporary.replace(path)
                 folders.add(path.parent)
         for folder in folders:
-            _sync(folder)
+            sync(folder)
 
     def open(self, key: str) -> BufferedReader:
         """Open a file. Raises FileNotFoundError, another OSError if its storage is broken, Unreadable."""
@@ -101,9 +101,15 @@ class FolderFiles:
 
     def list(self, prefix: str = "") -> Iterator[StoredFile]:
         """List files. Those of other uses of the folder are left out."""
-        tops = [prefix.split("/", maxsplit=1)[0]] if prefix else sorted(p.name for p in self._folder.iterdir())
+        try:
+            yield from self._list(prefix)
+        except OSError as error:
+            raise unreadable_error(error) from error
+
+    def _list(self, prefix: str) -> Iterator[StoredFile]:
+        tops = sorted(path.name for path in self._folder.iterdir())
         for top in tops:
-            if not self._tops.fullmatch(top):
+            if not self._tops.fullmatch(top) or (prefix and top != prefix.split("/", maxsplit=1)[0]):
                 continue
             for path in (self._folder / top).rglob("*"):
                 key = path.relative_to(self._folder).as_posix()
@@ -146,7 +152,7 @@ def _synced(data: bytes | Path, workspace: Path, *, gentle: bool) -> Path:
     """
     path = data if isinstance(data, Path) else workspace / secrets.token_hex(16)
     if isinstance(data, Path):
-        _sync(path)
+        sync(path)
         return path
     with path.open("wb") as out:
         for start in range(0, len(data), BLOCK) if gentle else ():
@@ -158,11 +164,3 @@ def _synced(data: bytes | Path, workspace: Path, *, gentle: bool) -> Path:
         out.flush()
         os.fsync(out.fileno())
     return path
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from datetime import timedelta
@@ -15,8 +16,9 @@ from obstore import exceptions
 from obstore.store import S3Store
 
 from app.backends.blobs import BLOCK, StoredFile, Unreadable, unwritable_error
+from app.backends.s3_faults import Fault, check_endpoint, fault_of
 from app.backends.workspaces import Workspaces
-from app.errors import NoRoom, Unavailable
+from app.errors import Invalid, NoRoom, Unavailable
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, RetryConfig, S3Config
@@ -30,8 +32,7 @@ PROBE: Final = "probe"
 AT_ONCE: Final = 8
 DELETED_AT_ONCE: Final = 500
 
-_FULL: Final = ("507 ", "InsufficientStorage", "QuotaExceeded", "XMinioStorageFull", "no space left", "ServiceFull")
-_REFUSED: Final = ("401 ", "403 ", "AccessDenied", "SignatureDoesNotMatch", "InvalidAccessKeyId")
+_BEYOND: Final = "416 Range Not Satisfiable"
 
 
 class S3Files:
@@ -40,11 +41,15 @@ class S3Files:
     Args:
         folder: for workspaces on this machine.
         access_key, secret_key: instead of those of the ``AWS_*`` variables.
+
+    Raises Invalid if the address of the server (``AWS_ENDPOINT_URL``) is unusable.
     """
 
     remote = True
 
     def __init__(self, url: str, folder: Path, *, access_key: str | None = None, secret_key: str | None = None) -> None:
+        if (fault := check_endpoint()) is not None:
+            raise Invalid(str(fault))
         parts = urlsplit(url)
         self._place = f"s3://{parts.netloc}{parts.path.rstrip('/')}"
         self._workspaces = Workspaces(folder / "tmp")
@@ -89,7 +94,9 @@ class S3Files:
                 raise Unreadable(f"{self._place} cannot be read (no such bucket): create it") from error
             raise
         except (exceptions.BaseError, OSError) as error:
-            raise Unreadable(f"{self._place} cannot be read ({_reason(error)}): try again later") from error
+            if _BEYOND in str(error):  # the file was cut off
+                return
+            raise Unreadable(f"{self._place} cannot be read ({fault_of(error)}): try again later") from error
 
     def _range(self, key: str, start: int, size: int | None) -> obstore.GetResult:
         if size is None:
@@ -112,10 +119,10 @@ class S3Files:
         try:
             for some in obstore.list(self._store, prefix.rstrip("/") or None):
                 for one in some:
-                    if one["path"] != PROBE:
+                    if not one["path"].startswith(PROBE):
                         yield StoredFile(one["path"], one["size"], one["last_modified"].timestamp())
         except (exceptions.BaseError, OSError) as error:
-            raise Unreadable(f"{self._place} cannot be listed ({_reason(error)}): try again later") from error
+            raise Unreadable(f"{self._place} cannot be listed ({fault_of(error)}): try again later") from error
 
     def check(self, *, readonly: bool = False) -> None:
         """Raise Unavailable unless a small file can be written (``readonly``: the bucket listed) within seconds."""
@@ -127,19 +134,37 @@ class S3Files:
         except (exceptions.BaseError, OSError) as error:
             raise self._unwritable(error) from error
 
+    def find_faults(self) -> Iterator[tuple[str, Fault]]:
+        """Try all that a server does with a small file, within seconds; yield what it cannot do, and why."""
+        key = f"{PROBE}-{os.getpid()}"
+        steps: dict[str, Callable[[], object]] = {
+            "written": lambda: obstore.put(self._probing, key, b"fleetmap"),
+            "read": lambda: obstore.get(self._probing, key).bytes(),
+            "listed": lambda: next(iter(obstore.list(self._probing, chunk_size=1)), None),
+            "emptied": lambda: obstore.delete(self._probing, [key]),
+        }
+        is_written = False
+        for done, step in steps.items():
+            try:
+                step()
+                is_written |= done == "written"
+            except (exceptions.BaseError, OSError) as error:
+                if is_written or "NoSuchKey" not in str(error):  # a file that could not be written is no second fault
+                    yield done, fault_of(error)
+
     def recover(self) -> int:
         """Remove the workspaces of ended processes."""
         self.prepare()
         return self._workspaces.recover()
 
     def _unwritable(self, error: Exception) -> Unavailable:
-        reason = _reason(error)
-        if any(word in str(error) for word in _FULL):
+        fault = fault_of(error)
+        if fault.is_full:
             return NoRoom(
-                f"{self._place} has no space left ({reason}), and nothing was stored: try again when its operator has "
-                "freed space"
+                f"{self._place} has no space left ({fault.reason}), and nothing was stored: try again when its "
+                "operator has freed space"
             )
-        return Unavailable(f"{self._place} cannot be written ({reason}), and nothing was stored: try again later")
+        return Unavailable(f"{self._place} cannot be written ({fault}), and nothing was stored: try again later")
 
 
 def _open(bucket: str, prefix: str, keys: S3Config, *, retries: int, stall: int) -> S3Store:
@@ -157,23 +182,3 @@ def _open(bucket: str, prefix: str, keys: S3Config, *, retries: int, stall: int)
 def _is_of_store(error: OSError) -> bool:
     """Whether an OSError is the store's answer (obstore uses FileNotFoundError), not one of a local file."""
     return "Object at location" in str(error) or "S3" in str(error)
-
-
-def _reason(error: Exception) -> str:
-    """Return why a request failed, in a few words, without addresses and signatures."""
-    text = str(error)
-    if any(word in text for word in _REFUSED):
-        return (
-            "access was refused: check the bucket's policy, and the keys (AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, or "
-            "FLEETMAP_BLOB_ACCESS_KEY, FLEETMAP_BLOB_SECRET_KEY)"
-        )
-    if "NoSuchBucket" in text:
-        return "no such bucket: create it"
-    if any(word in text for word in _FULL):
-        return "it is full"
-    if any(word in text for word in ("kind: Timeout", "TimedOut", "timed out")):
-        return "it answers too slowly"
-    if "kind: Connect" in text or "error sending request" in text:
-        return "it does not answer: check AWS_ENDPOINT_URL, and whether it runs"
-    code = text.partition("status code: ")[2].partition(":")[0]
-    return f"it answered {code}" if code else type(error).__name__

@@ -7,6 +7,7 @@ this replaces lost and damaged bytes, and makes a file young for the garbage col
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ class BlobFiles(Protocol):
         """Store files durably, each complete or not at all; an existing one is replaced. Paths: in a workspace."""
 
     def stream(self, key: str, start: int = 0, size: int | None = None) -> Iterator[bytes]:
-        """Read a file, or ``size`` bytes of it from byte ``start`` on, in pieces."""
+        """Read a file, or ``size`` bytes of it from byte ``start`` on, in pieces; beyond its end there are none."""
 
     def delete(self, keys: Iterable[str]) -> None:
         """Remove files; one that does not exist is skipped."""
@@ -66,6 +67,15 @@ class BlobFiles(Protocol):
 
     def recover(self) -> int:
         """Remove the workspaces of ended processes; returns how many."""
+
+
+def sync(path: Path) -> None:
+    """Flush a file, or the names in a folder, to the disk. Raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def unwritable_error(error: OSError) -> Unavailable:

@@ -15,13 +15,19 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from time import monotonic
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 from app import traces
 from app.errors import Unavailable
 
 Urgency = Literal["robot", "person"]
 """Who waits for a task."""
+
+FAILURES: Final = "worker_failures"
+"""Name among a task's arguments of the number of failures."""
+
+MAX_FAILURES: Final = 3
+"""Number of failures that the next worker may do better, such as a full disk; a further one is the task's outcome."""
 
 FULL = "too many conversions are waiting: try again in a few seconds"
 
@@ -38,6 +44,11 @@ class Task:
     environment: str
     urgency: Urgency = "person"
     arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def failures(self) -> int:
+        """Number of attempts that failed."""
+        return int(self.arguments.get(FAILURES, 0))
 
 
 @dataclass(frozen=True, slots=True)

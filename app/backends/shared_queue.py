@@ -34,7 +34,17 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
 from app.backends.fence import LIMIT_IDLE_TIME, FenceError, fenced_by
-from app.backends.queue import FULL, Performer, QueueFigures, Task, Urgency, carry_out, with_parent
+from app.backends.queue import (
+    FAILURES,
+    FULL,
+    MAX_FAILURES,
+    Performer,
+    QueueFigures,
+    Task,
+    Urgency,
+    carry_out,
+    with_parent,
+)
 from app.errors import FleetMapError, Unavailable
 
 log = logging.getLogger(__name__)
@@ -52,8 +62,11 @@ POLL_SECONDS: Final = 1.0
 GRACE_SECONDS: Final = 20.0
 """Seconds that a worker has for its running tasks when it stops; then it gives them back."""
 
-MAX_ATTEMPTS: Final = 3
-"""Number of workers that may die of a task before it fails."""
+MAX_DEATHS: Final = 3
+"""Number of workers that may die of a task before it fails. One that stops and gives it back is none of them."""
+
+DEATHS: Final = "worker_deaths"
+"""Name among a task's arguments of the number of workers that died of it."""
 
 RETRY_SECONDS: Final = 1.0
 
@@ -105,6 +118,12 @@ _CHECK = text(
     f"SELECT {LIMIT_IDLE_TIME} FROM procrastinate_jobs"  # noqa: S608  constants
     " WHERE id = :id AND attempts = :attempts AND status = 'doing' FOR SHARE"
 )
+_COUNT = text(
+    "UPDATE procrastinate_jobs SET args = jsonb_set(args, ARRAY['arguments', CAST(:what AS text)],"
+    " to_jsonb(coalesce((args #>> ARRAY['arguments', CAST(:what AS text)])::int, 0) + 1)) WHERE id = :id"
+)
+"""Counts among a task's arguments, where workers of other releases do not mind it."""
+
 _RETRY = text("SELECT procrastinate_retry_job_v2(:id, now() + make_interval(secs => :seconds), NULL, NULL, NULL)")
 _REMOVE = text("SELECT procrastinate_finish_job_v1(:id, 'failed', true)")
 _SWEEP = text("DELETE FROM procrastinate_jobs WHERE NOT (status IN ('todo', 'doing'))")
@@ -180,11 +199,16 @@ class SharedQueue:
                 connection.execute(_REMOVE, {"id": row.id})
             return row is not None
 
-    def give_back(self, attempt: Attempt, seconds: float) -> bool:
-        """Let a task wait again, for some seconds at least. Returns False if the worker no longer has it."""
+    def give_back(self, attempt: Attempt, seconds: float, *, failed: bool = False) -> bool:
+        """Let a task wait again, for some seconds at least. Returns False if the worker no longer has it.
+
+        failed: whether that counts as one of the task's failures.
+        """
         with self._transaction() as connection:
             row = _row_of(connection, attempt)
             if row is not None:
+                if failed:
+                    connection.execute(_COUNT, {"id": row.id, "what": FAILURES})
                 connection.execute(_REMOVE if row.is_needless else _RETRY, {"id": row.id, "seconds": seconds})
             return row is not None
 
@@ -196,11 +220,12 @@ class SharedQueue:
                 task = _as_task(row.args)
                 if row.is_needless:
                     connection.execute(_REMOVE, {"id": row.id})
-                elif row.attempts + 1 >= MAX_ATTEMPTS:
+                elif int(task.arguments.get(DEATHS, 0)) + 1 >= MAX_DEATHS:
                     connection.execute(_REMOVE, {"id": row.id})
                     given_up.append(task)
                 else:
                     log.warning("queue: a worker died, its task is put back (key=%s)", task.key[:16])
+                    connection.execute(_COUNT, {"id": row.id, "what": DEATHS})
                     connection.execute(_RETRY, {"id": row.id, "seconds": 0})
             connection.execute(_SWEEP)
         return given_up
@@ -226,13 +251,21 @@ def _as_task(arguments: dict[str, Any]) -> Task:
 
 
 class _GiveBack(procrastinate.BaseRetryStrategy):
-    """Gives a task back that a stopping worker did not finish, or whose outcome could not be stored."""
+    """Gives a task back that a stopping worker did not finish, or whose outcome could not be stored.
+
+    failed: ids of tasks whose attempt failed, for who ends it.
+    """
+
+    def __init__(self, failed: set[int]) -> None:
+        self._failed = failed
 
     def get_retry_decision(self, *, exception: BaseException, job: jobs.Job) -> procrastinate.RetryDecision | None:
         """Decide whether and when the task is tried again."""
         if isinstance(exception, asyncio.CancelledError | exceptions.JobAborted):
             return procrastinate.RetryDecision(retry_in={"seconds": 0})
-        if isinstance(exception, FleetMapError) and job.attempts < MAX_ATTEMPTS:
+        if isinstance(exception, FleetMapError) and _as_task(job.task_kwargs).failures < MAX_FAILURES:
+            assert job.id is not None
+            self._failed.add(job.id)
             return procrastinate.RetryDecision(retry_in={"seconds": 2})
         return None
 
@@ -248,6 +281,7 @@ class _JobManager(JobManager):
     ) -> None:
         super().__init__(connector)
         self._queue, self._is_stopping = queue, is_stopping
+        self.failed: set[int] = set()
 
     async def finish_job(self, job: jobs.Job, status: jobs.Status, delete_job: bool) -> None:
         """Remove a task, whatever its status: its outcome is stored already."""
@@ -265,7 +299,9 @@ class _JobManager(JobManager):
         """Give a task back."""
         del priority, queue, lock
         seconds = 0.0 if retry_at is None else max(0.0, (retry_at - datetime.now(UTC)).total_seconds())
-        await self._end(job, partial(self._queue.give_back, seconds=seconds))
+        failed = job.id in self.failed
+        self.failed -= {job.id}
+        await self._end(job, partial(self._queue.give_back, seconds=seconds, failed=failed))
 
     async def _end(self, job: jobs.Job, end: Callable[[Attempt], bool]) -> None:
         """End an attempt, as soon as the database can be had. A worker that stops leaves that to the others."""
@@ -369,8 +405,8 @@ class QueueWorker:
         options |= {"application_name": "fleetmap worker", "connect_timeout": 5, "keepalives_idle": 2}
         connector = _Connector(conninfo=make_conninfo(**options), min_size=1, max_size=self._slots + 4, timeout=10.0)
         queue_app = procrastinate.App(connector=connector)
-        queue_app.job_manager = _JobManager(connector, self._queue, self._stopping.is_set)
-        queue_app.task(name=TASK, retry=_GiveBack(), pass_context=True)(self._perform)
+        queue_app.job_manager = manager = _JobManager(connector, self._queue, self._stopping.is_set)
+        queue_app.task(name=TASK, retry=_GiveBack(manager.failed), pass_context=True)(self._perform)
         async with queue_app.open_async():
             self._worker = Worker(
                 queue_app,
@@ -386,7 +422,7 @@ class QueueWorker:
             )
             if self._stopping.is_set():
                 return
-            beating = asyncio.create_task(_beat(queue_app.job_manager, self._worker))
+            beating = asyncio.create_task(_beat(manager, self._worker))
             try:
                 await self._worker.run()  # type: ignore[no-untyped-call]
             finally:
@@ -410,13 +446,22 @@ class QueueWorker:
             carry_out(self._performer, task)
 
     async def _watch(self) -> None:
-        """Put back the tasks of dead workers, every few seconds."""
+        """Put back the tasks of dead workers, every few seconds.
+
+        While the database is away no worker's heartbeat reaches it. So each has time to send one before it is missed.
+        """
+        since = time.monotonic() - STALLED_SECONDS
         while True:
             await asyncio.sleep(HEARTBEAT_SECONDS)
             try:
+                if time.monotonic() - since < STALLED_SECONDS:
+                    await asyncio.to_thread(self._queue.figures)
+                    continue
                 for task in await asyncio.to_thread(self._queue.put_back_stalled):
                     await asyncio.to_thread(self._give_up, task)
             except FleetMapError as error:
+                since = time.monotonic()
                 log.warning("worker: looking for dead workers failed, will retry: %s", error.detail)
             except Exception as error:  # noqa: BLE001  must survive a temporary loss of the database
+                since = time.monotonic()
                 log.warning("worker: looking for dead workers failed, will retry: %s", type(error).__name__)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.convert.worker import open_store
 from app.store.cell_changes import SAME, CellChangeImage
+from app.store.in_worker import open_store
 from app.syntax import images
 
 TILE = 256

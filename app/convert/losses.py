@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from app import formats, upload_reader
 from app.convert.comparison import Item, differing_fields, match_items
 from app.convert.recipe import Recipe
-from app.convert.worker import open_store
 from app.errors import BadUpload, CannotConvert
 from app.formats import Files, Format
 from app.limits import Limits
@@ -27,6 +26,7 @@ from app.model.features import Features, Properties
 from app.model.frame import GROUND
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.layers import VECTOR_LAYERS, Layer, Layers, PartKey
+from app.store.in_worker import open_store
 from app.store.values import Version
 from app.upload_reader import EnvironmentContext, UploadHints
 

@@ -6,9 +6,8 @@ import mimetypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import lru_cache, partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 from app import derive, formats, parameters, progress
 from app.convert import closures as applied_closures
@@ -26,13 +25,10 @@ from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.layers import Layer, Layers, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
+from app.store.in_worker import open_store
 from app.store.values import PartEntry, Provenance, Version, datum_information
 from app.syntax import archives
 from app.templates import resolve
-
-if TYPE_CHECKING:
-    from app.store.store import Store
-
 
 READ_PART = 0.1
 DERIVED_PART = 0.1, 0.7
@@ -46,14 +42,6 @@ class WrittenMap:
     files: dict[str, bytes]
     report: Report
     places: dict[str, tuple[str, str]] = field(default_factory=dict)
-
-
-@lru_cache(maxsize=4)
-def open_store(database_url: str, blob_dir: str) -> Store:
-    """Open the store in a worker; cached between jobs."""
-    from app.store.store import Store  # not needed to convert files
-
-    return Store(database_url, Path(blob_dir), readonly=True)
 
 
 def convert_version(

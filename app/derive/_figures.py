@@ -74,7 +74,9 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
     if pieces(mask) > MAX_PIECES:
         raise CannotConvert(f"the grid is too noisy: it has more than {MAX_PIECES} pieces and holes")
     rims, seen = _broken_rims(mask, free, sizes)
-    contours, tree = cv2.findContours(mask & (1 - seen), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    np.subtract(mask, seen, out=seen)  # arrays as large as the grid are used again: they are most of the memory
+    contours, tree = cv2.findContours(seen, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    del seen
     shapes = MaskShapes([], [], [], [], 0)
     specks = 0
     rest = np.zeros(mask.shape, np.uint8)
@@ -113,8 +115,11 @@ def figures(mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: ShapeLimits
         else:
             cv2.drawContours(rest, [contours[k], *(contours[c] for c in inner)], -1, 1, cv2.FILLED)
     if rest.any():
-        thin |= _split_others(rest & mask, sizes, shapes)
-    shapes = _join(_without_insides(shapes, rims, mask.shape), thin & mask, free, sizes)
+        rest &= mask
+        _split_others(rest, thin, sizes, shapes)
+    del rest
+    thin &= mask
+    shapes = _join(_without_insides(shapes, rims, mask.shape), thin, free, sizes)
     return _with_tables(replace(shapes, specks=specks), np.array(legs), free, sizes)
 
 
@@ -217,7 +222,8 @@ def _join(shapes: MaskShapes, thin: NDArray[np.uint8], free: NDArray[np.bool_], 
     main = _directions(walls)
     # across the main directions, what is little longer than clutter is clutter
     walls = [wall for wall in walls if not main or wall.length >= OBLIQUE * sizes.length or _is_along(wall, main)]
-    left = thin & (1 - _painted(walls, thin.shape, 1.0))
+    left = _painted(walls, thin.shape, 1.0)
+    np.greater(thin, left, out=left.view(bool))
     return replace(shapes, walls=walls, areas=[*shapes.areas, *_remains(left)])
 
 
@@ -396,8 +402,8 @@ def _arc(contour: Any, mask: NDArray[np.uint8], free: NDArray[np.bool_], sizes: 
     return disc if (free[y : y + height, x : x + width] & inner).sum() <= FREE_IN_ARC * inner.sum() else None
 
 
-def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> NDArray[np.uint8]:
-    """Split the remaining shapes: thin parts become walls, the others rectangles or areas. Returns the thin parts."""
+def _split_others(rest: NDArray[np.uint8], out: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShapes) -> None:
+    """Split the remaining shapes: thin parts become walls and are marked in ``out``, others rectangles or areas."""
     from app.derive import _skeleton
 
     rows, columns = np.flatnonzero(rest.any(axis=1)), np.flatnonzero(rest.any(axis=0))
@@ -407,20 +413,19 @@ def _split_others(rest: NDArray[np.uint8], sizes: ShapeLimits, shapes: MaskShape
     thick = _open_mask(mask, sizes.wall / 2)
     if thick.any():
         shapes.areas.extend(_areas(thick, sizes, shapes, at))
-    thin = mask & (1 - thick)
-    out = np.zeros(rest.shape, np.uint8)
-    out[top : int(rows[-1]) + 1, left : int(columns[-1]) + 1] = thin[1:-1, 1:-1]
-    if not thin.any():
-        return out
-    free_space = _skeleton.space(thin.copy(), 0, 0, 0.0)
+    mask -= thick
+    del thick
+    out[top : int(rows[-1]) + 1, left : int(columns[-1]) + 1] |= mask[1:-1, 1:-1]
+    if not mask.any():
+        return
+    free_space = _skeleton.space(mask, 0, 0, 0.0)  # without a radius the mask does not change
     # branches that reach less than their width out of a wall are roughness
     graph, _ = _skeleton.skeleton(free_space, merge=2.0, spur=sizes.speck, tolerance=sizes.tolerance, island=0.0)
     if len(graph.edges) > MAX_FIGURES:
         raise CannotConvert(f"the grid shows no walls: its thin pieces have more than {MAX_FIGURES} edges")
-    for wall in wall_boxes(thin, straighten_lines(graph.nodes[:, ::-1], graph.edges, sizes.tolerance), sizes.wall):
+    for wall in wall_boxes(mask, straighten_lines(graph.nodes[:, ::-1], graph.edges, sizes.tolerance), sizes.wall):
         if wall.length >= sizes.speck:
             shapes.walls.append(replace(wall, x=wall.x + float(at[0]), y=wall.y + float(at[1])))
-    return out
 
 
 def _open_mask(mask: NDArray[np.uint8], radius: float) -> NDArray[np.uint8]:

@@ -6,6 +6,8 @@ import os
 from collections.abc import Iterator
 from datetime import timedelta
 
+from app.backends.blob_s3 import S3Files
+from app.backends.s3_faults import Fault
 from app.doctor.disks import FREE
 from app.doctor.registry import Finding, check, error, human_size, ok, warning
 from app.doctor.site import Site
@@ -84,18 +86,35 @@ def stored_files(site: Site) -> Iterator[Finding]:
     if not site.has_database:
         yield ok("not checked without a database", place)
         return
+    if place.startswith("s3://"):
+        yield from _bucket_findings(site, place)
+        return
     try:
         site.store.blobs.files.check()
     except FleetMapError as failure:
-        yield error(failure.detail, place, _files_advice(site, failure))
+        yield error(failure.detail, place, _folder_advice(failure))
     else:
         yield ok("can be written", place)
 
 
-def _files_advice(site: Site, failure: FleetMapError) -> str:
-    """Say what to do with a store of files that cannot be written."""
-    if (site.settings.blob_url or "").startswith("s3://"):
-        return "check its address, its keys and their rights, and whether it has space"
+def _bucket_findings(site: Site, place: str) -> Iterator[Finding]:
+    """Say what is wrong with a store of files in S3, each reason once."""
+    if site.endpoint_fault is not None:
+        yield error(site.endpoint_fault.reason, place, site.endpoint_fault.advice)
+        return
+    files = site.store.blobs.files
+    assert isinstance(files, S3Files)
+    faults: dict[Fault, list[str]] = {}
+    for done, fault in files.find_faults():
+        faults.setdefault(fault, []).append(done)
+    for fault, denied in faults.items():
+        yield error(f"the bucket cannot be {' or '.join(denied)}: {fault.reason}", place, fault.advice)
+    if not faults:
+        yield ok("can be written, read, listed and emptied", place)
+
+
+def _folder_advice(failure: FleetMapError) -> str:
+    """Say what to do with a folder of files that cannot be written."""
     if isinstance(failure, NoRoom):
         return FREE
     return f"let the user of the server, who runs this, write it and all below: chown -R {os.getuid()} (check folders)"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import httpx
 
+from app.backends.s3_faults import Fault, check_endpoint
 from app.config import Settings
 from app.errors import FleetMapError, Unavailable
 from app.events.credentials import server_ssl_context
@@ -74,8 +75,16 @@ class Site:
 
     @cached_property
     def store(self) -> Store:
-        """Store of the settings, opened only for reading, once."""
-        return open_store(self.settings, readonly=True)
+        """Store of the settings, opened only for reading, once; without its files, if their address is unusable."""
+        settings = self.settings
+        if self.endpoint_fault is not None:
+            settings = settings.model_copy(update={"blob_url": None, "blob_access_key": None})
+        return open_store(settings, readonly=True)
+
+    @property
+    def endpoint_fault(self) -> Fault | None:
+        """What is wrong with the address of the S3 server."""
+        return check_endpoint() if (self.settings.blob_url or "").startswith("s3://") else None
 
     @cached_property
     def is_database_usable(self) -> bool:

@@ -12,13 +12,13 @@ import numpy as np
 from app import derive
 from app.derive import DerivationNotes
 from app.errors import CannotConvert, Invalid, NotFound, Problem
-from app.ingest.prepare import open_store
 from app.model import alignment
 from app.model.frame import GROUND
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
 from app.model.names import did_you_mean
 from app.store.changes import Changes, Prepared, Replace
+from app.store.in_worker import open_store
 from app.store.values import Version
 
 ALIGNED = "aligned"

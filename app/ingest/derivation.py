@@ -9,10 +9,11 @@ from typing import Any
 from app import derive, parameters, progress
 from app.derive import ChainFailure, DerivationNotes, Step
 from app.errors import CannotDerive, Conflict, Invalid, MissingLayer, NotFound, Problem
-from app.ingest.prepare import READ, open_store
+from app.ingest.prepare import READ
 from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
 from app.model.names import did_you_mean
 from app.store.changes import Changes, Prepared, Provenance, Replace
+from app.store.in_worker import open_store
 from app.store.values import PartEntry, Version, frame_input
 
 

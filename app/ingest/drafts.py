@@ -10,9 +10,9 @@ from typing import Any, Final, TypeVar
 
 from app.errors import Denied, StaleParent
 from app.ingest.edits import check_depth, edit_changes
-from app.ingest.prepare import open_store
 from app.ingest.rebase import MergeConflict, Side, prepare_rebase
 from app.store.changes import Changes, Prepared
+from app.store.in_worker import open_store
 from app.store.store import Store
 from app.store.values import DRAFT_PREFIX, Draft, Version, Writer
 

@@ -9,9 +9,10 @@ from typing import Any
 from app import generate, progress
 from app.derive import DerivationNotes
 from app.errors import Conflict, Problem
-from app.ingest.prepare import READ, open_store
+from app.ingest.prepare import READ
 from app.model.layers import Layers, PartKey
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Replace
+from app.store.in_worker import open_store
 from app.store.store import Store
 from app.store.values import PartEntry, Version
 

@@ -12,7 +12,6 @@ import numpy as np
 from app.derive import DerivationNotes
 from app.errors import CannotConvert, Conflict, Invalid, NotFound, Problem
 from app.ingest.alignment import AlignmentResult
-from app.ingest.prepare import open_store
 from app.model import alignment, stitching
 from app.model.alignment import Fit
 from app.model.frame import GROUND
@@ -20,6 +19,7 @@ from app.model.grid import OccupancyGrid, unknown_grey
 from app.model.layers import PartKey
 from app.model.names import did_you_mean
 from app.store.changes import Changes, Drop, Operation, Provenance, Replace
+from app.store.in_worker import open_store
 from app.store.values import Information, PartEntry, Version
 
 MERGED = "merged"

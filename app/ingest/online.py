@@ -37,13 +37,13 @@ from app.errors import (
     Problem,
     Unavailable,
 )
-from app.ingest.prepare import open_store
 from app.limits import Limits
 from app.model.geodesy import WGS84, between
 from app.model.imagery import GeoImage
 from app.model.layers import Layers, PartKey
 from app.parameters import describe, parameter
 from app.store.changes import Changes, Prepared, Provenance, Replace
+from app.store.in_worker import open_store
 from app.store.values import Version
 from app.upload_reader import EnvironmentContext, UploadHints
 

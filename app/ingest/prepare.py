@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +24,7 @@ from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
+from app.store.in_worker import open_store
 from app.store.store import Store
 from app.store.values import Version
 from app.upload_reader import Bundle, EnvironmentContext, UploadHints
@@ -52,12 +52,6 @@ class PreparedUpload:
     notes: tuple[FileNote, ...]
     warnings: tuple[Problem, ...]
     members: Mapping[str, bytes]
-
-
-@lru_cache(maxsize=4)
-def open_store(database_url: str, blob_dir: str) -> Store:
-    """Open the store in a worker; cached between jobs."""
-    return Store(database_url, Path(blob_dir), readonly=True)
 
 
 def prepare_upload(

@@ -13,7 +13,6 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import shapely
 
-from app.ingest.prepare import open_store
 from app.model.features import Features, Properties
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
@@ -21,6 +20,7 @@ from app.model.grid import OccupancyGrid
 from app.model.layers import PartKey, join_levels
 from app.store.changes import KEEP, Changes, Delete, Operation, Prepared, Put, Replace
 from app.store.encode import pack
+from app.store.in_worker import open_store
 from app.store.store import Store
 from app.store.values import FeatureDelta, GridDelta, Version
 

@@ -16,10 +16,11 @@ from typing import Any, Protocol
 
 from app import upload_reader
 from app.errors import Damaged, FleetMapError, NotFound
-from app.ingest.prepare import open_store, operation_for, read_fence
+from app.ingest.prepare import operation_for, read_fence
 from app.limits import Limits
 from app.model.layers import PartKey
 from app.store.changes import Put
+from app.store.in_worker import open_store
 from app.store.prepare import compose_operation
 from app.store.store import Store
 from app.store.tree import ChunkStage

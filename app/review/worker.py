@@ -10,7 +10,6 @@ import numpy as np
 
 from app.event_types import RobotPlace
 from app.ingest.edits import edit_changes
-from app.ingest.prepare import open_store
 from app.model.features import Features, concatenate
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers, Part, PartKey
@@ -18,6 +17,7 @@ from app.review.impact import Blocked, Comparison, CutOff
 from app.review.rules import check_layers
 from app.review.touched import RobotImpact, RobotTouch
 from app.store.changes import Changes, Delete, Drop, Put, Replace
+from app.store.in_worker import open_store
 from app.store.store import Store
 from app.store.values import Version
 

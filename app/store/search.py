@@ -7,7 +7,7 @@ returned. Others that contain it come from an index of groups of three character
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple
@@ -22,7 +22,6 @@ from sqlalchemy import (
     Row,
     Select,
     Text,
-    and_,
     any_,
     bindparam,
     cast,
@@ -32,7 +31,9 @@ from sqlalchemy import (
     or_,
     select,
     table,
+    true,
     union_all,
+    values,
 )
 from sqlalchemy.dialects.postgresql import TSQUERY
 
@@ -126,24 +127,31 @@ class Search:
     def _matches(self, connection: Connection, scope: _Scope, needle: str, limit: int) -> Iterator[_Match]:
         """Find the best ``limit`` items, best first; one that matches by name and id may come twice."""
         sqlite = self._database.sqlite
-        values = {**scope.values, "needle": needle, "last": needle + LAST}
+        given = {**scope.values, "needle": needle, "last": needle + LAST}
         if scope.form == "few":
-            rows = connection.execute(_all_query(sqlite=sqlite), values)
+            rows = connection.execute(_all_query(sqlite=sqlite), given)
             yield from heapq.nsmallest(limit, (_best_match(row, needle) for row in rows))
             return
-        seen: set[int] = set()
-        for rank in (EQUAL, PREFIX):
-            ordered = _ordered_query(rank, scope.form, sqlite=sqlite)
-            rows = connection.execute(ordered, {**values, "limit": limit + len(seen)})
-            for match in sorted(_match(row, rank, by_id=bool(row.by_id)) for row in rows):
-                seen.add(match.id)
-                yield match
-        values |= {"wanted": wanted_grams(needle, sqlite=sqlite), "limit": MAX_CANDIDATES + limit}
-        for kind in range(len(ORDER)):
-            query = _part_query(scope.form, kind, is_short=len(needle) < GRAM, sqlite=sqlite)
-            rows = connection.execute(query, {**values, "kind": kind})
-            matches = (_best_match(row, needle) for row in rows)
+        beginning = connection.execute(_ordered_query(scope.form, sqlite=sqlite), {**given, "limit": limit})
+        yield from sorted(_ordered_match(row, needle) for row in beginning)
+        given |= {"wanted": wanted_grams(needle, sqlite=sqlite), "limit": MAX_CANDIDATES + limit}
+        for candidates in self._part_rows(connection, scope.form, given, is_short=len(needle) < GRAM):
+            matches = (_best_match(row, needle) for row in candidates)
             yield from sorted(match for match in matches if match.rank == PART)
+
+    def _part_rows(
+        self, connection: Connection, form: Form, given: Mapping[str, Any], *, is_short: bool
+    ) -> Iterator[Sequence[Row[Any]]]:
+        """Read items that contain the text: of all kinds or, if there are too many, of one kind after another."""
+        sqlite = self._database.sqlite
+        if not sqlite:
+            rows = connection.execute(_part_query(form, None, is_short=is_short, sqlite=sqlite), given).all()
+            if len(rows) < given["limit"]:
+                yield rows
+                return
+        for kind in range(len(ORDER)):
+            query = _part_query(form, kind, is_short=is_short, sqlite=sqlite)
+            yield connection.execute(query, {**given, "kind": kind}).all()
 
 
 # --- which environments ---
@@ -208,29 +216,40 @@ def _all_query(*, sqlite: bool) -> Select[Any]:
 
 
 @lru_cache
-def _ordered_query(rank: int, form: Form, *, sqlite: bool) -> CompoundSelect[Any]:
-    """Select the first items of each kind whose name or id equals the text, or begins with it."""
+def _ordered_query(form: Form, *, sqlite: bool) -> CompoundSelect[Any]:
+    """Select the first items of each kind whose name or id equals the text or begins with it, in their order.
+
+    One subquery for all kinds on PostgreSQL: it takes longer to plan one than to execute it.
+    """
     item = tables.search_item
     needle, last = bindparam("needle", type_=Text), bindparam("last", type_=Text)
-    queries = []
-    for kind in range(len(ORDER)):
-        for by_id, text in enumerate((item.c.folded, item.c.folded_id)):
-            condition = text == needle if rank == EQUAL else and_(text > needle, text < last)
-            query = _items(form, sqlite=sqlite).add_columns(literal_column(str(by_id)).label("by_id"))
-            query = query.where(item.c.kind == literal_column(str(kind)), condition)
-            order = (text, item.c.environment, item.c.level, item.c.feature)
-            queries.append(select(query.order_by(*order).limit(bindparam("limit", type_=Integer)).subquery()))
+    listed = values(column("number", Integer), name="kinds", literal_binds=True)
+    kinds = listed.data([(kind,) for kind in range(len(ORDER))])
+    queries: list[Select[Any]] = []
+    for by_id, text in enumerate((item.c.folded, item.c.folded_id)):
+        query = _items(form, sqlite=sqlite).add_columns(literal_column(str(by_id)).label("by_id"))
+        query = query.where(text >= needle, text < last)
+        query = query.order_by(text, item.c.environment, item.c.level, item.c.feature)
+        query = query.limit(bindparam("limit", type_=Integer))
+        if sqlite:
+            chosen = (query.where(item.c.kind == literal_column(str(kind))) for kind in range(len(ORDER)))
+            queries += (select(some.subquery()) for some in chosen)
+        else:
+            some = query.where(item.c.kind == kinds.c.number).lateral()
+            queries.append(select(some).select_from(kinds.join(some, true())))
     return union_all(*queries)
 
 
 @lru_cache
-def _part_query(form: Form, kind: int, *, is_short: bool, sqlite: bool) -> Select[Any]:
-    """Select items of a kind that contain the text, by the index of three characters in a row."""
+def _part_query(form: Form, kind: int | None, *, is_short: bool, sqlite: bool) -> Select[Any]:
+    """Select items that contain the text, by the index of three characters in a row. kind: None for all of them."""
     item = tables.search_item
     query = _items(form, sqlite=sqlite).where(_has_text(sqlite=sqlite)).limit(bindparam("limit", type_=Integer))
     if not sqlite:
         wanted = cast(bindparam("wanted", type_=Text), TSQUERY)
-        return query.where(item.c.kind == bindparam("kind"), item.c.grams.op("@@")(wanted))
+        query = query.where(item.c.grams.op("@@")(wanted))
+        return query if kind is None else query.where(item.c.kind == bindparam("kind"))
+    assert kind is not None, "each kind has an index of its own"
     name = f"search_{ORDER[kind]}"
     if is_short:
         term = table(f"{name}_term", column("term"), column("doc")).c
@@ -257,6 +276,12 @@ def _best_match(row: Row[Any], needle: str) -> _Match:
     ]
     rank, by_id = min(ranks)
     return _match(row, rank, by_id=bool(by_id))
+
+
+def _ordered_match(row: Row[Any], needle: str) -> _Match:
+    """Return a match at the beginning of an item's name or id, whichever the row was found by."""
+    text = row.folded_id if row.by_id else row.folded
+    return _match(row, EQUAL if text == needle else PREFIX, by_id=bool(row.by_id))
 
 
 def _match(row: Row[Any], rank: int, *, by_id: bool) -> _Match:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import itertools
 import json
 import threading
 import time
@@ -45,6 +46,7 @@ class Fake:
         self.statuses: list[dict[str, Any]] = []
         self.asked: list[str] = []
         self.instead: Callable[[BaseHTTPRequestHandler], bool] = lambda _: False
+        self._numbers, self._current, self._answered = itertools.count(), set[int](), threading.Condition()
         fake = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -52,14 +54,14 @@ class Fake:
             wbufsize = -1
 
             def do_GET(self) -> None:
-                fake.asked.append(self.path)
-                with contextlib.suppress(OSError):
+                with fake._answering():
+                    fake.asked.append(self.path)
                     if not fake.instead(self):
                         fake.answer(self)
 
             def do_PUT(self) -> None:
                 fake.statuses.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
-                with contextlib.suppress(OSError):
+                with fake._answering():
                     if not fake.instead(self):
                         send(self, 204, b"")
 
@@ -81,6 +83,25 @@ class Fake:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(60)
+
+    def finish_requests(self) -> None:
+        """Wait until all requests that are being answered now have been answered."""
+        with self._answered:
+            current = set(self._current)
+            assert self._answered.wait_for(lambda: not current & self._current, 60)
+
+    @contextlib.contextmanager
+    def _answering(self) -> Iterator[None]:
+        number = next(self._numbers)
+        with self._answered:
+            self._current.add(number)
+        try:
+            with contextlib.suppress(OSError):
+                yield
+        finally:
+            with self._answered:
+                self._current.remove(number)
+                self._answered.notify_all()
 
     def put(self, files: Files) -> int:
         """A version with these files; its number."""
@@ -189,6 +210,16 @@ def send(handler: BaseHTTPRequestHandler, status: int, body: bytes, **headers: s
         handler.send_header(name, value)
     handler.end_headers()
     handler.wfile.write(body)
+
+
+class StoppedClock:
+    """Monotonic clock that a test moves, in place of a module's ``time``: no load of the machine makes it later."""
+
+    def __init__(self) -> None:
+        self.seconds = 1000.0
+
+    def monotonic(self) -> float:
+        return self.seconds
 
 
 @contextlib.contextmanager

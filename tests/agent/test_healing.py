@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta, timezone
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ import pytest
 from app.agent import activation, agent, freshness
 from app.cli.agent import _logger
 from tests.agent.conftest import whole
-from tests.agent.fake import Fake, One, run, send
+from tests.agent.fake import Fake, One, StoppedClock, run, send
 from tests.events.conftest import eventually
 
 A, B, C = ({"kml/map.kml": letter * 5000} for letter in (b"a", b"b", b"c"))
@@ -61,42 +62,66 @@ def test_log_prints_invalid_unicode(as_json: bool, capfd: pytest.CaptureFixture[
     assert "bad ? text" in captured.out + captured.err
 
 
-def test_time_far_ahead_does_not_freeze_server(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(freshness, "STALE_SECONDS", 1.0)
-    one = robot(poll_seconds=0.05)
-    with run(one):
-        eventually(lambda: one.saw("active", version=1))
-        fake.more = {"time": later(hours=2)}
-        version = fake.put(B)
-        eventually(lambda: one.saw("active", version=version))
-        fake.more = {}
-        end = time.monotonic() + 3
-        while time.monotonic() < end:
-            fake.put(C)
-            time.sleep(0.1)
-    assert not one.saw("refused"), one.detail
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
+    """The clock by which the age of signed responses is judged."""
+    clock = StoppedClock()
+    monkeypatch.setattr(freshness, "time", clock)
+    return clock
 
 
-def test_planned_versions_do_not_hide_a_frozen_channel(
-    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def opened(fake: Fake, tmp_path: Path) -> Iterator[One]:
+    """An agent that stays the same for several polls."""
+    one = One(fake, tmp_path / "robot")
+    one.agent.open()
+    yield one
+    one.agent.close()
+
+
+def test_time_far_ahead_does_not_freeze_server(fake: Fake, stopped: StoppedClock, opened: One) -> None:
+    assert opened.agent.run_once()
+    fake.more = {"time": later(hours=2)}
     fake.put(B)
-    fake.move("production", 1)
-    assert robot().once()
-    monkeypatch.setattr(freshness, "STALE_SECONDS", 1.0)
-    count = 0
+    assert opened.agent.run_once()
+    fake.more = {}
+    for _ in range(5):  # in all much longer than half an hour
+        stopped.seconds += 1200
+        fake.put(C)
+        assert opened.agent.run_once()
+    assert not opened.saw("refused")
+    stopped.seconds += 1801
+    assert not opened.agent.run_once(), "and then it is frozen"
+    assert "no new signed response" in opened.detail
 
-    def change(handler: object) -> bool:
-        nonlocal count
-        count += 1
-        fake.plan("production", 1 + count % 2)  # another one with each poll
+
+def test_slow_download_and_hooks_do_not_freeze_server(fake: Fake, stopped: StoppedClock, tmp_path: Path) -> None:
+    def slow(handler: BaseHTTPRequestHandler) -> bool:
+        stopped.seconds += 3600.0 * ("/maps/" in handler.path)
         return False
 
-    fake.instead = change
-    one = robot(poll_seconds=0.05)
-    with run(one):
-        eventually(lambda: one.saw("refused"))
-        assert "no new signed response" in one.detail
+    one = One(fake, tmp_path / "robot", "true")
+    fake.instead = slow
+    one.agent.open()
+    assert one.agent.run_once()
+    assert (fake.statuses[-1]["state"], fake.statuses[-1]["version"]) == ("active", 1)
+    assert not one.agent.run_once(), "an hour later the same response is returned"
+    assert "no new signed response" in one.detail
+    fake.put(B)
+    assert one.agent.run_once()
+    one.agent.close()
+
+
+def test_planned_versions_do_not_hide_a_frozen_channel(fake: Fake, stopped: StoppedClock, opened: One) -> None:
+    fake.put(B)
+    fake.move("production", 1)
+    assert opened.agent.run_once()
+    for count in range(4):
+        stopped.seconds += 600
+        fake.plan("production", 1 + count % 2)  # another one with each poll
+        opened.agent.run_once()
+        assert bool(opened.saw("refused")) == (count == 3)
+    assert "no new signed response" in opened.detail
 
 
 def test_agent_recovers_from_absurd_time_at_first_contact(fake: Fake, robot: Robot) -> None:

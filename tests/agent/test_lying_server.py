@@ -8,7 +8,7 @@ import hashlib
 import json
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -22,7 +22,7 @@ from app.agent.state import AgentState, Mark, load, save
 from app.errors import Conflict
 from app.signing import Keys
 from tests.agent.conftest import whole
-from tests.agent.fake import Fake, One, run, send
+from tests.agent.fake import Fake, One, StoppedClock, run, send
 from tests.agent.test_bad_server import event
 from tests.events.conftest import eventually
 
@@ -205,6 +205,7 @@ def test_attack_is_refused_reported_and_healed(
         eventually(lambda: one.saw("active", version=1))
         honest = fake.instead
         attack(fake, tmp_path)
+        fake.finish_requests()
         fake.put(B)
         eventually(lambda: fake.statuses[-1]["state"] == "failed" and word in fake.statuses[-1]["detail"])
         assert whole(one.into)["version"] == 1
@@ -238,45 +239,69 @@ def test_slow_download_is_resumed(fake: Fake, robot: Robot) -> None:
 # --- frozen ---
 
 
-def test_frozen_server_is_reported(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(freshness, "STALE_SECONDS", 0.5)
-    one = robot(poll_seconds=0.05)
-    with run(one):
-        eventually(lambda: one.saw("active", version=1))
-        data = fake.manifest("latest")
-        key, signature = fake.keys.sign(data)
-        header = f"{key}:{base64.b64encode(signature).decode()}"
-
-        def frozen(handler: BaseHTTPRequestHandler) -> bool:
-            if "/manifest" in handler.path:
-                send(handler, 200, data, **{"fleetmap-signature": header})
-            return "/manifest" in handler.path
-
-        fake.instead = frozen
-        fake.put(B)
-        eventually(lambda: "no new signed response since" in fake.statuses[-1].get("detail", ""))
-        assert fake.statuses[-1]["state"] == "failed"
-        assert whole(one.into)["version"] == 1
-        one.agent._freshness._stale_after = 1800.0  # on a busy machine half a second passes between two polls
-        fake.instead = lambda _: False
-        eventually(lambda: fake.statuses[-1]["state"] == "active" and fake.statuses[-1]["version"] == 2)
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
+    """The clock by which the age of signed responses and of events is judged."""
+    clock = StoppedClock()
+    monkeypatch.setattr(freshness, "time", clock)
+    return clock
 
 
-def test_server_behind_its_events_is_reported(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(freshness, "BEHIND_SECONDS", 0.2)
-    one = robot(poll_seconds=0.1)
-    with run(one):
-        eventually(lambda: one.saw("active", version=1))
-        one.agent._on_event(event(2))
-        eventually(lambda: "sequence 2 was announced" in fake.statuses[-1].get("detail", ""))
+@pytest.fixture
+def opened(robot: Robot) -> Iterator[One]:
+    """An agent that stays the same for several polls."""
+    one = robot()
+    one.agent.open()
+    yield one
+    one.agent.close()
+
+
+def test_frozen_server_is_reported(fake: Fake, opened: One, stopped: StoppedClock) -> None:
+    assert opened.agent.run_once()
+    data = fake.manifest("latest")
+    key, signature = fake.keys.sign(data)
+    header = f"{key}:{base64.b64encode(signature).decode()}"
+
+    def frozen(handler: BaseHTTPRequestHandler) -> bool:
+        if "/manifest" in handler.path:
+            send(handler, 200, data, **{"fleetmap-signature": header})
+        return "/manifest" in handler.path
+
+    fake.instead = frozen
+    fake.put(B)
+    assert opened.agent.run_once()
+    stopped.seconds += 1800
+    assert opened.agent.run_once(), "as long as one may have been signed before"
+    stopped.seconds += 1
+    assert not opened.agent.run_once()
+    assert fake.statuses[-1]["state"] == "failed"
+    assert "no new signed response since" in fake.statuses[-1]["detail"]
+    assert whole(opened.into)["version"] == 1
+    fake.instead = lambda _: False
+    assert opened.agent.run_once()
+    assert (fake.statuses[-1]["state"], fake.statuses[-1]["version"]) == ("active", 2)
+
+
+def test_server_behind_its_events_is_reported(fake: Fake, opened: One, stopped: StoppedClock) -> None:
+    def remark() -> str:
+        assert opened.agent.run_once()
         assert fake.statuses[-1]["state"] == "active", "events are not signed: they make no robot fail"
-        fake.put(B)
-        eventually(lambda: fake.statuses[-1]["version"] == 2 and "detail" not in fake.statuses[-1])
-        one.agent._on_event(event(10**17))
-        monkeypatch.setattr(freshness, "FORGET_SECONDS", 0.5)
-        one.agent._on_event(event(9))
-        eventually(lambda: "sequence 9" in fake.statuses[-1].get("detail", ""))
-        eventually(lambda: "detail" not in fake.statuses[-1])
+        return str(fake.statuses[-1].get("detail", ""))
+
+    assert not remark()
+    opened.agent._on_event(event(2))
+    assert not remark()
+    stopped.seconds += 61
+    assert "sequence 2 was announced" in remark()
+    fake.put(B)
+    assert not remark()
+    assert fake.statuses[-1]["version"] == 2
+    opened.agent._on_event(event(10**17))
+    opened.agent._on_event(event(9))
+    stopped.seconds += 61
+    assert "sequence 9" in remark(), "the other one is absurd"
+    stopped.seconds += 901
+    assert not remark(), "forgotten"
 
 
 # --- time ---

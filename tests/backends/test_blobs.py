@@ -48,6 +48,15 @@ def test_files_are_read_as_written(files: BlobFiles) -> None:
     assert all(len(piece) <= 4 * 2**20 for piece in files.stream("ab/large")), "in pieces"
 
 
+def test_pieces_beyond_the_end_are_empty(files: BlobFiles) -> None:
+    """So what was in a file that was cut off counts as damaged, which a repair mends, and not as away for a while."""
+    files.write({"packs/one": b"0123456789"})
+    assert read(files, "packs/one", 8, 4) == b"89"
+    assert read(files, "packs/one", 10, 4) == b""
+    assert read(files, "packs/one", 20, 4) == b""
+    assert read(files, "packs/one", 20) == b""
+
+
 def test_absent_file_is_told_from_an_unreadable_one(files: BlobFiles) -> None:
     with pytest.raises(FileNotFoundError):
         read(files, "ab/none")
@@ -89,6 +98,15 @@ def test_store_that_works_passes_the_check(files: BlobFiles) -> None:
     files.check()
     files.check(readonly=True)
     assert list(files.list()) == [], "the check leaves nothing to collect"
+
+
+def test_folder_that_is_gone_is_unreadable(tmp_path: Path) -> None:
+    """Such as one that several servers mount: nothing is concluded from its files not being there."""
+    files = FolderFiles(tmp_path / "blobs")
+    with pytest.raises(Unreadable):
+        list(files.list())
+    with pytest.raises(Unavailable):
+        files.check(readonly=True)
 
 
 def test_refused_access_says_what_to_check(s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

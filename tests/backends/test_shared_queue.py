@@ -12,7 +12,7 @@ from sqlalchemy import text
 
 from app.backends import shared_queue
 from app.backends.fence import fenced_by
-from app.backends.queue import Task
+from app.backends.queue import MAX_FAILURES, Task
 from app.backends.shared_queue import Attempt, SharedQueue, TaskLostError
 from app.errors import NoRoom, Unavailable
 from tests.backends.test_queue import Case, eventually, made, shared_case
@@ -98,6 +98,64 @@ def test_task_is_not_put_back_while_its_worker_commits(case: Case, queue: Shared
         assert rows(queue) == [("doing", 0)]
     queue.put_back_stalled()
     assert rows(queue) == [("todo", 1)]
+
+
+def test_task_fails_of_dead_workers_only(case: Case, queue: SharedQueue) -> None:
+    """Upgrades that stop a worker in the middle of a long task are no reason to give it up, however many."""
+    case.submit("task")
+    for _ in range(2 * shared_queue.MAX_DEATHS):
+        assert queue.give_back(take(queue), 0)
+    for _ in range(shared_queue.MAX_DEATHS - 1):
+        take(queue)
+        assert queue.put_back_stalled() == []
+    assert queue.give_back(take(queue), 0)
+    take(queue)
+    assert [task.key for task in queue.put_back_stalled()] == ["task"]
+    assert rows(queue) == []
+
+
+def test_failures_of_a_task_count_by_themselves(case: Case, queue: SharedQueue) -> None:
+    perform = case.recorder.perform
+    seen: list[int] = []
+
+    def fail(task: Task) -> None:
+        perform(task)
+        seen.append(task.failures)
+        if task.failures < MAX_FAILURES:
+            raise NoRoom("the disk is full")
+
+    case.recorder.perform = fail  # type: ignore[method-assign]
+    case.submit("task")
+    for _ in range(2):
+        take(queue)
+        assert queue.put_back_stalled() == []
+        assert queue.give_back(take(queue), 0)
+    case.start()
+    eventually(lambda: rows(queue) == [])
+    assert seen == list(range(MAX_FAILURES + 1))
+
+
+def test_workers_have_time_for_a_heartbeat_when_the_database_is_back(
+    case: Case, queue: SharedQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shared_queue, "HEARTBEAT_SECONDS", 0.1)
+    monkeypatch.setattr(shared_queue, "STALLED_SECONDS", 2.0)
+    put_back = SharedQueue.put_back_stalled
+    calls: list[float] = []
+
+    def away_at_first(queue: SharedQueue) -> list[Task]:
+        calls.append(time.monotonic())
+        if len(calls) < 3:
+            raise Unavailable("the database is away")
+        return put_back(queue)
+
+    monkeypatch.setattr(SharedQueue, "put_back_stalled", away_at_first)
+    case.submit("task")
+    take(queue)
+    case.start()
+    eventually(lambda: made(case) == ["task"])
+    assert calls[1] - calls[0] >= 2.0
+    assert calls[2] - calls[1] >= 2.0
 
 
 def test_end_of_a_task_is_stored_once_the_database_can_be_had(

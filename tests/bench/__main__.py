@@ -261,9 +261,10 @@ def main() -> int:
             "servers",
             "sizing",
             "backup",
+            "backup-postgresql",
         ],
         help="one of the tables; scale and scale-postgresql (half an hour each), servers and sizing (with PostgreSQL), "
-        "and backup only if they are named",
+        "and backup and backup-postgresql only if they are named",
     )
     parser.add_argument(
         "--databases",
@@ -275,7 +276,7 @@ def main() -> int:
     if arguments.only == "sizing":
         return sizing.report(arguments.json)
     is_scale = arguments.only in ("scale", "scale-postgresql")
-    without_maps = ("generate", "large", "derived", "mirror", "servers", "backup")
+    without_maps = ("generate", "large", "derived", "mirror", "servers", "backup", "backup-postgresql")
     if not DATA.is_dir() and not is_scale and arguments.only not in without_maps:
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
@@ -293,7 +294,8 @@ def main() -> int:
     if is_scale:
         scale_rows = scale.rows(postgres=arguments.only == "scale-postgresql", folder=arguments.databases)
     mirror_rows = mirror.rows() if arguments.only in (None, "mirror") else []
-    backup_rows = backup.rows() if arguments.only == "backup" else []
+    is_backup = arguments.only in ("backup", "backup-postgresql")
+    backup_rows = backup.rows(postgres=arguments.only == "backup-postgresql") if is_backup else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": paths, "large": big, "events": event_rows}
         tables |= {

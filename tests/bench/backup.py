@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -36,6 +37,7 @@ from app.store.values import Source
 from tests.agent.conftest import network
 from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess
+from tests.postgres import running_cluster
 from tests.store.samples import GRID
 
 GIGABYTES = float(os.environ.get("FLEETMAP_BENCH_BACKUP_GB", "1"))
@@ -57,24 +59,59 @@ ENVIRONMENT = "filled"
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def rows() -> list[dict[str, Any]]:
-    """Measure everything on SQLite."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        data, place = folder / "data", folder / "backup"
-        with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs")) as store:
-            store.migrate()
-            fill(store, int(GIGABYTES * 2**30))
-        with running_server(data) as (server, client):
-            out, acknowledged = _during(client, data, place)
-            out += _incremental(client, data, place)
-            robots = _Robots(server.address, folder / "robots")
-            robots.sync()
-            promote(client, "writer-0", -1)
-            robots.sync()
-            port = int(server.address.rpartition(":")[2])
-        out += _restored(folder, place, acknowledged, robots, port)
-        out += _verification(folder / "restored")
+@dataclass(frozen=True)
+class Home:
+    """Data folder of a server, and its database: SQLite's file in it, or the URL of another one."""
+
+    data: Path
+    database: str | None = None
+
+    def open_store(self, *, readonly: bool = False) -> Store:
+        """Open the store."""
+        url = self.database or f"sqlite:///{self.data / 'fleetmap.sqlite3'}"
+        return Store(url, self.data / "blobs", readonly=readonly)
+
+    @property
+    def window_seconds(self) -> float:
+        """Time for which a backup is stopped: PostgreSQL gives what it holds to others once it is silent for 2 s."""
+        return WINDOW_SECONDS if self.database is None else WINDOW_SECONDS / 4
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options of a command on this data."""
+        database = () if self.database is None else ("--database-url", self.database)
+        return ("--data-dir", str(self.data), *database)
+
+
+def rows(*, postgres: bool = False) -> list[dict[str, Any]]:
+    """Measure everything on SQLite, or on PostgreSQL with synced commits."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        if not postgres:
+            return _rows(folder, Home(folder / "data"), Home(folder / "restored"))
+        cluster = stack.enter_context(running_cluster(synced=True))
+        (folder / "data" / "blobs").mkdir(parents=True)
+        urls = [cluster.url(cluster.create_database()) for _ in "12"]
+        return _rows(folder, Home(folder / "data", urls[0]), Home(folder / "restored", urls[1]))
+
+
+def _rows(folder: Path, home: Home, target: Home) -> list[dict[str, Any]]:
+    """Measure everything on one database."""
+    place = folder / "backup"
+    with closing(home.open_store()) as store:
+        store.migrate()
+        fill(store, int(GIGABYTES * 2**30))
+    with running_server(home) as (server, client):
+        out, acknowledged = _during(client, home, place)
+        out += _incremental(client, home, place)
+        robots = _Robots(server.address, folder / "robots")
+        robots.sync()
+        promote(client, "writer-0", -1)
+        robots.sync()
+        port = int(server.address.rpartition(":")[2])
+    out += _restored(target, place, acknowledged, robots, port)
+    if target.database is None:  # sha256sum reads what is in files
+        out += _verification(target.data)
     return out
 
 
@@ -102,10 +139,10 @@ def _commit_noise(store: Store, dice: np.random.Generator, number: int) -> None:
 
 
 @contextlib.contextmanager
-def running_server(data: Path, port: int = 0) -> Iterator[tuple[ServerProcess, httpx.Client]]:
+def running_server(home: Home, port: int = 0) -> Iterator[tuple[ServerProcess, httpx.Client]]:
     """Run a server on a data folder, with a client."""
     variables = {"FLEETMAP_ADMIN_TOKEN": ADMIN, "FLEETMAP_LOG_LEVEL": "warning", "FLEETMAP_SCRUB_HOURS": "0"}
-    server = ServerProcess("--data-dir", str(data), "--port", str(port), environment=variables, folder=ROOT)
+    server = ServerProcess(*home.options, "--port", str(port), environment=variables, folder=ROOT)
     try:
         address = server.ready()
         headers = {"Authorization": f"Bearer {ADMIN}"}
@@ -173,13 +210,13 @@ def finish_fleetmap(process: subprocess.Popen[str]) -> Any:
 
 
 def _during(
-    client: httpx.Client, data: Path, place: Path
+    client: httpx.Client, home: Home, place: Path
 ) -> tuple[list[dict[str, Any]], dict[str, dict[tuple[str, int], str]]]:
     """Measure commits during backups; returns what was acknowledged before and after the first one.
 
-    The backup is stopped and continued every WINDOW_SECONDS, so that other work on the machine slows both sides alike.
+    The backup is stopped and continued in turn, so that other work on the machine slows both sides alike.
     """
-    compiled = Path(os.environ.get(native.FOLDER, data / "native"))
+    compiled = Path(os.environ.get(native.FOLDER, home.data / "native"))
     deadline = time.monotonic() + MAX_COMPILE_SECONDS
     while not native.is_filled(compiled) and time.monotonic() < deadline:  # a new server compiles in the background
         time.sleep(1)
@@ -190,12 +227,12 @@ def _during(
     for cycle in range(CYCLES):
         acknowledged.setdefault("before", dict(writers.versions))
         into = place if cycle == 0 else place.with_name(f"backup{cycle}")
-        process = start_fleetmap("backup", str(into), "--keys", "--data-dir", str(data))
+        process = start_fleetmap("backup", str(into), "--keys", *home.options)
         while process.poll() is None:
             for is_running in (True, False):
                 process.send_signal(signal.SIGCONT if is_running else signal.SIGSTOP)
                 begin = time.monotonic()
-                time.sleep(WINDOW_SECONDS)
+                time.sleep(home.window_seconds)
                 windows[is_running].append((begin, time.monotonic()))
             process.send_signal(signal.SIGCONT)
         size = finish_fleetmap(process)["bytes"]
@@ -212,29 +249,29 @@ def _during(
     ], acknowledged
 
 
-def _incremental(client: httpx.Client, data: Path, place: Path) -> list[dict[str, Any]]:
+def _incremental(client: httpx.Client, home: Home, place: Path) -> list[dict[str, Any]]:
     """Measure what a second backup writes of a change: uploads, a large grid, and many small commits."""
-    former = _content_bytes(data)
-    with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs")) as store:
+    former = _content_bytes(home)
+    with closing(home.open_store()) as store:
         dice = np.random.default_rng(2)
         for number in range(max(1, int(GIGABYTES * 2**30 * SHARE_CHANGED) // STEP_BYTES)):
             _commit_noise(store, dice, number)
     writers = Writers(client)
     time.sleep(PHASE_SECONDS)
     writers.stop()
-    change = _content_bytes(data) - former
+    change = _content_bytes(home) - former
     before = _folder_bytes(place)
     begin = time.perf_counter()
-    fleetmap("backup", str(place), "--data-dir", str(data))
+    fleetmap("backup", str(place), *home.options)
     seconds = time.perf_counter() - begin
     written = _folder_bytes(place) - before
     label = f"second backup, {seconds:.0f} s: bytes written (peer: the change)"
     return [row(label, written / 1e6, MAX_WRITTEN, "MB", change / 1e6)]
 
 
-def _content_bytes(data: Path) -> int:
+def _content_bytes(home: Home) -> int:
     """Count the bytes of chunks and files: less than what the database's file grows by."""
-    with closing(Store(f"sqlite:///{data / 'fleetmap.sqlite3'}", data / "blobs", readonly=True)) as store:
+    with closing(home.open_store(readonly=True)) as store:
         with store._database.read() as connection:
             chunks = int(connection.exec_driver_sql("SELECT sum(length(data)) FROM chunk").scalar_one())
         return chunks + sum(file.size for file in store.blobs.files.list())
@@ -289,15 +326,14 @@ def promote(client: httpx.Client, environment: str, version: int) -> int:
 
 
 def _restored(
-    folder: Path, place: Path, acknowledged: dict[str, dict[tuple[str, int], str]], robots: _Robots, port: int
+    target: Home, place: Path, acknowledged: dict[str, dict[tuple[str, int], str]], robots: _Robots, port: int
 ) -> list[dict[str, Any]]:
     """Restore the first backup, which the robots are ahead of, and let them converge."""
     listed = fleetmap("backup", str(place), "--list")["backups"]
-    target = folder / "restored"
     begin = time.perf_counter()
-    fleetmap("restore", str(place), "--snapshot", listed[0]["id"], "--data-dir", str(target))
+    fleetmap("restore", str(place), "--snapshot", listed[0]["id"], *target.options)
     seconds = time.perf_counter() - begin
-    with closing(Store(f"sqlite:///{target / 'fleetmap.sqlite3'}", target / "blobs", readonly=True)) as store:
+    with closing(target.open_store(readonly=True)) as store:
         roots = {
             (e.name, v): store.versions.get(e.name, v).root
             for e in store.environments.page(limit=100)[0]

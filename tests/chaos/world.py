@@ -47,11 +47,14 @@ COMMIT, RELAY, DOWNLOAD, ANY = "commit", "relay", "download", "any"
 class World:
     """Server, router, database, and a process that collects garbage.
 
-    own_router: the server's own one; else a separate one. more: further variables of the server.
+    own_router: the server's own one; else a separate one. forked: see ServerProcess. more: further variables of the
+    server.
     """
 
-    def __init__(self, folder: Path, cluster: Cluster | None, *, own_router: bool, **more: str) -> None:
-        self.folder, self.cluster, self.own_router = folder, cluster, own_router
+    def __init__(
+        self, folder: Path, cluster: Cluster | None, *, own_router: bool, forked: bool = True, **more: str
+    ) -> None:
+        self.folder, self.cluster, self.own_router, self._forked = folder, cluster, own_router, forked
         self.port, self.zenoh = free_port(), free_port()
         self.variables = {
             "FLEETMAP_ADMIN_TOKEN": ADMIN,
@@ -86,7 +89,7 @@ class World:
     def serve(self) -> None:
         """Start the server and wait until it responds."""
         arguments = ("--port", str(self.port), "--data-dir", str(self.folder / "data"))
-        self.server = ServerProcess(*arguments, environment=self.variables, folder=ROOT)
+        self.server = ServerProcess(*arguments, environment=self.variables, folder=ROOT, forked=self._forked)
         self.server.ready()
 
     def revive(self, target: str) -> float:

@@ -7,6 +7,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -43,12 +45,25 @@ Fleetmap = Callable[..., Result]
 
 
 class ServerProcess:
-    """``fleetmap serve`` (or another command) in a process of its own; ``lines`` is what it printed."""
+    """``fleetmap serve`` (or another command) in a process of its own; ``lines`` is what it printed.
 
-    def __init__(self, *arguments: str, environment: Mapping[str, str], folder: Path, command: str = "serve") -> None:
+    forked: from a process that has imported its modules, whose memory it shares; else started as by a user.
+    """
+
+    process: PreloadedProcess | subprocess.Popen[str]
+
+    def __init__(
+        self,
+        *arguments: str,
+        environment: Mapping[str, str],
+        folder: Path,
+        command: str = "serve",
+        forked: bool = True,
+    ) -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
         values = {**clean, "FLEETMAP_ZENOH_MODE": "off", **environment, "PYTHONPATH": str(Path(__file__).parents[2])}
-        self.process = PreloadedProcess([command, "--port", "0", *arguments], env=values, cwd=folder)
+        given = [command, "--port", "0", *arguments]
+        self.process = PreloadedProcess(given, env=values, cwd=folder) if forked else _start(given, values, folder)
         self.lines: list[str] = []
         self._news = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -108,6 +123,19 @@ class ServerProcess:
             self._reader.join(60)
             assert self.process.stdout is not None
             self.process.stdout.close()
+
+
+def _start(arguments: list[str], environment: Mapping[str, str], folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "app.cli", *arguments],
+        env=environment,
+        cwd=folder,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        process_group=0,
+    )
 
 
 def seconds_until_healthy(address: str, start: float) -> float:

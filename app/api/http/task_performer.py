@@ -12,7 +12,7 @@ from app.api.http import problems
 from app.api.http.outcomes import commit_as_json, error_as_json
 from app.api.http.responses import api_path
 from app.backends.fence import FenceError
-from app.backends.queue import Task
+from app.backends.queue import MAX_FAILURES, Task
 from app.convert.maps import Maps
 from app.convert.recipe import MapOrder
 from app.derive import ChainFailure
@@ -45,7 +45,7 @@ class TaskPerformer:
         }
 
     def perform(self, task: Task) -> None:
-        """Carry out a task and store its outcome; blocks. Raises Unavailable if that cannot be stored now."""
+        """Carry out a task and store its outcome; blocks. Raises Unavailable if another attempt may do better."""
         stop = CancelHandle()
         with self._lock:
             self._stops[task.key] = stop
@@ -88,8 +88,13 @@ class TaskPerformer:
             outcome, location = carry_out(task, stop)
         except Cancelled:
             self._store.jobs.release_task(task.key)  # unless all were cancelled, this worker stops
-        except (NoRoom, FenceError):
-            raise  # another worker may have room, or has the task already
+        except FenceError:
+            raise  # another worker has the task already
+        except Unavailable as error:
+            # Another worker may have room. A change's client relies on its job: the database may be back soon.
+            if task.failures < MAX_FAILURES and (task.kind != "convert" or isinstance(error, NoRoom)):
+                raise
+            self._fail(task, error)
         except Exception as error:  # noqa: BLE001  the outcome is for who waits
             self._fail(task, error)
         else:
