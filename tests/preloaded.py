@@ -303,8 +303,8 @@ def _preload() -> None:
     for name in (*MODULES, *(f"{COMMANDS}.{found.name}" for found in pkgutil.iter_modules(commands.__path__))):
         if not name.endswith("__main__"):
             importlib.import_module(name)
-    for package in ("app.api", "app.ogc"):
-        list(importlib.import_module(package).routers())  # imports their modules, which build the routes
+    for name in ("app.api", "app.ogc"):  # their modules are discovered when an application is made
+        list(importlib.import_module(name).routers())
     gc.collect()
     gc.freeze()  # the collector of a new process would copy this memory by marking it
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import gc
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -102,7 +103,11 @@ WRITING = {
 def modules(folder: str) -> dict[str, ast.Module]:
     """Parse each file below a folder: path -> syntax tree."""
     paths = sorted((TOP / folder).rglob("*.py"))
-    return {path.relative_to(TOP).as_posix(): ast.parse(path.read_text()) for path in paths}
+    gc.disable()  # half the time: a million objects, none of which is garbage
+    try:
+        return {path.relative_to(TOP).as_posix(): ast.parse(path.read_text()) for path in paths}
+    finally:
+        gc.enable()
 
 
 def functions(folder: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:

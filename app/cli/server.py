@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import inspect
 import multiprocessing
@@ -231,6 +232,7 @@ def application(settings: Settings) -> Any:
     gc.freeze()
     gc.unfreeze()  # moves all objects to the oldest generation without scanning them
     gc.enable()
+    atexit.register(gc.freeze)  # of a child process, as in app.cli.main
     return server_app
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from app import derive, formats, parameters, progress
 from app.convert import closures as applied_closures
@@ -29,10 +29,6 @@ from app.store.in_worker import open_store
 from app.store.values import PartEntry, Provenance, Version, datum_information
 from app.syntax import archives
 from app.templates import resolve
-
-if TYPE_CHECKING:
-    pass
-
 
 READ_PART = 0.1
 DERIVED_PART = 0.1, 0.7

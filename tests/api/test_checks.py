@@ -165,14 +165,14 @@ def test_real_sites_have_few_and_true_findings(api: Api, bare: str, shared: Path
 
 
 def test_large_network_is_checked_in_time(api: Api, bare: str) -> None:
-    side = 140
+    side = 90
     ids = {(x, y): f"n{x}-{y}" for x in range(side) for y in range(side)}
     nodes = {name: (x * 1.0, y * 1.0) for (x, y), name in ids.items()}
     ways = [(ids[x, y], ids[x + 1, y]) for x in range(side - 1) for y in range(side)]
     api.upload(bare, {"big.tmap2.yaml": samples.tmap2(nodes, tuple(w for a, b in ways for w in ((a, b), (b, a))))})
     begun = time.perf_counter()
     body = checks(api, bare)
-    assert time.perf_counter() - begun < 240  # some seconds of the processor; a quadratic rule takes an hour
+    assert time.perf_counter() - begun < 240  # two seconds of the processor; a quadratic rule takes ten minutes
     assert {item["rule"] for item in body["items"]} == {"unreachable-part"}, "rows that no column connects"
     assert len(body["items"]) == side - 1 <= MAX_FINDINGS
     assert len(body["rules"]) == len(RULES)

@@ -240,11 +240,11 @@ def test_fetched_image_is_at_its_position(provider: Misbehaving, kind: Any) -> N
 
 
 def test_large_images_are_fetched_in_parts(provider: Misbehaving) -> None:
-    for kind, url in (("wms", "/wms?layers=ortho"), ("mapbox", "/styles/static")):
+    for kind, url, resolution in (("wms", "/wms?layers=ortho", 0.03), ("mapbox", "/styles/static", 0.05)):
         provider.paths.clear()
-        picture, _ = fetched(Provider(provider.url + url, kind, max_zoom=22), resolution=0.03)  # type: ignore[arg-type]
+        picture, _ = fetched(Provider(provider.url + url, kind, max_zoom=22), resolution)  # type: ignore[arg-type]
         check(picture)
-        assert len(provider.paths) >= 2
+        assert len(provider.paths) == 4, "two across and two along"
 
 
 def test_url_templates_support_tms_rows_and_wmts_names() -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import yaml
 
 from tests.ports import free_port
-from tests.preloaded import PreloadedProcess
+from tests.preloaded import PreloadedProcess, run_preloaded
 
 TOP = Path(__file__).resolve().parents[2]
 DOCKER = TOP / "docker"
@@ -224,9 +224,13 @@ class Container:
         return (self.folder / "log").read_text(errors="replace")
 
     def run(self, command: list[str], *, seconds: float = 120.0) -> subprocess.CompletedProcess[str]:
-        """Run a command in the container to its end."""
+        """Run a command in the container to its end. Both streams of ``fleetmap`` are in ``stderr``."""
+        program = self._program(command)
+        if Path(program).name == "fleetmap":
+            done = run_preloaded(command[1:], env=self.environment, cwd=Path(self.workdir), timeout=seconds)
+            return subprocess.CompletedProcess(command, done.returncode, "", done.stdout)
         return subprocess.run(
-            [self._program(command), *command[1:]],
+            [program, *command[1:]],
             env=self.environment,
             cwd=self.workdir,
             capture_output=True,

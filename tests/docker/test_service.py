@@ -22,6 +22,7 @@ from tests.agent.conftest import network
 from tests.docker.containers import DOCKER, TOP
 from tests.events.conftest import eventually
 from tests.ports import free_port
+from tests.preloaded import PreloadedProcess
 
 UNITS = ("fleetmap-server.service", "fleetmap-agent.service", "fleetmap-doctor.service")
 EXPOSURE = {"fleetmap-server.service": 2.5, "fleetmap-agent.service": 5.5, "fleetmap-doctor.service": 5.5}
@@ -66,13 +67,10 @@ class Service:
         assert Path(program).name == "fleetmap"
         self.state, self.log = state, folder / "log"
 
-    def start(self) -> subprocess.Popen[bytes]:
+    def start(self) -> PreloadedProcess:
         """Start ExecStart with this checkout's program."""
-        command = [sys.executable, "-m", "app.cli", *self.arguments]
         with self.log.open("wb") as log:
-            return subprocess.Popen(
-                command, env=self.environment, cwd=self.state, stdin=subprocess.DEVNULL, stdout=log, stderr=log
-            )
+            return PreloadedProcess(self.arguments, env=self.environment, cwd=self.state, output=log)
 
 
 @pytest.fixture(scope="module")

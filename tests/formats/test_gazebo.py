@@ -5,11 +5,8 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import shutil
 import struct
-import subprocess
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -36,11 +33,11 @@ from app.model.layers import Layers, PartKey, Resources
 from app.model.meshes import read_mesh
 from app.upload_reader import Bundle, EnvironmentContext, UploadHints, unpack
 from app.upload_reader import read as read_bundle
+from tests import libsdformat
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "gazebo"
 LIMITS = Limits()
 Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
-CHECKER = shutil.which("ign")
 OBJECTS = PartKey("objects", name="gazebo")
 RESOURCES = PartKey("resources", name="gazebo")
 
@@ -95,7 +92,7 @@ def report(
 
 def check(files: dict[str, bytes]) -> list[str]:
     """Return libsdformat's complaints about a bundle, except missing files (none if it is not installed)."""
-    if CHECKER is None:
+    if libsdformat.LIBRARY is None:
         return []
     import tempfile
 
@@ -104,17 +101,14 @@ def check(files: dict[str, bytes]) -> list[str]:
             path = Path(at) / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        answer = subprocess.run(
-            [CHECKER, "sdf", "--check", f"{at}/world.sdf"],
-            env={**os.environ, "SDF_PATH": f"{at}/models", "GZ_SIM_RESOURCE_PATH": f"{at}/models"},
-            capture_output=True, text=True, timeout=120, check=False,
-        )  # fmt: skip
-    lines = (answer.stdout + answer.stderr).splitlines()
+        models = f"{at}/models"
+        _, output = libsdformat.check(Path(at) / "world.sdf", {"SDF_PATH": models, "GZ_SIM_RESOURCE_PATH": models})
+    lines = output.splitlines()
     errors = [
         re.sub(r"\[/sdf.*?\]: ", "", n) for n in lines if "Error" in n and "findFile" not in n and "backward" not in n
     ]
     if not errors:
-        assert "Valid" in answer.stdout
+        assert "Valid" in output
     return errors
 
 
@@ -179,9 +173,8 @@ def test_yard_round_trips(same: Same) -> None:
     assert back.find("model[@name='sign']/pose").get("relative_to") == "corner"
     assert back.find("state") is None
     assert back.find("gui") is not None
-    if (
-        CHECKER
-    ):  # both are the upload's own words: an address of another machine, and one that libsdformat does not know
+    if libsdformat.LIBRARY:
+        # both are the upload's own words: an address of another machine, and one that libsdformat does not know
         missing_uris = ("https://fuel.gazebosim.org/1.0/openrobotics/models/Oak tree", "file://models/crate")
         assert sorted(check(out)) == sorted(f"Error Code 13: Msg: Unable to find uri[{uri}]" for uri in missing_uris)
 

@@ -909,12 +909,12 @@ def network_cases() -> Iterator[Case]:
         for value in ("3", "null", "{}", "[null]", "[[]]", "[3]"):
             text = (plain + PICTURE).replace(f"{word}:\n", f"{word}: {value}\nold_{word}:\n")
             yield Case(f"prm/{word} {value}", {"p.yaml": text.encode()}, "any", "prm")
-    many = "nodes:\n" + "".join(f"- {{id: {k}, x: {k % 9}, y: 1}}\n" for k in range(20000)) + "edges:\n"
-    many += "".join(f"- {{from: 0, to: {k}, weight: 1}}\n" for k in range(20000))
-    yield Case("prm/a star of 20 000", {"p.yaml": (many + PICTURE).encode()}, "read", "prm")
-    same = "internal_points:\n" + "- {name: a, x: 1, y: 1}\n" * 20000 + "network_lines:\n"
-    same += "- {start: {x: 1, y: 1}, end: {x: 1, y: 1}}\n" * 20000
-    yield Case("ffr/20 000 points in one place", {"n.ffr.yaml": same.encode()}, "read", "ffr_network")
+    many = "nodes:\n" + "".join(f"- {{id: {k}, x: {k % 9}, y: 1}}\n" for k in range(10000)) + "edges:\n"
+    many += "".join(f"- {{from: 0, to: {k}, weight: 1}}\n" for k in range(10000))
+    yield Case("prm/a star of 10 000", {"p.yaml": (many + PICTURE).encode()}, "read", "prm")
+    same = "internal_points:\n" + "- {name: a, x: 1, y: 1}\n" * 10000 + "network_lines:\n"
+    same += "- {start: {x: 1, y: 1}, end: {x: 1, y: 1}}\n" * 10000
+    yield Case("ffr/10 000 points in one place", {"n.ffr.yaml": same.encode()}, "read", "ffr_network")
     for k, end in enumerate(("3", "null", "{}", "[5, 0]", "{x: 5}", "{x: 5, y: '0'}")):
         yield Case(
             f"ffr/end {k}", {"n.ffr.yaml": FFR.format(name="a", x=1, end=end).encode()}, "refused", "ffr_network"
@@ -1030,9 +1030,9 @@ def network_cases() -> Iterator[Case]:
     ):
         text = NAV_GRAPH.format(name="a", x=1, lane="[0, 1, {}]") + more
         yield Case(f"nav graph/more {k}", {"0.yaml": text.encode()}, "any", "rmf_nav_graph")
-    star = "building_name: b\nlevels:\n  L1:\n    vertices:\n" + "    - [1.0, 1.0, {}]\n" * 20000 + "    lanes:\n"
-    star += "".join(f"    - [0, {k}, {{}}]\n" for k in range(20000))
-    yield Case("nav graph/a star of 20 000", {"0.yaml": star.encode()}, "read", "rmf_nav_graph")
+    star = "building_name: b\nlevels:\n  L1:\n    vertices:\n" + "    - [1.0, 1.0, {}]\n" * 10000 + "    lanes:\n"
+    star += "".join(f"    - [0, {k}, {{}}]\n" for k in range(10000))
+    yield Case("nav graph/a star of 10 000", {"0.yaml": star.encode()}, "read", "rmf_nav_graph")
     yield Case(
         "nav graph/500 of them",
         {f"{k}.yaml": NAV_GRAPH.format(name=f"n{k}", x=1, lane="[0, 1, {}]").encode() for k in range(500)},

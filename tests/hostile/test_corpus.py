@@ -16,8 +16,8 @@ from app.syntax.decimals import numbers
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import ACCORDING_TO_KIND, Case, cases, damaged, sample_maps, zipped
 
-SECONDS = 15.0
-"""CPU time limit of one case, in seconds; the slowest ones take one or two."""
+SECONDS = 10.0
+"""CPU time limit of one case, in seconds; the slowest ones take one."""
 
 MEMORY = 6 * 2**30
 COPIES, COPIES_OF_A_FILE = 60, 15
