@@ -142,7 +142,8 @@ def _commit_noise(store: Store, dice: np.random.Generator, number: int) -> None:
 def running_server(home: Home, port: int = 0) -> Iterator[tuple[ServerProcess, httpx.Client]]:
     """Run a server on a data folder, with a client."""
     variables = {"FLEETMAP_ADMIN_TOKEN": ADMIN, "FLEETMAP_LOG_LEVEL": "warning", "FLEETMAP_SCRUB_HOURS": "0"}
-    server = ServerProcess(*home.options, "--port", str(port), environment=variables, folder=ROOT)
+    # in the session of the backup: Linux gives sessions equal shares, whatever the niceness of the processes in them
+    server = ServerProcess(*home.options, "--port", str(port), environment=variables, folder=ROOT, forked=False)
     try:
         address = server.ready()
         headers = {"Authorization": f"Bearer {ADMIN}"}

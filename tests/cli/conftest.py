@@ -25,7 +25,7 @@ from app.errors import Unavailable
 from tests.preloaded import PreloadedProcess
 
 TOKEN = "administrator-of-the-tests"
-START_SECONDS = 60.0
+START_SECONDS = 240.0
 
 
 @dataclass(frozen=True)
