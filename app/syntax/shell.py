@@ -43,8 +43,7 @@ _BLANK = re.compile(r"[ \t]*")
 _SINGLE = re.compile(r"'([^'\n]*)'")
 _DOUBLE = re.compile(r'"((?>(?:[^"\\$`\n]|\\[^\n])*))"')
 _BARE = re.compile(r"[^\s'\"\\$`;&|<>(){}*?\[\]~#!\x00-\x1f]+")
-_ESCAPES = re.compile(r"(?:\\[^\n])+")
-_ESCAPE = re.compile(r"\\(.)")
+_ESCAPE = re.compile(r"\\([^\n])")
 _ESCAPED = re.compile(r'\\(["\\$`])')
 _NOTHING = re.compile(r"[ \t]*(?:#[^\n]*)?(?:\n|\Z)")
 _END = re.compile(r"(?:[ \t]+#[^\n]*|[ \t]*)(?:\n|\Z)")
@@ -207,8 +206,8 @@ def _value(text: str, at: int) -> tuple[str, int]:
             parts.append(_ESCAPED.sub(r"\1", piece.group(1)))
         elif piece := _BARE.match(text, at):
             parts.append(piece.group())
-        elif piece := _ESCAPES.match(text, at):
-            parts.append(_ESCAPE.sub(r"\1", piece.group()))
+        elif piece := _ESCAPE.match(text, at):
+            parts.append(piece.group(1))
         else:
             break
         at = piece.end()
