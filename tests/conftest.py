@@ -46,7 +46,7 @@ def pytest_configure(config: pytest.Config) -> None:
     run; this saves each worker half a minute. Native code: servers use the user's folder, like the tests' processes,
     not one in each data folder.
     """
-    gc.set_threshold(10_000, 10, 10)  # the default spends a third of reading a large document on garbage collection
+    gc.set_threshold(50_000, 10, 100)  # the default spends a third of reading a large document on garbage collection
     if yaml.__with_libyaml__:  # ``safe_load`` and ``safe_dump`` of the tests take a tenth of the time
         yaml.SafeLoader, yaml.SafeDumper = yaml.CSafeLoader, yaml.CSafeDumper
     if hasattr(config, "workerinput"):  # pytest-xdist: inherits the environment of the main process

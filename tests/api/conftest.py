@@ -135,7 +135,7 @@ def running(settings: Settings, verify: ssl.SSLContext | bool = False, *, migrat
             assert thread.is_alive(), "the server did not start"
             assert time.monotonic() < deadline, "the server did not start in time"
             time.sleep(0.01)
-        assert app.state.services.prepared.wait(120), "the server was not ready in time"
+        assert app.state.services.prepared.wait(240), "the server was not ready in time"
         port = server.servers[0].sockets[0].getsockname()[1]
         scheme = "https" if settings.tls_certificate else "http"
         api = Api(f"{scheme}://127.0.0.1:{port}", app, verify=verify)
