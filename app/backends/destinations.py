@@ -48,9 +48,14 @@ def open_destination(place: str, scratch: Path, *, new: bool) -> BlobFiles:
 
 
 def is_foreign(place: str) -> bool:
-    """Return whether a place is a folder with other files, in which no backup may begin."""
+    """Return whether a place is a folder with other files, in which no backup may begin.
+
+    Empty folders are what a first backup leaves that is killed before it has written anything.
+    """
     path = Path(place)
-    return path.is_dir() and any(child.name != "tmp" for child in path.iterdir())
+    return path.is_dir() and any(
+        child.name != "tmp" and not (child.is_dir() and next(child.iterdir(), None) is None) for child in path.iterdir()
+    )
 
 
 def shown(place: str) -> str:

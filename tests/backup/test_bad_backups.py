@@ -273,6 +273,9 @@ def test_place_of_another_server_is_refused(sqlite_store: Store, tmp_path: Path,
     (tmp_path / "home" / "letter.txt").write_text("private")
     with pytest.raises(Conflict, match="has other files"):
         back_up(sqlite_store, tmp_path / "home", tmp_path / "data")
+    for folder in ("tmp", "packs"):  # what a first backup leaves that is killed at once
+        (tmp_path / "killed" / folder).mkdir(parents=True)
+    back_up(sqlite_store, tmp_path / "killed", tmp_path / "data")
     with pytest.raises(Invalid, match="unsupported place"):
         back_up(sqlite_store, "ftp://host/place", tmp_path / "data")
 
