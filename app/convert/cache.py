@@ -31,6 +31,7 @@ from uuid import uuid4
 
 import orjson
 
+from app.backends.blobs import sync
 from app.backends.locks import file_lock
 from app.backends.room import lacking_bytes
 from app.convert.report import Report
@@ -582,15 +583,6 @@ def _check_files(cached_map: CachedMap) -> None:
         except OSError as error:
             raise file.lost_error(error) from error
         file.check(digest)
-
-
-def sync(path: Path) -> None:
-    """Flush a file or folder to the disk (fsync)."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _file_from_entry(folder: Path, f: dict[str, Any], on_damage: Callable[[str], None]) -> CachedFile:

@@ -20,7 +20,8 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.agent.fake import Fake
+from app.agent import freshness
+from tests.agent.fake import Fake, StoppedClock
 from tests.api import samples
 from tests.events.conftest import eventually
 from tests.ports import free_port
@@ -48,6 +49,14 @@ def find_python310() -> Path | None:
 
 collect_ignore = [] if find_python310() else ["test_python310.py"]
 """The agent's tests on Python 3.10 run where there is one."""
+
+
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
+    """The clock by which the agent judges the age of signed responses and of events."""
+    clock = StoppedClock()
+    monkeypatch.setattr(freshness, "time", clock)
+    return clock
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from app.agent import activation, agent, freshness
+from app.agent import activation, agent
 from app.cli.agent import _logger
 from tests.agent.conftest import whole
 from tests.agent.fake import Fake, One, StoppedClock, run, send
@@ -60,14 +60,6 @@ def test_log_prints_invalid_unicode(as_json: bool, capfd: pytest.CaptureFixture[
     _logger(as_json=as_json)("failed", detail="bad \ud800 text")
     captured = capfd.readouterr()
     assert "bad ? text" in captured.out + captured.err
-
-
-@pytest.fixture
-def stopped(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
-    """The clock by which the age of signed responses is judged."""
-    clock = StoppedClock()
-    monkeypatch.setattr(freshness, "time", clock)
-    return clock
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from app.agent import agent, freshness, http_client
+from app.agent import agent, http_client
 from app.agent.signed_manifest import MAX_SEQUENCE_AHEAD
 from app.agent.state import AgentState, Mark, load, save
 from app.errors import Conflict
@@ -237,14 +237,6 @@ def test_slow_download_is_resumed(fake: Fake, robot: Robot) -> None:
 
 
 # --- frozen ---
-
-
-@pytest.fixture
-def stopped(monkeypatch: pytest.MonkeyPatch) -> StoppedClock:
-    """The clock by which the age of signed responses and of events is judged."""
-    clock = StoppedClock()
-    monkeypatch.setattr(freshness, "time", clock)
-    return clock
 
 
 @pytest.fixture

@@ -20,7 +20,9 @@ from tests.ports import free_port
 from tests.seaweed import ACCESS, Fault, FaultyStore, Seaweed, running_seaweed
 
 
-def look(folder: Path, bucket: str = "maps", key: str | None = None, secret: str | None = None) -> list[Finding]:
+def examine_bucket(
+    folder: Path, bucket: str = "maps", key: str | None = None, secret: str | None = None
+) -> list[Finding]:
     """Examine the stored files of an installation in ``folder``."""
     data = folder / "data"
     (data / "blobs").mkdir(parents=True, exist_ok=True)
@@ -51,7 +53,7 @@ def folder(tmp_path: Path, seaweed: Seaweed, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_usable_bucket_is_left_as_it_was(folder: Path, seaweed: Seaweed) -> None:
-    (finding,) = look(folder, key="limited", secret="limited-secret")
+    (finding,) = examine_bucket(folder, key="limited", secret="limited-secret")
     assert (finding.level, finding.detail) == ("ok", "can be written, read, listed and emptied")
     with closing(open_store(settings_for(folder / "data", blob_url="s3://maps/doctor"))) as store:
         assert list(store.blobs.files.list()) == []
@@ -75,14 +77,14 @@ def test_usable_bucket_is_left_as_it_was(folder: Path, seaweed: Seaweed) -> None
 def test_keys_that_do_not_suffice(
     folder: Path, bucket: str, user: str, secret: str | None, detail: str, advice: str
 ) -> None:
-    found = one_error(look(folder, bucket, user, secret or f"{user}-secret"))
+    found = one_error(examine_bucket(folder, bucket, user, secret or f"{user}-secret"))
     assert detail in found[0]
     assert advice in found[1]
 
 
 def test_wrong_bucket(folder: Path) -> None:
     """SeaweedFS refuses to create it for a put of this key, and says to the other requests that there is none."""
-    refused, missing = look(folder, "mops", "limited", "limited-secret")
+    refused, missing = examine_bucket(folder, "mops", "limited", "limited-secret")
     assert "cannot be written: access was refused" in refused.detail
     assert "check the bucket's name" in refused.advice
     assert "cannot be read or listed or emptied: no such bucket" in missing.detail
@@ -98,7 +100,7 @@ def test_full_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setenv(name, value)
         with pytest.raises(BaseError):
             fill(S3Store("maps", client_options={"allow_http": True}, retry_config={"max_retries": 0}))
-        detail, advice = one_error(look(tmp_path))
+        detail, advice = one_error(examine_bucket(tmp_path))
     assert "cannot be written: it answered 500" in detail
     assert "SeaweedFS answers so if it has no volume left to write" in advice
 
@@ -136,7 +138,7 @@ def test_answers_of_other_stores(
     faulty: FaultyStore, tmp_path: Path, status: int, code: str, detail: str, advice: str
 ) -> None:
     faulty.fault = Fault(status, body=f"<?xml version='1.0'?><Error><Code>{code}</Code></Error>".encode())
-    found = one_error(look(tmp_path))
+    found = one_error(examine_bucket(tmp_path))
     assert found[0].startswith("the bucket cannot be written or read or listed or emptied: ")
     assert detail in found[0]
     assert advice in found[1]
@@ -146,7 +148,7 @@ def test_answers_of_other_stores(
 def test_unusable_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
     """obstore would end the thread that uses it, so a server does not start with it."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
-    detail, advice = one_error(look(tmp_path))
+    detail, advice = one_error(examine_bucket(tmp_path))
     assert detail == "AWS_ENDPOINT_URL is no address"
     assert "http://host:port" in advice
     with pytest.raises(Invalid, match="AWS_ENDPOINT_URL is no address: use a complete one"):
@@ -156,7 +158,7 @@ def test_unusable_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, endpo
 def test_store_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {**ACCESS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{free_port()}"}.items():
         monkeypatch.setenv(name, value)
-    detail, advice = one_error(look(tmp_path))
+    detail, advice = one_error(examine_bucket(tmp_path))
     assert "it does not answer" in detail
     assert "AWS_ENDPOINT_URL" in advice
 
