@@ -47,6 +47,9 @@ MAX_BEND = math.radians(15.0)
 
 MAX_ENDS = 20_000
 
+ENDS_AT_ONCE = 64
+"""Number of straight ends whose pairs are compared at once: all pairs of a grid would need the most memory."""
+
 
 @dataclass(frozen=True, slots=True)
 class Grid:
@@ -70,27 +73,40 @@ def walls(grid: Grid, target: Bool) -> Bool:
     if not 2 <= len(at) <= MAX_ENDS:
         return out.astype(bool)
     direction, straight = _directions(grid, at)
-    points = shapely.points(at[:, ::-1].astype(float))
-    ends = np.flatnonzero(straight)
-    pairs = shapely.STRtree(points).query(points[ends], predicate="dwithin", distance=SPAN_METRES / grid.cell)
-    first, second = ends[pairs[0]], pairs[1]
-    chosen = (first < second) | ~straight[second] & (first != second)
-    first, second = first[chosen], second[chosen]
-    continues, bend = _continues(grid, at, direction, straight, (first, second))
     seen_free = grid.observed & ~grid.occupied
-    rows = zip(at[first[continues]].tolist(), at[second[continues]].tolist(), bend[continues].tolist(), strict=True)
-    for a, b, turn in rows:
+    for first, second in _pairs(at, straight, SPAN_METRES / grid.cell):
+        continues, bend = _continues(grid, at, direction, straight, (first, second))
+        # An arc needs a gap: beside a wall, ends near its corners look bent.
+        for is_arc, blocked in ((False, seen_free), (True, grid.observed)):
+            chosen = continues & ((bend != 0) == is_arc)
+            _draw(out, blocked, at[first[chosen]], at[second[chosen]], bend[chosen])
+    return out.astype(bool) & target
+
+
+def _pairs(at: Places, straight: Bool, span: float) -> Iterator[tuple[Places, Places]]:
+    """Yield portions of the pairs of a straight end and another one that are at most span cells apart, as indices."""
+    points = shapely.points(at[:, ::-1].astype(float))
+    tree = shapely.STRtree(points)
+    ends = np.flatnonzero(straight)
+    for begin in range(0, len(ends), ENDS_AT_ONCE):
+        some = ends[begin : begin + ENDS_AT_ONCE]
+        pairs = tree.query(points[some], predicate="dwithin", distance=span)
+        first, second = some[pairs[0]], pairs[1]
+        chosen = (first < second) | ~straight[second] & (first != second)
+        yield first[chosen], second[chosen]
+
+
+def _draw(out: NDArray[np.uint8], blocked: Bool, first: Places, second: Places, bend: Array) -> None:
+    """Draw lines and arcs between ends [n, 2], in place, except those that leave the grid or meet a blocked cell."""
+    for a, b, turn in zip(first.tolist(), second.tolist(), bend.tolist(), strict=True):
         steps = max(abs(a[0] - b[0]), abs(a[1] - b[1]))
         share = np.linspace(0.0, 1.0, steps + 1)[1:-1]
         aside = turn * share * (1.0 - share)
         row = np.round(a[0] + share * (b[0] - a[0]) + aside * (b[1] - a[1])).astype(int)
         column = np.round(a[1] + share * (b[1] - a[1]) - aside * (b[0] - a[0])).astype(int)
-        inside = (row >= 0) & (row < target.shape[0]) & (column >= 0) & (column < target.shape[1])
-        # An arc needs a gap: beside a wall, ends near its corners look bent.
-        blocked = grid.observed if turn else seen_free
+        inside = (row >= 0) & (row < out.shape[0]) & (column >= 0) & (column < out.shape[1])
         if len(row) and inside.all() and not blocked[row, column].any():
             out[row, column] = 1
-    return out.astype(bool) & target
 
 
 def _continues(
@@ -124,16 +140,21 @@ def _continues(
 def _is_wall_end(grid: Grid, at: Places, line: Array) -> Bool:
     """Return whether a wall in a direction (rows, columns) begins at each position, longer than it is wide."""
     reach = max(2, round(WALL_RADIUS_METRES / 2 / grid.cell))
-    padded = np.pad(grid.occupied, 2 * reach)
     ahead = at[:, None] + np.arange(1, reach + 1)[None, :, None] * line[:, None]
     middle = at + line * reach / 2
     aside = np.stack([line[:, 1], -line[:, 0]], axis=1) * (reach / 2 + 1.0)
-    row, column = np.moveaxis(np.round(ahead).astype(int) + 2 * reach, 2, 0)
-    out = padded[row, column].all(axis=1)
+    out = _is_occupied(grid, ahead).all(axis=1)
     for place in (middle + aside, middle - aside):
-        row, column = (np.round(place).astype(int) + 2 * reach).T
-        out &= ~padded[row, column]
+        out &= ~_is_occupied(grid, place)
     return np.asarray(out)
+
+
+def _is_occupied(grid: Grid, places: Array) -> Bool:
+    """Return whether the cells at places [..., 2] are occupied; those beyond the grid are not."""
+    row, column = np.moveaxis(np.round(places).astype(int), -1, 0)
+    height, width = grid.occupied.shape
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return np.asarray(inside & grid.occupied[row.clip(0, height - 1), column.clip(0, width - 1)])
 
 
 def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:
@@ -143,7 +164,7 @@ def _directions(grid: Grid, at: Places) -> tuple[Array, Bool]:
     offset = np.argwhere(np.ones((2 * radius + 1, 2 * radius + 1), bool)) - radius
     offset = offset[(offset**2).sum(axis=1) <= radius * radius]
     direction, straight = np.zeros((len(at), 2)), np.zeros(len(at), bool)
-    portion = max(1, 2**22 // len(offset))
+    portion = max(1, 2**18 // len(offset))
     for begin in range(0, len(at), portion):
         batch = at[begin : begin + portion] + radius
         weight = padded[batch[:, :1] + offset[:, 0], batch[:, 1:] + offset[:, 1]].astype(np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -88,6 +89,24 @@ def test_wall_is_continued_to_its_corner_but_not_to_a_wall_across(stub: int) -> 
     hole[22 + stub : 62, 50:90] = True
     wall = walls_over(occupied, hole)
     assert wall.sum() == (2 * (40 - stub) if stub else 0), "a gap before a wall across may be a door"
+
+
+def test_walls_compared_in_portions_are_the_same_and_need_less_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    occupied = np.zeros((100, 400), bool)
+    occupied[40, 20:380] = True
+    hole = np.zeros_like(occupied)
+    hole[41:60, 20:380] = True
+    hole[30:60, 190:210] = True
+    found, peaks = [], []
+    for ends in (10_000, _evidence.ENDS_AT_ONCE):
+        monkeypatch.setattr(_evidence, "ENDS_AT_ONCE", ends)
+        tracemalloc.start()
+        found.append(walls_over(occupied, hole))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert found[0].sum() == found[1].sum() == 20
+    assert (found[0] == found[1]).all()
+    assert peaks[1] < 0.6 * peaks[0]
 
 
 def test_higher_confidence_fills_fewer_cells() -> None:
