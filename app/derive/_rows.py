@@ -352,10 +352,16 @@ def _blocks(field: RowField, u: Array, v: Array) -> list[RowField]:
             rows += [shorter] if shorter is not None else []
         typical = float(np.median([row.length for row in rows])) if rows else 0.0
         rows = [row for row in rows if row.length >= SIMILAR * typical]
-        if len(rows) >= MIN_ROWS:
+        if len(rows) >= MIN_ROWS and _same_distances(rows, distances):
             kept = sum(row.fill * row.length for row in rows) * min(1.0, (len(rows) - 1) / 4)
             out.append(replace(field, rows=tuple(rows), score=field.score * kept / support))
     return out
+
+
+def _same_distances(rows: list[Row], distances: Array) -> bool:
+    """Return whether a part of a field has the field's distances: walls that go on beyond an aisle across it do not."""
+    ratio = np.diff([row.v for row in rows])[:, None] / distances[None]
+    return bool((np.abs(ratio - 1.0) <= REGULAR).any(axis=1).mean() >= STRICT)
 
 
 def _density(u: Array, v: Array, centre: float, half: float, low: float, steps: int) -> Array:

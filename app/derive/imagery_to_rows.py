@@ -39,7 +39,7 @@ class Parameters:
     )
 
 
-@derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=60.0, version=2)
+@derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=60.0, version=3)
 def imagery_to_rows(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Rows in an aerial image: lines of kind ``row`` with their distance and direction, and headlands.
 

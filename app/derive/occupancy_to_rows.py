@@ -25,7 +25,7 @@ class Parameters:
     )
 
 
-@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=2)
+@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=3)
 def occupancy_to_rows(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Rows in a grid: lines of kind ``row`` with their distance and direction, and headlands.
 

@@ -94,6 +94,20 @@ def test_aisle_across_divides_rows() -> None:
     assert all(high < 10.6 or low > 13.4 for low, _, high, _ in ends)
 
 
+@pytest.mark.parametrize(("rows_beyond", "found"), [((0, 1, 2, 3, 4, 5), 12), ((0, 2, 5), 6)])
+def test_beyond_an_aisle_only_lines_at_the_distances_of_the_rows_are_rows(
+    rows_beyond: tuple[int, ...], found: int
+) -> None:
+    rows = lines(0.0, count=6, spacing=2.5, length=24.0)
+    mask = drawn(rows)
+    mask[:, 135:172] = False
+    for k, row in enumerate(rows):
+        if k not in rows_beyond:
+            y = round(row.centroid.y / SIZE)
+            mask[y - 10 : y + 10, 135:] = False
+    assert len(of(derived("occupancy_to_rows", grid(mask)), "objects", "row")) == found
+
+
 def test_rows_in_beds_are_found_and_not_the_beds() -> None:
     beds = [
         shapely.transform(row, lambda xy, v=v: xy + np.array([0.0, v])) for row in lines(0.0, 6) for v in (-0.25, 0.25)
