@@ -26,8 +26,8 @@ LOOK_SECONDS: Final = 0.5
 BUSY_SHARE: Final = 0.25
 """Share of the processors that others use from which on the rests are longest."""
 
-MAX_REST: Final = 5.0
-"""Longest rest per second of work, waits for disks and processors included: a sixth of a processor is left."""
+MAX_REST: Final = 9.0
+"""Longest rest per second of work, waits for disks and processors included: a tenth of a processor is left."""
 
 MAX_REST_SECONDS: Final = 1.0
 """Maximum duration of one rest, also after a large piece of work."""
