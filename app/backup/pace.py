@@ -94,7 +94,7 @@ class Pace:
         """Update the share of the machine's processors that other programs use."""
         before = self._look
         if before is not None and now.elapsed - before.elapsed >= LOOK_SECONDS:
-            own = now.process - before.process + now.server - before.server
-            others = now.machine - before.machine - own
+            backup = now.process - before.process + now.server - before.server
+            others = now.machine - before.machine - backup
             self._share = max(0.0, others / (now.elapsed - before.elapsed) / self._processors)
             self._look = now
