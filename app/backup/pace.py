@@ -29,7 +29,7 @@ BUSY_SHARE: Final = 0.25
 MAX_REST: Final = 9.0
 """Longest rest per second of work, waits for disks and processors included: a tenth of a processor is left."""
 
-MAX_REST_SECONDS: Final = 1.0
+MAX_REST_SECONDS: Final = 3.0
 """Maximum duration of one rest, also after a large piece of work."""
 
 
