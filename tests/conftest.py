@@ -8,8 +8,10 @@ import importlib
 import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -26,6 +28,10 @@ from tests.seaweed import s3_url, seaweed  # noqa: F401  fixtures
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 TOP = Path(__file__).resolve().parents[1]
+MEMORY = Path("/dev/shm")
+ROOM = 6 << 30
+"""Free bytes with which a whole run keeps its files in memory."""
+
 COMPILE = """
 import importlib
 from app import native
@@ -39,6 +45,7 @@ settings.register_profile("fuzz", max_examples=2000, deadline=None)  # make fuzz
 settings.load_profile("test")
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest reads where temporary files go
 def pytest_configure(config: pytest.Config) -> None:
     """Share compiled code between processes: tests start hundreds of them, each of which imports the server.
 
@@ -56,15 +63,32 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.setdefault("NUMBA_CACHE_DIR", str(native.folder().parent))
     if config.getoption("numprocesses", None):  # many tests: workers of servers may not write compiled code
+        _keep_files_in_memory(config)
         process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TOP)
         config.add_cleanup(process.wait)
         config.add_cleanup(process.kill)
 
 
+def _keep_files_in_memory(config: pytest.Config) -> None:
+    """Keep all temporary files of the run in memory, if it has room: writing databases to a disk takes a third longer.
+
+    They go with the run. A few tests without workers, such as one that failed, leave theirs where pytest has them.
+    """
+    if "TMPDIR" in os.environ or config.option.basetemp:
+        return
+    if not MEMORY.is_dir() or shutil.disk_usage(MEMORY).free < ROOM:
+        return
+    folder = Path(tempfile.mkdtemp(prefix="fleetmap-", dir=MEMORY))
+    folder.chmod(0o1777)  # as /tmp: PostgreSQL's user has a folder there
+    os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
+    config.option.basetemp = str(folder / "t")  # short: a socket's path has at most 107 characters
+    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run two workers more than there are processors: many tests wait for agents, routers, browsers and timeouts."""
-    return len(os.sched_getaffinity(0)) + 2
+    """Run three workers more than there are processors: many tests wait for agents, routers, browsers and timeouts."""
+    return len(os.sched_getaffinity(0)) + 3
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

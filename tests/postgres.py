@@ -62,12 +62,12 @@ class Cluster:
 
     def restart(self) -> None:
         """Start the server after ``kill``; it refuses to start until its last process has ended."""
-        for _ in range(50):
-            started = self.start()
-            if started.returncode == 0:
-                return
+        until = time.monotonic() + 120
+        while (started := self.start()).returncode:
+            if time.monotonic() > until:
+                log = (self.data.parent / "log").read_text(errors="replace")
+                pytest.fail(f"PostgreSQL does not start again: {started.stdout}{started.stderr}{log[-2000:]}")
             time.sleep(0.1)
-        pytest.fail(f"PostgreSQL does not start again: {started.stdout}{started.stderr}")
 
     def url(self, database: str = "postgres") -> str:
         """Return the URL for SQLAlchemy."""

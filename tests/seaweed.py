@@ -13,7 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -110,14 +110,20 @@ class Seaweed:
 class Fault:
     """What goes wrong between a client and the store: an answer of this status, a delay in seconds, changed bytes.
 
-    body: of that answer. methods: those of the requests that get it.
+    body: of that answer, or a function of the request's. methods: those of the requests that get it. containing: only
+        requests with these bytes.
     """
 
     status: int | None = None
     seconds: float = 0.0
     changes_bytes: bool = False
-    body: bytes = b""
+    body: bytes | Callable[[bytes], bytes] = b""
     methods: tuple[str, ...] = ("GET", "HEAD", "PUT", "POST", "DELETE")
+    containing: bytes = b""
+
+    def answers(self, method: str, body: bytes) -> bool:
+        """Whether a request gets the answer."""
+        return self.status is not None and method in self.methods and self.containing in body
 
 
 class FaultyStore:
@@ -145,11 +151,12 @@ class _Forwarder(BaseHTTPRequestHandler):
         fault, body = self._store.fault, self.rfile.read(int(self.headers.get("content-length") or 0))
         time.sleep(fault.seconds)
         with contextlib.suppress(OSError):  # the client has given up
-            if fault.status is not None and self.command in fault.methods:
+            if fault.status is not None and fault.answers(self.command, body):
+                text = fault.body if isinstance(fault.body, bytes) else fault.body(body)
                 self.send_response(fault.status)
-                self.send_header("content-length", str(len(fault.body)))
+                self.send_header("content-length", str(len(text)))
                 self.end_headers()
-                self.wfile.write(fault.body)
+                self.wfile.write(text)
                 return
             connection = http.client.HTTPConnection("127.0.0.1", self._store.target, timeout=30)
             connection.request(self.command, self.path, body, dict(self.headers))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import time
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -33,6 +32,7 @@ from app.api.http.response_cache import FRESH_SECONDS, CachedResponse, Key, requ
 from app.api.http.responses import API, api_path, api_router, json_response
 from app.api.http.schemas import EnvironmentPath, ProblemItem, VersionPath, problem_responses
 from app.api.http.streams import IN_MEMORY, Headers, range_headers, raw_response, requested_range, stream_file
+from app.clock import seconds_since_boot
 from app.convert.cache import CachedFile, CachedMap, LostMap
 from app.convert.maps import select_file
 from app.convert.recipe import Recipe
@@ -65,7 +65,7 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
         return fresh
     wanted = parse_map_request(request)
     # Taken before any read: a concurrent commit makes this response stale, never wrongly fresh.
-    generation, until = memory.generation(), time.monotonic() + FRESH_SECONDS
+    generation, until = memory.generation(), seconds_since_boot() + FRESH_SECONDS
     for attempt in itertools.count():
         recipe = await memory.run_shared(request, resolve_recipe, services, wanted)
         old = memory.get(key)

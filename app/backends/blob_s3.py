@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -104,15 +105,23 @@ class S3Files:
         return obstore.get(self._store, key, options={"range": (start, start + size)})
 
     def delete(self, keys: Iterable[str]) -> None:
-        """Remove files."""
+        """Remove files. One that does not exist is no error, also for a server that reports it as one."""
         names = list(keys)
         try:
             for start in range(0, len(names), DELETED_AT_ONCE):
-                obstore.delete(self._store, names[start : start + DELETED_AT_ONCE])
-        except FileNotFoundError:
-            return
+                self._delete_some(names[start : start + DELETED_AT_ONCE])
         except (exceptions.BaseError, OSError) as error:
             raise self._unwritable(error) from error
+
+    def _delete_some(self, names: builtins.list[str]) -> None:
+        """Remove files in one request; if the server misses one of them, each by itself: others may still exist."""
+        try:
+            obstore.delete(self._store, names)
+        except (exceptions.BaseError, OSError) as error:
+            if not _is_absent_file(error):
+                raise
+            if len(names) > 1:
+                list(self._threads.map(self._delete_some, ([name] for name in names)))
 
     def list(self, prefix: str = "") -> Iterator[StoredFile]:
         """List files."""
@@ -177,6 +186,12 @@ def _open(bucket: str, prefix: str, keys: S3Config, *, retries: int, stall: int)
     retry: RetryConfig = {"max_retries": retries, "retry_timeout": timedelta(seconds=2 * STALL_SECONDS)}
     folder = prefix.strip("/") or None
     return S3Store(bucket, prefix=folder, config=keys, client_options=client, retry_config=retry)
+
+
+def _is_absent_file(error: Exception) -> bool:
+    """Whether a request failed since a file does not exist; not since its bucket does not."""
+    text = str(error)
+    return "NoSuchBucket" not in text and (isinstance(error, FileNotFoundError) or "NoSuchKey" in text)
 
 
 def _is_of_store(error: OSError) -> bool:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Final, Protocol
 
 from app.backends.locks import file_lock
+from app.clock import seconds_since_boot
 
 FRESH_SECONDS: Final = 1.0
 """Seconds for which a document is not read again unless a commit is known of."""
@@ -76,4 +76,4 @@ def write_private(path: Path, data: bytes) -> None:
 
 def time_slot() -> int:
     """Return a number that changes every FRESH_SECONDS."""
-    return int(time.monotonic() / FRESH_SECONDS)
+    return int(seconds_since_boot() / FRESH_SECONDS)

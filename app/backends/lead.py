@@ -16,9 +16,8 @@ import hashlib
 import logging
 import socket
 import threading
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from sqlalchemy import Connection
 
 from app.backends.direct import DirectConnection
 from app.backends.fence import LIMIT_IDLE_TIME, FenceError, fenced_by
+from app.clock import seconds_since_boot
 
 log = logging.getLogger(__name__)
 
@@ -240,10 +240,11 @@ class SharedLeads(Leads):
     Args:
         url: database URL that reaches PostgreSQL itself, not a pooler of transactions.
         data_dir: folder of this server; with the name of the host it names the server to operators.
+        clock: seconds; must count the time for which the host is suspended, since PostgreSQL does.
     """
 
-    def __init__(self, url: str, data_dir: Path) -> None:
-        self._url, self._data_dir = url, data_dir
+    def __init__(self, url: str, data_dir: Path, clock: Callable[[], float] = seconds_since_boot) -> None:
+        self._url, self._data_dir, self._clock = url, data_dir, clock
         self._server = f"{socket.gethostname()}:{data_dir.resolve()}"
         self._leads: dict[str, SharedLead] = {}
         self._host_leads: dict[str, LocalLead] = {}
@@ -257,7 +258,7 @@ class SharedLeads(Leads):
     @property
     def has_lease(self) -> bool:
         """Whether PostgreSQL cannot have ended the session: it heard of this process within LEASE_SECONDS."""
-        return time.monotonic() < self._lease_until
+        return self._clock() < self._lease_until
 
     def lead(self, name: str) -> SharedLead:
         """Return the lead of a task."""
@@ -312,7 +313,7 @@ class SharedLeads(Leads):
         """Keep the session alive, free leads that are no longer wanted, and try to get those that are."""
         if self._connection is None:
             self._connection = DirectConnection(self._url, "fleetmap lead", idle_seconds=LEASE_SECONDS)
-        sent = time.monotonic()
+        sent = self._clock()
         rows = self._connection.execute("SELECT name, holder FROM lead")
         self._lease_until = sent + LEASE_SECONDS
         self._roles = {name: holder == self._server for name, holder in rows}

@@ -26,31 +26,40 @@ LOOK_SECONDS: Final = 0.5
 BUSY_SHARE: Final = 0.25
 """Share of the processors that others use from which on the rests are longest."""
 
-MAX_REST: Final = 5.0
-"""Longest rest per second of work, waits for disks and processors included: a sixth of a processor is left."""
+MAX_REST: Final = 9.0
+"""Longest rest per second of work, waits for disks and processors included: a tenth of a processor is left."""
 
-MAX_REST_SECONDS: Final = 1.0
+MAX_REST_SECONDS: Final = 3.0
 """Maximum duration of one rest, also after a large piece of work."""
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Times in seconds: elapsed, of this thread and of this process on processors, and of all processors at work."""
+    """Times in seconds: elapsed, of this thread and of this process on processors, and of all processors at work.
+
+    server: that a database server worked for this thread.
+    """
 
     elapsed: float
     thread: float
     process: float
     machine: float
+    server: float = 0.0
+
+    @property
+    def work(self) -> float:
+        """Time of work for this thread."""
+        return self.thread + self.server
 
 
-def current_times() -> Times | None:
+def current_times(server: float = 0.0) -> Times | None:
     """Read the times; None if the system does not show how busy it is."""
     try:
         user, nice, system, _, _, irq, softirq = map(int, PROC_STAT.read_text().split(maxsplit=8)[1:8])
     except (OSError, ValueError):
         return None
     machine = (user + nice + system + irq + softirq) / os.sysconf("SC_CLK_TCK")
-    return Times(time.monotonic(), time.thread_time(), time.process_time(), machine)
+    return Times(time.monotonic(), time.thread_time(), time.process_time(), machine, server)
 
 
 class Pace:
@@ -70,10 +79,10 @@ class Pace:
     def rest(self) -> None:
         """Sleep in proportion to the work since the last rest, and to how busy others keep the machine."""
         now = self._times()
-        if now is None or self._piece is None or now.thread - self._piece.thread < PIECE_SECONDS:
+        if now is None or self._piece is None or now.work - self._piece.work < PIECE_SECONDS:
             return
         self._note_others(now)
-        worked = now.thread - self._piece.thread
+        worked = now.work - self._piece.work
         idle = now.elapsed - self._piece.elapsed - worked
         rest = MAX_REST * min(1.0, self._share / BUSY_SHARE) * worked - idle
         if rest > 0:
@@ -85,6 +94,7 @@ class Pace:
         """Update the share of the machine's processors that other programs use."""
         before = self._look
         if before is not None and now.elapsed - before.elapsed >= LOOK_SECONDS:
-            others = now.machine - before.machine - (now.process - before.process)
+            backup = now.process - before.process + now.server - before.server
+            others = now.machine - before.machine - backup
             self._share = max(0.0, others / (now.elapsed - before.elapsed) / self._processors)
             self._look = now

@@ -16,7 +16,7 @@ from app.backends.destinations import is_foreign, open_destination, shown
 from app.backends.lead import Lead, LeadLostError, Leads
 from app.backup.check import PlaceCheck, check_place
 from app.backup.create import BackupWriter, KeyBundle
-from app.backup.pace import Pace
+from app.backup.pace import Pace, current_times
 from app.backup.repository import Repository, Snapshot, choose, finish, read_description
 from app.backup.restore import Restorer, RestoreResult, check_complete, check_release
 from app.backup.retention import KeepRule
@@ -90,7 +90,8 @@ class BackupService:
         return result
 
     def _write(self, place: str, keys: KeyBundle, options: BackupOptions, progress: Progress) -> BackupResult:
-        pace = Pace()
+        source = self._store.backup_source
+        pace = Pace(lambda: current_times(source.served))
 
         def advance(size: int) -> None:
             progress(size)
@@ -100,7 +101,6 @@ class BackupService:
             files = open_destination(place, scratch, new=True)
             try:
                 repository = self._repository(place, files, options)
-                source = self._store.backup_source
                 writer = BackupWriter(source, repository, keys, guard=guard, scratch=scratch, progress=advance)
                 snapshot = writer.run()
                 finish(files)

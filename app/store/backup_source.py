@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -45,6 +46,16 @@ class BackupSource:
 
     def __init__(self, database: Database, blobs: Blobs) -> None:
         self._database, self._blobs = database, blobs
+        self.served = 0.0
+        """Seconds that this source waited for a database server while that worked for it; 0 on SQLite."""
+
+    @contextmanager
+    def _read(self) -> Iterator[Connection]:
+        started, worked = time.monotonic(), time.thread_time()
+        with self._database.read() as connection:
+            yield connection
+        if not self._database.sqlite:
+            self.served += (time.monotonic() - started) - (time.thread_time() - worked)
 
     def check(self) -> None:
         """Raise Unavailable unless the schema is that of this release: it knows all of its columns."""
@@ -82,7 +93,7 @@ class BackupSource:
         table, last = tables.chunk, b""
         while True:
             query = select(table.c.hash).where(table.c.hash > last).order_by(table.c.hash).limit(NAMES)
-            with self._database.read() as connection:
+            with self._read() as connection:
                 names = [bytes(name) for name in connection.execute(query).scalars()]
             yield names
             if len(names) < NAMES:
@@ -92,7 +103,7 @@ class BackupSource:
     def chunks(self, names: Sequence[bytes]) -> Iterator[tuple[bytes, bytes, str | None]]:
         """Read chunks and check each against its hash: (name, stored bytes, ``damaged`` or None)."""
         for start in range(0, len(names), READ):
-            with self._database.read() as connection:
+            with self._read() as connection:
                 rows = list(chunks.select_rows(connection, names[start : start + READ]))
             yield from ((name, data, problem(name, data)) for name, data in rows)
 
@@ -101,7 +112,7 @@ class BackupSource:
         table, last = tables.blob, ""
         while True:
             query = select(table.c.sha256).where(table.c.sha256 > last).order_by(table.c.sha256).limit(READ)
-            with self._database.read() as connection:
+            with self._read() as connection:
                 rows = blob_rows.select_rows(connection, list(connection.execute(query).scalars()))
             yield [rows[name] for name in sorted(rows)]
             if len(rows) < READ:
@@ -117,13 +128,13 @@ class BackupSource:
         table = tables.blob
         end = func.max(table.c.start + func.coalesce(table.c.stored, table.c.size))
         query = select(table.c.pack, end).where(table.c.pack.is_not(None))
-        with self._database.read() as connection:
+        with self._read() as connection:
             return {str(pack): int(size) for pack, size in connection.execute(query.group_by(table.c.pack))}
 
     def packed_rows(self, pack: str) -> list[BlobRow]:
         """Return the rows of the blobs in a pack."""
         table = tables.blob
-        with self._database.read() as connection:
+        with self._read() as connection:
             names = list(connection.execute(select(table.c.sha256).where(table.c.pack == pack)).scalars())
             return list(blob_rows.select_rows(connection, names).values())
 

@@ -16,6 +16,7 @@ import pytest
 import yaml
 from lxml import etree
 
+from app.clock import seconds_since_boot
 from app.convert.recipe import Recipe
 from app.pool import CancelHandle, Cancelled, Pool
 from app.progress import Progress
@@ -102,6 +103,22 @@ def test_repeated_requests_are_served_from_memory(api: Api, farm: str, monkeypat
     api.problem("GET", path, 503)
     monkeypatch.undo()
     assert api.get(path).content == first.content
+
+
+def test_answer_in_memory_is_old_when_a_suspended_host_wakes_up(
+    api: Api, farm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"environments/{farm}/versions/3/maps/kml"
+    clock = [seconds_since_boot()]
+    for module in ("app.api.maps", "app.api.http.response_cache"):
+        monkeypatch.setattr(f"{module}.seconds_since_boot", lambda: clock[0])
+    etag = api.get(path).headers["etag"]
+    hot, key = api.app.state.services.response_cache, (f"/api/v1/{path}".encode(), b"")
+    assert hot.get_fresh(key) is not None
+    clock[0] += 3600
+    assert hot.get_fresh(key) is None
+    api.get(path, 304, headers={"If-None-Match": etag})
+    assert hot.get_fresh(key) is not None
 
 
 def test_matching_etag_returns_304_without_conversion(api: Api, farm: str) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -175,6 +177,42 @@ def test_failing_store_is_named_with_its_reason(
         failing.write({"ab/x": b"x"})
     with pytest.raises(Unreadable):
         read(failing, "ab/x")
+
+
+GONE = b"<?xml version='1.0'?><Error><Code>NoSuchKey</Code><Message>gone</Message></Error>"
+
+
+def absent_keys(request: bytes) -> bytes:
+    """The answer to a request to delete files that reports each as absent."""
+    failures = (
+        b"<Error>%s<Code>NoSuchKey</Code><Message/></Error>" % key for key in re.findall(rb"<Key>.*?</Key>", request)
+    )
+    return b"<?xml version='1.0'?><DeleteResult>%s</DeleteResult>" % b"".join(failures)
+
+
+@pytest.mark.parametrize(("status", "body"), [(404, GONE), (200, absent_keys)])
+def test_files_are_deleted_although_a_server_reports_absent_ones_as_errors(
+    seaweed: Seaweed, s3_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int, body: Any
+) -> None:
+    """Some servers do, unlike S3. The first request has absent files only, the second one of each kind."""
+    store = FaultyStore(seaweed.ports["s3"])
+    try:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", store.endpoint)
+        monkeypatch.setattr("app.backends.blob_s3.DELETED_AT_ONCE", 2)
+        files = S3Files(s3_url, tmp_path)
+        files.prepare()
+        files.write({f"ab/{name}": b"x" for name in "vwxyz"})
+        store.fault = Fault(status, body=body, methods=("POST",), containing=b"gone-")
+        files.delete(["ab/gone-1", "ab/gone-2", "ab/v", "ab/gone-3", "ab/gone-4", "ab/w", "ab/x", "ab/y"])
+        assert [f.key for f in files.list()] == ["ab/z"]
+    finally:
+        store.close()
+
+
+def test_deleting_from_a_bucket_that_does_not_exist_fails(s3_url: str, tmp_path: Path) -> None:
+    """What is not deleted must be tried again: its rows stay."""
+    with pytest.raises(Unavailable, match="no such bucket"):
+        S3Files("s3://none/x", tmp_path).delete(["ab/x", "ab/y"])
 
 
 def test_copies_are_bounded_and_checked(tmp_path: Path) -> None:

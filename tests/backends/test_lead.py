@@ -161,6 +161,24 @@ class TestShared:
             store.environments.create("fresh")
         assert [e.name for e in store.environments.page()[0]] == ["fresh"]
 
+    def test_lease_ends_while_the_host_is_suspended(self, database_url: str, tmp_path: Path) -> None:
+        """A leader that wakes up asks the database first: the clock jumps, and its thread has not run again yet."""
+        clock = [1000.0]
+        leads = SharedLeads(database_url, tmp_path, lambda: clock[0])
+        try:
+            lead = leads.lead("task")
+            lead.try_acquire()
+            leads._hold_elections()
+            term = lead.term
+            assert term is not None
+            clock[0] += LEASE_SECONDS
+            assert not lead.is_held
+            assert not term.goes_on
+            with pytest.raises(LeadLostError), term.fenced():
+                pass
+        finally:
+            leads._disconnect()
+
     def test_stopped_process_loses_the_lead(
         self, database_url: str, tmp_path: Path, open_process: Callable[[], Leads]
     ) -> None:

@@ -40,6 +40,7 @@ def size_of(folder: Path) -> int:
 def test_restored_store_is_the_backed_up_one(store: Store, tmp_path: Path, empty_store: NewStore) -> None:
     result = back_up(store, tmp_path / "backup", tmp_path / "data")
     assert result.snapshot.damaged == ()
+    assert (store.backup_source.served > 0) == store.database_url.startswith("postgres")
     expected = rows_of(store)
     save(store, "farm", *replaces({GRID: grid(seed=6)}))
     target = empty_store()

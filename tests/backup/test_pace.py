@@ -12,14 +12,19 @@ from app.backup.pace import MAX_REST, MAX_REST_SECONDS, Pace, Times, current_tim
 
 
 class Machine:
-    """Times of a machine with two processors, of which others use a share. wait: seconds per second of work."""
+    """Times of a machine with two processors, of which others use a share.
 
-    def __init__(self, others: float, wait: float = 0.0) -> None:
-        self.others, self.wait = others, wait
+    wait, server: seconds that the thread waits, and that a database server works for it, per second of its work.
+    """
+
+    def __init__(self, others: float, wait: float = 0.0, server: float = 0.0) -> None:
+        self.others, self.wait, self.server = others, wait, server
         self.elapsed = self.worked = self.rested = 0.0
 
     def __call__(self) -> Times:
-        return Times(self.elapsed, self.worked, self.worked, self.worked + 2 * self.others * self.elapsed)
+        served = self.server * self.worked
+        machine = self.worked + served + 2 * self.others * self.elapsed
+        return Times(self.elapsed, self.worked, self.worked, machine, served)
 
     def sleep(self, seconds: float) -> None:
         self.rested += seconds
@@ -30,7 +35,7 @@ class Machine:
         paced = Pace(self, self.sleep, processors=2)
         for _ in range(round(seconds / piece)):
             self.worked += piece
-            self.elapsed += piece * (1 + self.wait)
+            self.elapsed += piece * (1 + self.wait + self.server)
             paced.rest()
         return seconds / self.elapsed
 
@@ -39,9 +44,14 @@ def test_free_machine_gives_full_speed() -> None:
     assert Machine(0.0).work(20) == pytest.approx(1)
 
 
-@pytest.mark.parametrize(("others", "share"), [(0.01, 0.83), (0.1, 1 / 3), (0.25, 1 / 6), (1.0, 1 / 6)])
+@pytest.mark.parametrize(("others", "share"), [(0.01, 0.74), (0.1, 1 / 4.6), (0.25, 1 / 10), (1.0, 1 / 10)])
 def test_rests_grow_with_the_use_by_others(others: float, share: float) -> None:
     assert Machine(others).work(60) == pytest.approx(share, abs=0.02)
+
+
+@pytest.mark.parametrize(("others", "share"), [(0.0, 1 / 2), (0.5, 1 / 20)])
+def test_work_of_a_database_server_counts_as_own(others: float, share: float) -> None:
+    assert Machine(others, server=1.0).work(20) == pytest.approx(share, abs=0.02)
 
 
 @pytest.mark.parametrize("others", [0.0, 0.5])

@@ -9,11 +9,14 @@ from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import func, select
 
 from app.mirror.centre import Centre
 from app.mirror.follow import Mirror
 from app.signing import Keys
+from app.store import tables
 from app.store.store import Store
+from tests.api import samples
 from tests.api.conftest import Api, empty_database, running, settings_for
 from tests.ports import free_port
 
@@ -139,3 +142,22 @@ def alone(centre: Api, tmp_path: Path) -> Iterator[Callable[..., Edge]]:
     for one in made:
         one.close()
         one.store.close()
+
+
+def long_network(step: int = 0) -> str:
+    """Return a file of a network of 2000 nodes; each step above 0 moves 150 others of them."""
+    low, high = 450 * step, 450 * step + 150 if step else 0
+    nodes = {f"n{k}": (float(k % 70), k / 70.0 + (step if low < k < high else 0)) for k in range(2000)}
+    return samples.tmap2(nodes, tuple((f"n{k}", f"n{k + 1}") for k in range(1999)))
+
+
+def stored_bytes(store: Store) -> int:
+    """Bytes of everything that the mirrored versions consist of, as they are stored."""
+    with store._database.read() as connection:
+        of = [
+            select(func.sum(func.length(tables.chunk.c.data))),
+            select(func.sum(func.coalesce(tables.blob.c.stored, tables.blob.c.size))),
+            select(func.sum(func.length(tables.version.c.manifest))),
+            select(func.sum(func.length(tables.event.c.body))),
+        ]
+        return sum(int(connection.execute(query).scalar() or 0) for query in of)

@@ -10,9 +10,11 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from app.agent import signatures
@@ -23,7 +25,7 @@ from app.store.store import Store
 from tests.agent.conftest import whole
 from tests.api.conftest import ADMIN, Api, create_farm
 from tests.events.conftest import eventually
-from tests.mirror.conftest import Edge, mirror_token
+from tests.mirror.conftest import Edge, long_network, mirror_token, stored_bytes
 from tests.preloaded import PreloadedProcess
 
 Make = Callable[..., Edge]
@@ -57,17 +59,26 @@ class Robot:
 
 
 @pytest.fixture
-def clock(site: Api, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
+def move_clock() -> Iterator[Callable[[Api, float], None]]:
+    """Move the clock of a server so many seconds ahead."""
+    stores: list[Store] = []
+    with pytest.MonkeyPatch.context() as patch:
+
+        def move(server: Api, seconds: float) -> None:
+            store: Store = server.app.state.services.store
+            patch.setattr(store._database, "now", lambda: datetime.now(UTC) + timedelta(seconds=seconds))
+            store.generation.change()  # what is in memory was signed before
+            stores.append(store)
+
+        yield move
+    for store in stores:
+        store.generation.change()
+
+
+@pytest.fixture
+def clock(site: Api, move_clock: Callable[[Api, float], None]) -> Callable[[float], None]:
     """Move the clock of the edge's server so many seconds ahead."""
-    store: Store = site.app.state.services.store
-
-    def move(seconds: float) -> None:
-        monkeypatch.setattr(store._database, "now", lambda: datetime.now(UTC) + timedelta(seconds=seconds))
-        store.generation.change()  # what is in memory was signed before
-
-    yield move
-    monkeypatch.undo()
-    store.generation.change()
+    return partial(move_clock, site)
 
 
 def test_robot_accepts_for_48_hours_without_the_centre(
@@ -97,6 +108,57 @@ def test_robot_accepts_for_48_hours_without_the_centre(
     assert not robot.accepts()
     assert "connect the mirror to its centre" in str(robot.log)
     assert whole(robot.into)["edge_sequence"] == 1, "it keeps its map"
+    robot.agent.close()
+
+
+def test_robot_accepts_all_along_while_its_centre_changes_for_48_hours(
+    centre: Api, site: Api, farm: str, follower: Make, move_clock: Callable[[Api, float], None], tmp_path: Path
+) -> None:
+    """Before, while and after the mirror catches up, which transfers little more than what it lacks."""
+    centre.upload(farm, {"network.tmap2.yaml": long_network()})
+    edge = follower(farm)
+    edge.follow()
+    first = centre.get(f"environments/{farm}/versions/latest").json()["version"]
+    edge.wire.cut = True
+    robot = Robot(site, farm, tmp_path / "robot", centre.get("keys").json()[0]["id"])
+    for hours in range(0, 49, 6):
+        seconds = hours * 3600.0
+        robot.ahead = seconds
+        edge.now = lambda ahead=seconds: datetime.now(UTC) + timedelta(seconds=ahead)
+        for server in (centre, site):
+            move_clock(server, seconds)
+        if hours % 12 == 6 and hours < 24:
+            centre.upload(farm, {"network.tmap2.yaml": long_network(1 + hours // 12)})
+        with pytest.raises(Unavailable):
+            edge.mirror.run_once()
+        assert robot.accepts(), (hours, robot.log)
+        assert whole(robot.into)["version"] == first
+    edge.wire.cut = False
+    accepted: list[bool] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        """Have the robot ask the edge after each request of the mirror."""
+        response = handle(request)
+        accepted.append(robot.accepts())
+        return response
+
+    edge.wire.sent = edge.wire.received = 0
+    before, handle = stored_bytes(edge.store), edge.wire.handle_request
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(edge.wire, "handle_request", answer)
+        edge.follow()
+    missing, transferred = stored_bytes(edge.store) - before, edge.wire.sent + edge.wire.received
+    assert transferred <= 1.1 * missing, (transferred, missing)
+    assert len(accepted) > 3
+    assert all(accepted), robot.log
+    assert robot.accepts(), robot.log
+    assert (
+        whole(robot.into)["version"]
+        == centre.get(f"environments/{farm}/versions/latest").json()["version"]
+        == first + 2
+    )
+    signer = (robot.into / "current" / "manifest.sig").read_text().partition(":")[0]
+    assert signer == site.get("keys").json()[0]["id"]
     robot.agent.close()
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from app.errors import Mirrored
 from app.mirror.follow import FULL_PASS
@@ -15,7 +15,7 @@ from app.store import tables
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, create_farm
-from tests.mirror.conftest import Edge
+from tests.mirror.conftest import Edge, long_network, stored_bytes
 
 Make = Callable[..., Edge]
 _count = itertools.count(1)
@@ -94,18 +94,12 @@ def test_mirror_follows_every_change(centre: Api, site: Api, farm: str, follower
 
 
 def test_catch_up_transfers_only_what_is_missing(centre: Api, farm: str, alone: Make) -> None:
-    nodes = {f"n{k}": (float(k % 70), k / 70.0) for k in range(2000)}
-    edges = tuple((f"n{k}", f"n{k + 1}") for k in range(1999))
-    centre.upload(farm, {"network.tmap2.yaml": samples.tmap2(nodes, edges)})
+    centre.upload(farm, {"network.tmap2.yaml": long_network()})
     edge = alone(farm)
     edge.follow()
     before = stored_bytes(edge.store)
     for step in range(1, 4):
-        moved = {
-            name: (x, y + (step if 450 * step < k < 450 * step + 150 else 0))
-            for k, (name, (x, y)) in enumerate(nodes.items())
-        }
-        centre.upload(farm, {"network.tmap2.yaml": samples.tmap2(moved, edges)})
+        centre.upload(farm, {"network.tmap2.yaml": long_network(step)})
     edge.wire.sent = edge.wire.received = 0
     edge.follow()
     missing = stored_bytes(edge.store) - before
@@ -120,18 +114,6 @@ def test_catch_up_transfers_only_what_is_missing(centre: Api, farm: str, alone: 
     edge.wire.sent = edge.wire.received = 0
     edge.follow()
     assert edge.wire.received < 5000, "nothing has changed"
-
-
-def stored_bytes(store: Store) -> int:
-    """Bytes of everything that the mirrored versions consist of, as they are stored."""
-    with store._database.read() as connection:
-        of = [
-            select(func.sum(func.length(tables.chunk.c.data))),
-            select(func.sum(func.coalesce(tables.blob.c.stored, tables.blob.c.size))),
-            select(func.sum(func.length(tables.version.c.manifest))),
-            select(func.sum(func.length(tables.event.c.body))),
-        ]
-        return sum(int(connection.execute(query).scalar() or 0) for query in of)
 
 
 def test_mirrored_environment_is_changed_at_its_centre(centre: Api, site: Api, farm: str, follower: Make) -> None:

@@ -12,7 +12,6 @@ import hashlib
 import ipaddress
 import re
 import threading
-import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from fastapi import Depends, Request
 from starlette.types import Scope
 
 from app.api.http.problems import Throttled
+from app.clock import seconds_since_boot
 from app.errors import Denied, Unauthenticated
 from app.store.sessions import Session
 from app.store.values import Role, Token, Writer
@@ -254,7 +254,7 @@ class Authenticator:
         anonymous: Sequence[IPv4Network | IPv6Network] = (),
         share: ShareFailures | None = None,
         insecure: bool = False,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = seconds_since_boot,
     ) -> None:
         self._find_token, self._find_session, self._failures, self._clock = find, find_session, failures, clock
         self._anonymous = tuple(anonymous)

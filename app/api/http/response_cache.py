@@ -7,7 +7,6 @@ Other requests take the slow path: middleware, route, recipe (the ETag), disk ca
 from __future__ import annotations
 
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from app.api.http.caching import none_match
 from app.api.http.metrics import Metrics
 from app.api.http.single_flight import SingleFlight
 from app.api.http.streams import Headers
+from app.clock import seconds_since_boot
 from app.convert.cache import CachedFile
 from app.convert.recipe import Recipe
 from app.errors import Denied
@@ -73,7 +73,7 @@ class ResponseCache:
     def get_fresh(self, key: Key) -> CachedResponse | None:
         """Return the response of an address if it is still valid."""
         entry = self._entries.get(key)
-        if entry is None or entry.fresh_until < time.monotonic() or entry.generation != self.generation():
+        if entry is None or entry.fresh_until < seconds_since_boot() or entry.generation != self.generation():
             return None
         return entry
 
@@ -126,7 +126,7 @@ class ResponseCache:
             file=None,
             sha256="",
             generation=generation,
-            fresh_until=time.monotonic() + FRESH_SECONDS,
+            fresh_until=seconds_since_boot() + FRESH_SECONDS,
             tally=self.tally(request.scope["route"].path),
         )
         self.insert(request_key(request), response)
