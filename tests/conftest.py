@@ -87,8 +87,8 @@ def _keep_files_in_memory(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run three workers more than there are processors: many tests wait for agents, routers, browsers and timeouts."""
-    return len(os.sched_getaffinity(0)) + 3
+    """Run two workers more than there are processors: many tests wait for agents, routers, browsers and timeouts."""
+    return len(os.sched_getaffinity(0)) + 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

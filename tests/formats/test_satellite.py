@@ -738,7 +738,7 @@ def test_false_tiff_sizes_are_refused(width: int, height: int) -> None:
     try:
         with pytest.raises((UnreadableFile, TooLarge)):
             read({"a.tif": false_size})
-        assert tracemalloc.get_traced_memory()[1] < 2**20
+        assert tracemalloc.get_traced_memory()[1] < 2**24  # of gigabytes; servers of other tests allocate, too
     finally:
         tracemalloc.stop()
 
