@@ -47,6 +47,9 @@ MAX_BEND = math.radians(15.0)
 
 MAX_ENDS = 20_000
 
+DRAWN_AT_ONCE = 256
+"""Number of lines and arcs that are drawn at once."""
+
 ENDS_AT_ONCE = 64
 """Number of straight ends whose pairs are compared at once: all pairs of a grid would need the most memory."""
 
@@ -98,15 +101,22 @@ def _pairs(at: Places, straight: Bool, span: float) -> Iterator[tuple[Places, Pl
 
 def _draw(out: NDArray[np.uint8], blocked: Bool, first: Places, second: Places, bend: Array) -> None:
     """Draw lines and arcs between ends [n, 2], in place, except those that leave the grid or meet a blocked cell."""
-    for a, b, turn in zip(first.tolist(), second.tolist(), bend.tolist(), strict=True):
-        steps = max(abs(a[0] - b[0]), abs(a[1] - b[1]))
-        share = np.linspace(0.0, 1.0, steps + 1)[1:-1]
+    steps = np.abs(second - first).max(axis=1)
+    for begin in range(0, len(first), DRAWN_AT_ONCE):
+        some = np.flatnonzero(steps[begin : begin + DRAWN_AT_ONCE] > 1) + begin  # neighbours have nothing between them
+        count = steps[some] - 1
+        line = np.repeat(np.arange(len(some)), count)
+        start, (down, right), turn = first[some][line], (second - first)[some][line].T, bend[some][line]
+        step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count) + 1
+        share = step * (1.0 / steps[some][line])
         aside = turn * share * (1.0 - share)
-        row = np.round(a[0] + share * (b[0] - a[0]) + aside * (b[1] - a[1])).astype(int)
-        column = np.round(a[1] + share * (b[1] - a[1]) - aside * (b[0] - a[0])).astype(int)
+        row = np.round(start[:, 0] + share * down + aside * right).astype(int)
+        column = np.round(start[:, 1] + share * right - aside * down).astype(int)
         inside = (row >= 0) & (row < out.shape[0]) & (column >= 0) & (column < out.shape[1])
-        if len(row) and inside.all() and not blocked[row, column].any():
-            out[row, column] = 1
+        meets = ~inside
+        meets[inside] = blocked[row[inside], column[inside]]
+        drawn = np.bincount(line, meets, len(some))[line] == 0
+        out[row[drawn], column[drawn]] = 1
 
 
 def _continues(

@@ -92,10 +92,10 @@ def test_wall_is_continued_to_its_corner_but_not_to_a_wall_across(stub: int) -> 
 
 
 def test_walls_compared_in_portions_are_the_same_and_need_less_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    occupied = np.zeros((100, 400), bool)
-    occupied[40, 20:380] = True
+    occupied = np.zeros((100, 1600), bool)
+    occupied[40, 20:1580] = True
     hole = np.zeros_like(occupied)
-    hole[41:60, 20:380] = True
+    hole[41:60, 20:1580] = True
     hole[30:60, 190:210] = True
     found, peaks = [], []
     for ends in (10_000, _evidence.ENDS_AT_ONCE):
