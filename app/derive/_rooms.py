@@ -11,17 +11,21 @@ Steps, after the methods compared by Bormann et al. (Room segmentation: survey, 
    Basins that meet elsewhere are joined.
 4. *Corridors* are parts of a basin that are much narrower than it, and long; and long basins.
 5. Basins that walls do not enclose (fields, yards, fringes of a scan) are no rooms.
+6. *Niches*, which open to one other area along a whole side, are parts of it, as Bormann et al. join small parts that
+   share much of their outline with one other.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from app.derive import _partitions
 
 Mask = NDArray[np.bool_]
 Labels = NDArray[np.int32]
@@ -51,6 +55,9 @@ MAX_DOOR = 2.3
 MIN_DOOR = 0.5
 """Width of doors in metres: from a narrow leaf to a double door."""
 
+WIDE_DOOR = 2.0
+"""Minimum width in metres of openings that part rooms although the distance to walls does not dip in them."""
+
 JAMB = 0.5
 """Minimum length of the walls that a door's gap continues, as a share of its width."""
 
@@ -72,6 +79,12 @@ MAX_CORRIDOR = 4.0
 
 ENCLOSED = 0.6
 """Minimum share of a room's outline that is wall or leads to another room."""
+
+SIDE = 0.25
+"""Minimum share of a room's outline, of a square one side, along which it opens to one area and is its niche."""
+
+BESIDE = 0.7
+"""Depth in metres behind a door in which the areas on its sides are sought."""
 
 SEEN = 0.25
 """Minimum share of a room's cells that are free: less was not seen, or is the inside of an obstacle."""
@@ -118,13 +131,16 @@ def rooms(free: Mask, occupied: Mask, cell: float) -> Rooms:
     """Divide the free ground of a grid into rooms and corridors. cell: metres; grids have row 0 at the bottom."""
     ground, wall = declutter(free, occupied, cell)
     distance = distances(ground)
-    labels = basins(distance, cell)
-    labels, doors = _join(labels, distance, wall, cell)
+    borders = _partitions.borders(wall, ground, WIDE_DOOR, JAMB, cell)
+    labels = basins(np.where(borders, np.float32(0), distance), cell)
+    labels = _grown(labels, borders)
+    labels, doors = _join(labels, distance, wall, borders, cell)
     labels = _enclosed(labels, free, wall, distance, cell)
     thick = thickness(ground, distance)
-    rooms_only = int(labels.max())
-    labels = _cut_corridors(labels, free, thick, cell)
-    return _classified(labels, doors, wall, distance, thick, cell, rooms_only)
+    labels, corridors = _cut_corridors(labels, free, thick, cell)
+    labels = _without_niches(labels, corridors, free, cell)
+    doors = [replace(door, sides=_sides(door, labels, cell)) for door in doors]
+    return _classified(labels, doors, wall, distance, thick, cell, corridors)
 
 
 def distances(mask: Mask) -> Distance:
@@ -197,7 +213,21 @@ def basins(distance: Distance, cell: float) -> Labels:
     return labels
 
 
-def _join(labels: Labels, distance: Distance, wall: Mask, cell: float) -> tuple[Labels, list[Door]]:
+def _grown(labels: Labels, ground: Mask) -> Labels:
+    """Return labels that reach into the thin ground between them."""
+    labels = labels.copy()
+    left = ground & (labels == 0)
+    while left.any():
+        near = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+        reached = left & (near > 0)
+        if not reached.any():
+            break
+        labels[reached] = near[reached]
+        left &= ~reached
+    return labels
+
+
+def _join(labels: Labels, distance: Distance, wall: Mask, borders: Mask, cell: float) -> tuple[Labels, list[Door]]:
     """Join basins that meet elsewhere than at a door; return the labels and the doors."""
     parent = np.arange(int(labels.max()) + 1)
 
@@ -209,10 +239,10 @@ def _join(labels: Labels, distance: Distance, wall: Mask, cell: float) -> tuple[
     candidates: list[Door] = []
     for a, b, seam in _seams(labels):
         door = _door(seam, distance, wall, cell, (a, b))
-        if door is None:
+        if door is None and borders[tuple(seam.T)].mean() <= 0.5:
             low, high = sorted((top(a), top(b)))
             parent[high] = low
-        else:
+        elif door is not None:
             candidates.append(door)
     final = np.array([top(k) for k in range(len(parent))], np.int32)
     doors = [
@@ -320,10 +350,14 @@ def thickness(ground: Mask, distance: Distance) -> Distance:
     return out
 
 
-def _cut_corridors(labels: Labels, free: Mask, thick: Distance, cell: float) -> Labels:
-    """Give long parts of a basin that are much narrower than it a label of their own, above the others."""
+def _cut_corridors(labels: Labels, free: Mask, thick: Distance, cell: float) -> tuple[Labels, set[int]]:
+    """Give long parts of a basin that are much narrower than it, and what they part, labels of their own.
+
+    Return the labels, and those of such corridors.
+    """
     labels = labels.copy()
     count = int(labels.max())
+    corridors: set[int] = set()
     peak = np.zeros(count + 1)
     np.maximum.at(peak, labels.ravel(), thick.ravel())
     thin = (labels > 0) & (thick < THIN * peak[labels]) & (thick * cell >= 0.3) & (thick * cell <= MAX_CORRIDOR / 2)
@@ -331,6 +365,7 @@ def _cut_corridors(labels: Labels, free: Mask, thick: Distance, cell: float) -> 
         inside = labels[window] == basin
         part = (thin[window] & inside).astype(np.uint8)
         _, piece, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=4)
+        before = count
         for k in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * cell * cell >= MIN_ROOM_AREA).tolist():
             x, y, width, height, _ = stats[k].tolist()
             frame = (slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1))
@@ -338,7 +373,48 @@ def _cut_corridors(labels: Labels, free: Mask, thick: Distance, cell: float) -> 
             if k and _is_corridor(chosen, inside[frame], free[window][frame], thick[window][frame]):
                 count += 1
                 labels[window][frame][chosen] = count
+                corridors.add(count)
+        if count > before:
+            pieces, piece = cv2.connectedComponents((labels[window] == basin).astype(np.uint8), connectivity=4)
+            for k in range(2, pieces):
+                count += 1
+                labels[window][piece == k] = count
+    return labels, corridors
+
+
+def _without_niches(labels: Labels, corridors: set[int], free: Mask, cell: float) -> Labels:
+    """Join rooms that open to one other area along a whole side, and scraps, to their neighbours, the smallest first.
+
+    Scraps, which corridors leave, are too small for rooms, or were not seen.
+    """
+    labels = labels.copy()
+    for k, window in sorted(_windows(labels), key=lambda one: np.count_nonzero(labels[one[1]] == one[0])):
+        chosen = labels[window] == k
+        if k in corridors or not chosen.any():
+            continue
+        beside = labels[window][(cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & ~chosen]
+        shared = np.bincount(beside, minlength=1)
+        shared[0] = 0
+        area = np.count_nonzero(chosen)
+        is_scrap = area * cell * cell < MIN_ROOM_AREA or np.count_nonzero(chosen & free[window]) < SEEN * area
+        if is_scrap or shared.max() >= SIDE * len(beside):
+            labels[window][chosen] = int(shared.argmax())
     return labels
+
+
+def _sides(door: Door, labels: Labels, cell: float) -> tuple[int, int]:
+    """Return the areas on both sides of a door, 0 for none."""
+    middle, along = door.ends.mean(axis=0), (door.ends[1] - door.ends[0]) / door.width
+    places = middle + np.linspace(-0.3, 0.3, 7)[:, None] * along * door.width
+    depths = np.arange(round(BESIDE / 2 / cell), round(BESIDE / cell) + 2)[:, None, None] * np.array(
+        [-along[1], along[0]]
+    )
+    out = []
+    for sign in (-1, 1):
+        x, y = np.moveaxis(np.rint(places + sign * depths).astype(int), -1, 0)
+        near = labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)]
+        out.append(int(np.bincount(near.ravel()).argmax()))
+    return out[0], out[1]
 
 
 def _is_corridor(chosen: Mask, basin: Mask, free: Mask, thick: Distance) -> bool:
@@ -390,7 +466,7 @@ def _enclosure(chosen: Mask, border: Mask) -> float:
 
 
 def _classified(
-    labels: Labels, doors: list[Door], wall: Mask, distance: Distance, thick: Distance, cell: float, last_room: int
+    labels: Labels, doors: list[Door], wall: Mask, distance: Distance, thick: Distance, cell: float, corridors: set[int]
 ) -> Rooms:
     """Return the areas with their kinds: a corridor is long, and leads on at two places or more."""
     solid = cv2.dilate(wall.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1
@@ -406,5 +482,5 @@ def _classified(
         beside = (cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) == 1) & (labels[window] > 0) & ~chosen
         exits, _ = cv2.connectedComponents(beside.astype(np.uint8), connectivity=8)
         ways = max(exits - 1, sum(k in door.sides for door in doors))
-        kinds[k] = "corridor" if k > last_room or (is_long and ways > 1) else "room"
-    return Rooms(labels, kinds, widths, enclosed, [d for d in doors if {*d.sides} & kinds.keys()])
+        kinds[k] = "corridor" if k in corridors or (is_long and ways > 1) else "room"
+    return Rooms(labels, kinds, widths, enclosed, [d for d in doors if d.sides[0] != d.sides[1]])

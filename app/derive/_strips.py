@@ -166,6 +166,8 @@ def _chains(middles: Points, sizes: NDArray[np.float64], cell: float) -> list[Li
     """
     from scipy.spatial import cKDTree
 
+    if len(middles) < CHAIN:
+        return []
     tree = cKDTree(middles)
     close = _neighbours(tree, middles, sizes, cell)
     chains = _longest(_walks(tree, middles, sizes, close, cell), middles, set(), cell)

@@ -66,7 +66,7 @@ class Parameters:
     needs={"occupancy"},
     parameters=Parameters,
     cost=5.0,
-    version=2,
+    version=3,
     also=frozenset({"zones"}),
     makes=frozenset({AREAS}),
 )

@@ -35,7 +35,7 @@ def _cases(kind: str | None, only: str, data: Path | None) -> Iterator[Case]:
     """Yield what the judge derives."""
     from app.model.layers import MAP, Layers, PartKey
     from tests.derive import judge
-    from tests.derive.judge import aerial, completion, plan, scan
+    from tests.derive.judge import aerial, completion, plan, rooms, scan
     from tests.derive.judge.__main__ import OWN
 
     for case in judge.cases(OWN, data or judge.DATA):
@@ -50,6 +50,8 @@ def _cases(kind: str | None, only: str, data: Path | None) -> Iterator[Case]:
                 layers = Layers({PartKey("imagery", "ground", case.kind): picture})
                 for step in ("imagery_to_occupancy", "imagery_to_objects"):
                     yield case.kind, case.name, step, layers
+            elif case.kind == "rooms":
+                yield case.kind, case.name, "occupancy_to_zones", rooms.read_layers(case)[0]
             elif case.kind == "completion":
                 grid = completion.read_grid(case)
                 hole, _ = completion.holes(grid, case.labels["seed"])[0]

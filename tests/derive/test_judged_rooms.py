@@ -9,7 +9,15 @@ import pytest
 from tests.derive.judge import cases, judged
 from tests.derive.judge.__main__ import OWN
 
-SMALL = ("nav2_depot", "riseholme_vineyard", "rmf_hotel_L2", "rmf_office", "turtlebot3_house")
+SMALL = (
+    "joctomap_ecmr",
+    "nav2_depot",
+    "riseholme_vineyard",
+    "rmf_hotel_L2",
+    "rmf_office",
+    "turtlebot3_house",
+    "turtlebot3_office_raw",
+)
 
 
 @pytest.mark.parametrize("name", SMALL)

@@ -70,6 +70,37 @@ def test_flat_has_rooms_a_corridor_and_doors() -> None:
         assert 0.5 <= door["confidence"] <= 1.0
 
 
+def halls(stub: float, opening: float) -> NDArray[np.uint8]:
+    """Two halls of 10 × 3 m, one south of the other, with an opening in the wall between them."""
+    frame = [(0, 0, 10.4, 0.2), (0, 6.4, 10.4, 6.6), (0, 0, 0.2, 6.6), (10.2, 0, 10.4, 6.6)]
+    return np.asarray(draw(10.4, 6.6, [*frame, (0, 3.2, 0.2 + stub, 3.4), (0.2 + stub + opening, 3.2, 10.4, 3.4)]))
+
+
+@pytest.mark.parametrize("yaw", [0, 1])
+def test_opening_wider_than_a_room_is_deep_parts_rooms(yaw: int) -> None:
+    found = by_name(zones(np.rot90(halls(1.5, 4.0), yaw).copy()))
+    assert sorted(found) == ["room-1", "room-2"], "an opening of 4 m is no door"
+    assert [shape.area for _, shape in found.values()] == pytest.approx([30.0, 30.0], rel=0.05)
+
+
+def test_piece_of_wall_in_a_room_does_not_part_it() -> None:
+    assert sorted(by_name(zones(halls(0.0, 6.0)))) == ["room-1"], "there is wall on one side only"
+    assert sorted(by_name(zones(halls(1.0, 7.0)))) == ["room-1"], "the opening is most of the wall"
+
+
+def test_niche_belongs_to_its_room() -> None:
+    cells = draw(10.0, 8.0, [(0, 0, 10, 0.2), (0, 7.8, 10, 8), (0, 0, 0.2, 8), (9.8, 0, 10, 8)])
+    cells[20:22, 70:86] = cells[40:42, 70:86] = OCCUPIED  # a booth of 1.8 × 2.8 m with a counter before it,
+    cells[20:42, 70:72] = OCCUPIED  # and ways of 1.2 m past it
+    assert sorted(by_name(zones(cells))) == ["room-1"]
+
+
+def test_goods_around_one_pallet_are_no_chain() -> None:
+    cells = draw(8.0, 8.0, [(0, 0, 8, 0.2), (0, 7.8, 8, 8), (0, 0, 0.2, 8), (7.8, 0, 8, 8), (2.8, 3.9, 5.2, 4.1)])
+    cells[[35, 35, 45, 45, 48], [36, 44, 36, 44, 40]] = OCCUPIED
+    assert sorted(by_name(zones(cells))) == ["room-1"]
+
+
 def test_areas_follow_origin_and_yaw_of_the_grid() -> None:
     yaw = 0.4
     plain, turned = by_name(zones(flat())), by_name(zones(flat(), origin=(3.0, -2.0, yaw)))

@@ -67,7 +67,7 @@ class Area:
 
 def judge(case: Case) -> Result:
     """Derive the areas of a labelled map, and measure them."""
-    layers, key, grid = _layers(case)
+    layers, key, grid = read_layers(case)
     zones = derive_zones(layers)
     found = areas(zones, key, grid)
     figures = [
@@ -102,7 +102,7 @@ def areas(layers: Layers, key: PartKey, grid: OccupancyGrid) -> list[Area]:
     return out
 
 
-def _layers(case: Case) -> tuple[Layers, PartKey, OccupancyGrid]:
+def read_layers(case: Case) -> tuple[Layers, PartKey, OccupancyGrid]:
     """Return the map's layers with one grid, its key, and the grid."""
     path = case.file()
     if "resolution" in case.labels:
