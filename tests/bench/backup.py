@@ -102,8 +102,8 @@ def _rows(folder: Path, home: Home, target: Home) -> list[dict[str, Any]]:
         store.migrate()
         fill(store, int(GIGABYTES * 2**30))
     with running_server(home) as (server, client):
-        out, acknowledged = _during(client, home, place)
-        out += _incremental(client, home, place)
+        out, acknowledged, former = _during(client, home, place)
+        out += _incremental(client, home, place, former)
         robots = _Robots(server.address, folder / "robots")
         robots.sync()
         promote(client, "writer-0", -1)
@@ -212,8 +212,8 @@ def finish_fleetmap(process: subprocess.Popen[str]) -> Any:
 
 def _during(
     client: httpx.Client, home: Home, place: Path
-) -> tuple[list[dict[str, Any]], dict[str, dict[tuple[str, int], str]]]:
-    """Measure commits during backups; returns what was acknowledged before and after the first one.
+) -> tuple[list[dict[str, Any]], dict[str, dict[tuple[str, int], str]], int]:
+    """Measure commits during backups; returns what was acknowledged before and after the first one, and its size.
 
     The backup is stopped and continued in turn, so that other work on the machine slows both sides alike.
     """
@@ -225,6 +225,7 @@ def _during(
     time.sleep(PHASE_SECONDS)
     acknowledged: dict[str, dict[tuple[str, int], str]] = {}
     windows: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+    former = 0
     for cycle in range(CYCLES):
         acknowledged.setdefault("before", dict(writers.versions))
         into = place if cycle == 0 else place.with_name(f"backup{cycle}")
@@ -238,21 +239,25 @@ def _during(
             process.send_signal(signal.SIGCONT)
         size = finish_fleetmap(process)["bytes"]
         acknowledged.setdefault("after", dict(writers.versions))
+        former = former or _content_bytes(home)
     writers.stop()
     times = {kind: [s for begin, end in spans for s in writers.times(begin, end)] for kind, spans in windows.items()}
     seconds = {kind: sum(end - begin for begin, end in spans) for kind, spans in windows.items()}
     busy, quiet = times[True], times[False]
     label = f"{CYCLES} backups of {size / 1e9:.1f} GB, {seconds[True] / CYCLES:.0f} s each, {WRITERS} writers"
     rates = len(quiet) / seconds[False], len(busy) / seconds[True]
-    return [
+    out = [
         row(f"{label}: commit (peer: while it is stopped)", median(busy) * 1e3, MAX_SLOWER, "ms", median(quiet) * 1e3),
         row("commits a second while it is stopped (peer: during)", rates[0], MAX_SLOWER, "1/s", rates[1]),
-    ], acknowledged
+    ]
+    return out, acknowledged, former
 
 
-def _incremental(client: httpx.Client, home: Home, place: Path) -> list[dict[str, Any]]:
-    """Measure what a second backup writes of a change: uploads, a large grid, and many small commits."""
-    former = _content_bytes(home)
+def _incremental(client: httpx.Client, home: Home, place: Path, former: int) -> list[dict[str, Any]]:
+    """Measure what a second backup writes of a change: uploads, a large grid, and many small commits.
+
+    former: bytes of what there was at the end of the first one.
+    """
     with closing(home.open_store()) as store:
         dice = np.random.default_rng(2)
         for number in range(max(1, int(GIGABYTES * 2**30 * SHARE_CHANGED) // STEP_BYTES)):
