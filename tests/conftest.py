@@ -24,6 +24,7 @@ from hypothesis import settings
 from app import native
 from tests.api.conftest import Api, running, settings_for
 from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
+from tests.preloaded import SHARED_FORKER, Forker
 from tests.seaweed import s3_url, seaweed  # noqa: F401  fixtures
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -67,6 +68,9 @@ def pytest_configure(config: pytest.Config) -> None:
         process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TOP)
         config.add_cleanup(process.wait)
         config.add_cleanup(process.kill)
+        forker = Forker()
+        os.environ[SHARED_FORKER] = forker.address
+        config.add_cleanup(forker.stop)
 
 
 def _keep_files_in_memory(config: pytest.Config) -> None:

@@ -4,8 +4,9 @@ Importing them takes half a second of processor time for a command and two for a
 of each. Everything else is as if ``python -m app.cli`` was started: environment, folder, input and output, signals,
 exit status, and a session of its own.
 
-Run as a program, with a socket as its argument, this is the process that forks: it has one thread, and one pytest
-process as its client. Each message is a request in JSON and gets a response.
+Run as a program, with a listening socket and a pipe as its arguments, this is the process that forks: it has one thread
+and pytest's processes as its clients. It imports when the first of them connects, and ends when nobody can write into
+the pipe any more. Each message is a request in JSON and gets a response.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ import os
 import pkgutil
 import runpy
 import select
+import selectors
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -40,6 +43,9 @@ COMMANDS = "app.cli"
 """The module that is run, and the package whose modules are imported as well."""
 
 LARGEST = 1 << 20
+
+SHARED_FORKER = "PYTEST_FORKER"
+"""Variable with the address of a forker that pytest's workers share."""
 
 SHARES_FORK_SERVER = sys.version_info[:2] in ((3, 11), (3, 12), (3, 13))
 """It needs names that are private to multiprocessing, and were the same in these versions."""
@@ -201,20 +207,45 @@ def _run_for(client: socket.socket, env: Mapping[str, str]) -> None:
             client.send(str(status).encode())
 
 
-class _Forker:
-    """The process that forks, from its client's side."""
+class Forker:
+    """The process that forks, from the side of the process that started it."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._folder = tempfile.TemporaryDirectory(prefix="forker-")
+        self.address = f"{self._folder.name}/socket"
         environment = {name: value for name, value in os.environ.items() if not name.startswith("FLEETMAP_")}
-        with theirs:
+        reading, self._writing = os.pipe()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+            listener.bind(self.address)
+            listener.listen()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.preloaded", str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-m", "tests.preloaded", str(listener.fileno()), str(reading)],
+                pass_fds=[listener.fileno(), reading],
                 cwd=ROOT,
                 env={**environment, "PYTHONPATH": str(ROOT)},
             )
+        os.close(reading)
+
+    def stop(self) -> None:
+        """End the process; servers that still run go on."""
+        os.close(self._writing)
+        self._process.wait()
+        self._folder.cleanup()
+
+
+class _Client:
+    """A connection to the process that forks: the one that pytest's workers share, or else one of this process."""
+
+    def __init__(self) -> None:
+        address = os.environ.get(SHARED_FORKER)
+        if address is None:
+            forker = Forker()
+            atexit.register(forker.stop)
+            address = forker.address
+        self._lock = threading.Lock()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.connect(address)
+        atexit.register(self._socket.close)
 
     def ask(self, request: dict[str, Any], *descriptors: int) -> dict[str, Any]:
         """Return the response to a request."""
@@ -223,38 +254,55 @@ class _Forker:
             response: dict[str, Any] = json.loads(self._socket.recv(LARGEST))
             return response
 
-    def stop(self) -> None:
-        """End the process; servers that still run go on."""
-        self._socket.close()
-        self._process.wait()
-
 
 @functools.cache
-def _forker() -> _Forker:
-    forker = _Forker()
-    atexit.register(forker.stop)
-    return forker
+def _forker() -> _Client:
+    return _Client()
 
 
-def _serve(client: socket.socket) -> tuple[str, list[str]]:
-    """Fork for each request, until the client is gone. In the new process, return its module and arguments."""
-    while True:
-        data, descriptors, _, _ = socket.recv_fds(client, LARGEST, 3)
-        if not data:
-            os._exit(0)
-        request = json.loads(data)
-        if "wait" in request:
-            status = os.waitstatus_to_exitcode(os.waitpid(request["wait"], 0)[1])
-            client.send(json.dumps({"status": status}).encode())
-            continue
-        pid = os.fork()
-        if pid == 0:
-            client.close()
-            _become(request, *descriptors)
-            return request["module"], request["arguments"]
+def _serve(listener: socket.socket, alive: int) -> tuple[str, list[str]]:
+    """Fork for each request of any client. In the new process, return its module and arguments."""
+    clients: list[socket.socket] = []
+    with selectors.DefaultSelector() as selector:
+        selector.register(listener, selectors.EVENT_READ)
+        selector.register(alive, selectors.EVENT_READ)
+        while True:
+            for client in [key.fileobj for key, _ in selector.select()]:
+                if client is listener:
+                    clients.append(listener.accept()[0])
+                    selector.register(clients[-1], selectors.EVENT_READ)
+                    _preload()
+                elif not isinstance(client, socket.socket):
+                    os._exit(0)
+                elif (answered := _answer(client)) is None:
+                    selector.unregister(client)
+                    clients.remove(client)
+                    client.close()
+                elif answered:
+                    for other in (listener, *clients):
+                        other.close()
+                    os.close(alive)
+                    request, streams = answered
+                    _become(request, *streams)
+                    return request["module"], request["arguments"]
+
+
+def _answer(client: socket.socket) -> tuple[dict[str, Any], list[int]] | tuple[()] | None:
+    """Answer a client's request; return None if the client is gone. In a new process, return the request and files."""
+    data, descriptors, _, _ = socket.recv_fds(client, LARGEST, 3)
+    if not data:
+        return None
+    request: dict[str, Any] = json.loads(data)
+    if "wait" in request:
+        response = {"status": os.waitstatus_to_exitcode(os.waitpid(request["wait"], 0)[1])}
+    else:
+        response = {"pid": os.fork()}
+        if response["pid"] == 0:
+            return request, descriptors
         for descriptor in descriptors:
             os.close(descriptor)
-        client.send(json.dumps({"pid": pid}).encode())
+    client.send(json.dumps(response).encode())
+    return ()
 
 
 def _become(request: dict[str, Any], *streams: int) -> None:
@@ -298,6 +346,7 @@ def _fork_the_fork_server() -> None:
         server._forkserver_address, server._forkserver_alive_fd, server._forkserver_pid = address, writing, pid
 
 
+@functools.cache
 def _preload() -> None:
     commands = importlib.import_module(COMMANDS)
     for name in (*MODULES, *(f"{COMMANDS}.{found.name}" for found in pkgutil.iter_modules(commands.__path__))):
@@ -310,7 +359,6 @@ def _preload() -> None:
 
 
 if __name__ == "__main__":
-    _preload()
-    module, sys.argv[1:] = _serve(socket.socket(fileno=int(sys.argv[1])))
+    module, sys.argv[1:] = _serve(socket.socket(fileno=int(sys.argv[1])), int(sys.argv[2]))
     sys.argv[0] = "fleetmap"
     runpy.run_module(module, run_name="__main__", alter_sys=True)

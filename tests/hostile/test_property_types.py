@@ -25,7 +25,7 @@ from app.errors import FleetMapError
 from app.limits import Limits
 from app.model.features import NO_GEOMETRY, Features
 from app.model.frame import Datum
-from app.model.layers import Layers
+from app.model.layers import Layer, Layers
 from app.upload_reader import EnvironmentContext, UploadHints
 from tests.hostile.corpus import sample_maps
 
@@ -95,20 +95,26 @@ def mutated_part(part: Features, dice: random.Random) -> Features:
     return Features(part.ids, geometry, tuple(properties), local, document)
 
 
-def bases() -> Iterator[tuple[str, Layers]]:
-    for name, files in sample_maps():
-        for layer in (None, "topology"):
-            if layer and not formats.get_format(name).traits.is_drawing:
-                continue
-            upload_bundle = upload_reader.read(
-                upload_reader.unpack(files, Limits()),
-                UploadHints(name, layer=layer),
-                EnvironmentContext(HERE),
-                Limits(),
-            )
-            layers = upload_bundle.layers(HERE)
-            parts = {key: scaled_part(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
-            yield f"{name}/{min(files)}{f' as {layer}' if layer else ''}", Layers(parts, layers.datum, layers.levels)
+def bases() -> Iterator[tuple[str, str, dict[str, bytes], Layer | None]]:
+    """Yield name, format, files and layer of each sample, and once more as a network if it is a drawing."""
+    drawn: tuple[Layer | None, ...] = (None, "topology")
+    for format_name, files in sample_maps():
+        for layer in drawn:
+            if layer is None or formats.get_format(format_name).traits.is_drawing:
+                yield f"{format_name}/{min(files)}{f' as {layer}' if layer else ''}", format_name, files, layer
+
+
+def read_base(format_name: str, files: dict[str, bytes], layer: Layer | None) -> Layers:
+    """Read a sample and scale it."""
+    upload_bundle = upload_reader.read(
+        upload_reader.unpack(files, Limits()),
+        UploadHints(format_name, layer=layer),
+        EnvironmentContext(HERE),
+        Limits(),
+    )
+    layers = upload_bundle.layers(HERE)
+    parts = {key: scaled_part(p) if isinstance(p, Features) else p for key, p in layers.parts.items()}
+    return Layers(parts, layers.datum, layers.levels)
 
 
 def scaled_part(part: Features) -> Features:
@@ -141,8 +147,11 @@ def writer_bugs(layers: Layers) -> list[tuple[str, BaseException]]:
     return out
 
 
-@pytest.mark.parametrize("layers", [pytest.param(layers, id=name) for name, layers in bases()])
-def test_property_values_of_any_type_break_no_writer(layers: Layers) -> None:
+@pytest.mark.parametrize(("format_name", "files", "layer"), [pytest.param(*base, id=name) for name, *base in bases()])
+def test_property_values_of_any_type_break_no_writer(
+    format_name: str, files: dict[str, bytes], layer: Layer | None
+) -> None:
+    layers = read_base(format_name, files, layer)
     vector = [key for key, part in layers.parts.items() if isinstance(part, Features)]
     if not vector:
         return

@@ -163,10 +163,10 @@ def check_accessibility(page: Page, axe: str, rules: Sequence[str] = ()) -> None
     if not page.evaluate("'axe' in window"):
         page.evaluate(axe)
     options = {"resultTypes": ["violations"]} | ({"runOnly": {"type": "rule", "values": list(rules)}} if rules else {})
-    found = page.evaluate("options => axe.run(document, options)", options)
+    found = page.evaluate("options => axe.run(document, options).then(({violations}) => violations)", options)
     serious = [
         f"{one['id']}: {one['help']}: {[node['html'][:120] for node in one['nodes'][:3]]}"
-        for one in found["violations"]
+        for one in found
         if one["impact"] in ("serious", "critical")
     ]
     assert not serious, "\n".join(serious)
