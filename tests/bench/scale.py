@@ -108,6 +108,7 @@ def _cpu_clock(process: int, database: str) -> Iterator[Callable[[], float]]:
             connection = stack.enter_context(psycopg.connect(database.replace("+psycopg", ""), autocommit=True))
 
         def read() -> float:
+            os.sched_yield()  # else the times of this thread are those of the scheduler's last tick
             files = list(Path(f"/proc/{process}/task").glob("*/schedstat"))
             if connection is not None:
                 files += [Path(f"/proc/{row[0]}/schedstat") for row in connection.execute(query)]
