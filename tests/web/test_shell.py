@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from playwright.sync_api import Page, expect
 
-from tests.web.conftest import DESKTOP, TABLET, Open, WebServer, check_themes, wait_until
+from tests.web.conftest import DESKTOP, SECONDS, TABLET, Open, WebServer, check_themes, wait_until
 
 VIEWS = ("Layers", "History", "Upload", "Edit", "Coverage", "Fleet", "Checks")
 
@@ -142,6 +148,47 @@ def test_last_map_stays_readable_offline(open_page: Open) -> None:
     expect(page.get_by_text("Offline", exact=False)).to_be_visible()
     page.context.set_offline(False)
     expect(page.get_by_text("Offline", exact=False)).to_have_count(0)
+
+
+def test_no_node_covers_the_name_of_an_area(open_page: Open, server: WebServer) -> None:
+    server.call("POST", "environments", json={"name": "named"})
+    ring = [[-30, -20], [30, -20], [30, 20], [-30, 20], [-30, -20]]
+    room = ("zones", "Room with a long name", {"type": "Polygon", "coordinates": [ring]}, "room")
+    nodes = [("topology", f"n{x}", {"type": "Point", "coordinates": [x, 0]}, "node") for x in range(-29, 30)]
+    changes = [
+        {
+            "op": "put",
+            "layer": layer,
+            "feature": {
+                "type": "Feature",
+                "id": name,
+                "place": place,
+                "geometry": None,
+                "properties": {"kind": kind, "name": name},
+            },
+        }
+        for layer, name, place, kind in (room, *nodes)
+    ]
+    server.call("POST", "environments/named/edits", json={"message": "", "changes": changes})
+    page = open_page("/?site=named")
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+
+    def seen(is_complete: Callable[[int, int], bool]) -> NDArray[np.bool_]:
+        """Return which pixels are as dark as names, once the numbers of these and of those of nodes are right."""
+        deadline = time.monotonic() + SECONDS
+        while True:
+            picture = np.frombuffer(page.locator(".ol-viewport").screenshot(), np.uint8)
+            blue, _, red = np.moveaxis(cv2.imdecode(picture, cv2.IMREAD_COLOR).astype(int), -1, 0)
+            ink = (red < 60) & (blue < 60)
+            if is_complete(int(ink.sum()), int(((red < 60) & (blue > 90)).sum())):
+                return np.asarray(ink)
+            assert time.monotonic() < deadline, "the name or the nodes are not drawn"
+            page.wait_for_timeout(250)
+
+    with_nodes = seen(lambda ink, nodes: ink > 200 and nodes > 200)
+    page.get_by_role("button", name="Hide Network").click()
+    without = seen(lambda ink, nodes: ink > 200 and nodes < 20)
+    assert (without & ~with_nodes).sum() < 0.02 * without.sum(), "nodes cover the name"
 
 
 def test_markup_in_names_is_text(open_page: Open, server: WebServer) -> None:

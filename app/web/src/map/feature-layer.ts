@@ -1,6 +1,7 @@
 /** Features drawn by class: all lines of a class are one path, so that ten thousand cost as much as ten. */
 import { apply } from "ol/transform";
-import { type Box, boxOf, centreOf, type Feature, type Geometry, isArea, linesOf, nameOf, pointsOf } from "./features";
+import { centreOf, type Feature, type Geometry, isArea, isIn, linesOf, pointsOf } from "./features";
+import { writeNames } from "./names";
 import { PaintedLayer, type PaintedView } from "./painted";
 
 /** How a class of features is drawn. Sizes are in CSS pixels. */
@@ -49,23 +50,32 @@ interface Group extends Chunk {
 }
 
 const CHUNK = 1000;
-const MAX_LABELS = 250;
 const ARROW = 5;
 const MIN_ARROW_EDGE = 22;
 const MAX_ARROWS = 3000;
-const FONT = "500 12px system-ui, sans-serif";
 
 export class FeatureLayer extends PaintedLayer {
   private groups = new Map<string, Group>();
   /** Paths are float32: they are drawn from here, so that millimetres last. */
   private anchor: [number, number] = [0, 0];
   private hidden = new Set<string>();
+  /** Whether another layer writes the names, above this one. */
+  isNamedAbove = false;
 
   constructor(
     private readonly style: FeatureStyle,
     zIndex: number,
   ) {
     super({ zIndex });
+  }
+
+  /** Returns the features in a view whose names are written. */
+  named(view: PaintedView): Feature[] {
+    return Object.entries(this.style.paints()).flatMap(([name, paint]) => {
+      if (!paint.labels || !isNear(paint, view)) return [];
+      const features = this.groups.get(name)?.features ?? [];
+      return features.filter(({ geometry }) => isIn(view.extent, ...centreOf(geometry)));
+    });
   }
 
   setFeatures(features: readonly Feature[]): void {
@@ -183,7 +193,6 @@ export class FeatureLayer extends PaintedLayer {
   protected override paint(context: CanvasRenderingContext2D, view: PaintedView): void {
     const pixel = view.resolution; // metres in a CSS pixel
     const paints = this.style.paints();
-    const labels: Feature[] = [];
     context.lineJoin = "round";
     for (const [name, paint] of Object.entries(paints)) {
       const group = this.groups.get(name);
@@ -209,19 +218,16 @@ export class FeatureLayer extends PaintedLayer {
       }
       context.setLineDash([]);
       if (paint.arrows && group.hasLines) this.drawArrows(context, view, group, paint);
-      const near = !paint.dotsBelow || pixel < paint.dotsBelow;
-      if (group.hasDots && paint.dot && near) {
+      if (group.hasDots && paint.dot && isNear(paint, view)) {
         context.lineCap = "round";
         context.lineWidth = paint.dot * pixel;
         context.strokeStyle = paint.dotColour ?? paint.stroke ?? "#000";
         context.stroke(group.dots);
       }
       if (paint.sign) this.drawSigns(context, view, group, paint);
-      for (const feature of paint.labels && near ? group.features : [])
-        if (isIn(view.extent, ...centreOf(feature.geometry))) labels.push(feature);
     }
     context.setTransform(1, 0, 0, 1, 0, 0);
-    drawLabels(context, view, labels);
+    if (!this.isNamedAbove) writeNames(context, view, this.named(view));
   }
 
   private toLocal(context: CanvasRenderingContext2D, view: PaintedView): void {
@@ -309,8 +315,9 @@ function newPaths(): Paths {
   };
 }
 
-function isIn(box: Box, x: number, y: number): boolean {
-  return x >= box[0] && x <= box[2] && y >= box[1] && y <= box[3];
+/** Whether points are drawn at the resolution of a view. */
+function isNear(paint: Paint, view: PaintedView): boolean {
+  return !paint.dotsBelow || view.resolution < paint.dotsBelow;
 }
 
 function cross(context: CanvasRenderingContext2D, x: number, y: number, size: number, turn: number): void {
@@ -329,34 +336,4 @@ function polygon(context: CanvasRenderingContext2D, x: number, y: number, size: 
     else context.moveTo(px, py);
   }
   context.closePath();
-}
-
-/** Writes names beside their features, where they do not cover each other. */
-function drawLabels(context: CanvasRenderingContext2D, view: PaintedView, visible: readonly Feature[]): void {
-  if (visible.length > MAX_LABELS * 4) return;
-  const { ratio } = view;
-  const taken: Box[] = [];
-  context.scale(ratio, ratio);
-  context.font = FONT;
-  context.textBaseline = "middle";
-  context.lineWidth = 3;
-  const halo = getComputedStyle(document.documentElement).getPropertyValue("--map-halo") || "#fff";
-  const ink = getComputedStyle(document.documentElement).getPropertyValue("--map-ink") || "#000";
-  for (const feature of visible) {
-    if (taken.length >= MAX_LABELS) break;
-    const box = boxOf(feature.geometry);
-    const anchor = [(box[0] + box[2]) / 2, (box[1] + box[3]) / 2];
-    const [px = 0, py = 0] = apply(view.transform, anchor);
-    const text = nameOf(feature).slice(0, 40);
-    const [x, y] = [px / ratio + 7, py / ratio];
-    const place: Box = [x - 2, y - 8, x + context.measureText(text).width + 2, y + 8];
-    if (taken.some((other) => place[0] < other[2] && place[2] > other[0] && place[1] < other[3] && place[3] > other[1]))
-      continue;
-    taken.push(place);
-    context.strokeStyle = halo;
-    context.strokeText(text, x, y);
-    context.fillStyle = ink;
-    context.fillText(text, x, y);
-  }
-  context.setTransform(1, 0, 0, 1, 0, 0);
 }

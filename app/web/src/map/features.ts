@@ -57,6 +57,10 @@ export function boxOf(geometry: Geometry, box: Box = [...EMPTY_BOX]): Box {
   return box;
 }
 
+export function isIn(box: Box, x: number, y: number): boolean {
+  return x >= box[0] && x <= box[2] && y >= box[1] && y <= box[3];
+}
+
 export function joinBoxes(boxes: Iterable<readonly number[]>): Box | null {
   const out: Box = [...EMPTY_BOX];
   for (const [a = Infinity, b = Infinity, c = -Infinity, d = -Infinity] of boxes) {

@@ -30,6 +30,7 @@ import {
   type Position,
 } from "./features";
 import { LOCAL } from "./frame";
+import { NamesLayer } from "./names";
 import { coloursOf, maskColours } from "./palette";
 import { RasterLayer } from "./raster-layer";
 import { Streets } from "./streets";
@@ -39,7 +40,17 @@ const PICK_PIXELS = 10;
 /** Changes beyond which all features are drawn anew. */
 const MAX_CHANGES = 2000;
 const AREA_KINDS = new Set(["room", "corridor", "door", "aisle", "row"]);
-const Z = { imagery: 0, voxels: 1, occupancy: 2, masks: 3, zones: 10, objects: 11, topology: 12, overlay: 20 };
+const Z = {
+  imagery: 0,
+  voxels: 1,
+  occupancy: 2,
+  masks: 3,
+  zones: 10,
+  objects: 11,
+  topology: 12,
+  names: 13,
+  overlay: 20,
+};
 
 /** Layers switched off, in the address, so that a link shows the same map. */
 export function isHidden(key: string): boolean {
@@ -120,6 +131,8 @@ export class SiteMap {
       objects: this.addLayer(this.style("objects"), Z.objects),
       topology: this.addLayer(this.style("topology"), Z.topology),
     };
+    const { topology, objects, zones, location } = this.layers;
+    this.map.addLayer(new NamesLayer([topology, objects, zones, location], Z.names));
     this.selection = this.addLayer(
       {
         classOf: () => "selected",
