@@ -44,15 +44,6 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         yield server
 
 
-def wait_for_job(api: Api, job: dict[str, Any]) -> dict[str, Any]:
-    """Wait until a job has finished."""
-    until = time.monotonic() + JOB_SECONDS
-    while job["state"] in ("queued", "running") and time.monotonic() < until:
-        time.sleep(0.5)
-        job = api.get(f"jobs/{job['id']}").json()
-    return job
-
-
 @pytest.mark.parametrize(("files", "kind"), environments())
 def test_coverage_matches_downloads(
     api: Api, files: dict[str, bytes], kind: str | None, request: pytest.FixtureRequest
@@ -93,7 +84,7 @@ def test_coverage_matches_downloads(
             continue  # one feature of a sample is outside any local frame, unknown without reading it
         assert answer.status_code in (200, 202), f"{label}: {answer.status_code} {answer.text[:500]}"
         if answer.status_code == 202:
-            job = wait_for_job(api, answer.json())
+            job = api.finished(answer.json())
             assert job["state"] == "done", f"{label}: {job}"
         else:
             assert answer.content, label

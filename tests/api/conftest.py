@@ -25,6 +25,7 @@ from tests.api import samples
 
 ADMIN = "administrators-token-for-tests"
 API = "/api/v1"
+JOB_SECONDS = 250.0
 
 Files = dict[str, bytes]
 
@@ -66,6 +67,15 @@ class Api:
     def problem(self, method: str, path: str, status: int, **more: Any) -> dict[str, Any]:
         """Send a request that must fail; return its problem, with checked members."""
         return problem(self(method, path, status, **more))
+
+    def finished(self, job: dict[str, Any]) -> dict[str, Any]:
+        """Wait until a job has ended, and return it."""
+        deadline = time.monotonic() + JOB_SECONDS
+        while job["state"] in ("queued", "running"):
+            assert time.monotonic() < deadline, job
+            time.sleep(0.25)
+            job = self.get(f"jobs/{job['id']}").json()
+        return job
 
     def as_(self, token: str | None) -> Api:
         """Return a client with another token; it is closed together with this one."""

@@ -375,13 +375,13 @@ def test_invalid_provider_urls_are_refused(tmp_path: Path, values: dict[str, Any
 
 # --- through the server ----------------------------------------------------------------------------------------------
 @contextmanager
-def serving(folder: Path, at: Misbehaving) -> Iterator[Api]:
+def serving(folder: Path, at: Misbehaving, seconds: float = 60.0) -> Iterator[Api]:
     more = {
         "imagery_url": at.url + "/tiles/{z}/{x}/{y}.png?key={token}",
         "imagery_token": SECRET,
         "imagery_attribution": "© Somebody; © Else",
         "imagery_tries": 1,
-        "imagery_seconds": 2.0,
+        "imagery_seconds": seconds,
         "imagery_cache_bytes": 0,
     }
     with running(settings_for(folder, **more)) as api:
@@ -436,7 +436,7 @@ def test_site_gets_its_image(provider: Misbehaving, tmp_path: Path) -> None:
         assert (again["version"], again["root"], again["stale"]) == (later["version"] + 1, later["root"], [])
         # Errors of the provider create no version.
         for behaviour, status in (
-            *(("broken", 503), ("failing", 503), ("silent", 503), ("dripping", 503)),
+            *(("broken", 503), ("failing", 503)),
             *(("html", 422), ("forbidden", 422), ("bomb", 422), ("huge", 422), ("endless", 422)),
         ):
             provider.behaviour = behaviour
@@ -449,6 +449,18 @@ def test_site_gets_its_image(provider: Misbehaving, tmp_path: Path) -> None:
         viewer = api.token_for("viewer")
         viewer.problem("POST", path, 403, json=request)
         assert api.get("environments/farm/versions/latest").json()["version"] == before
+
+
+def test_image_that_does_not_come_in_time_creates_no_version(provider: Misbehaving, tmp_path: Path) -> None:
+    with serving(tmp_path, provider, seconds=1.0) as api:
+        api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
+        request = {"method": "location_to_imagery", "parameters": {"resolution": 0.5, "radius": 20}}
+        before = api.get("environments/farm").json()["version"]
+        for provider.behaviour in ("silent", "dripping"):
+            problem = api.problem("POST", "environments/farm/derivations", 503, json=request)
+            assert "try again later" in problem["detail"]
+            assert SECRET not in str(problem)
+        assert api.get("environments/farm").json()["version"] == before
 
 
 def test_image_around_the_datum_is_stale_after_upload_of_a_fence(provider: Misbehaving, tmp_path: Path) -> None:

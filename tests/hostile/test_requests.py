@@ -91,5 +91,8 @@ def test_hostile_networks_are_rejected_or_stored(api: Api) -> None:
         stored += 1
         if case.format and answer.json()["changes"]:
             back = api.get(f"/maps/{env}/{case.format}", expect=None)
+            if back.status_code == 202:  # a slow machine
+                api.finished(back.json())
+                back = api.get(f"/maps/{env}/{case.format}", expect=None)
             assert back.status_code in (200, 404, 422), f"{case.name}: {back.status_code} {back.text[:300]}"
     assert stored > 20
