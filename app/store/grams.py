@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 SEPARATOR: Final = "\n"
@@ -9,6 +10,9 @@ SEPARATOR: Final = "\n"
 
 GRAM: Final = 3
 """Number of characters in a group."""
+
+RAREST: Final = 2
+"""Number of a text's groups that an index is asked for if it is known how common they are."""
 
 SINGLE, DOUBLE = "'", '"'
 
@@ -27,13 +31,17 @@ def fold(text: str) -> str:
     return lower.replace("ς", "σ")  # the only letter whose lower case depends on its neighbours
 
 
-def wanted_grams(needle: str, *, sqlite: bool) -> str:
+def wanted_grams(needle: str, *, sqlite: bool, shares: Mapping[str, float] | None = None) -> str:
     """Return the query of an index of three characters in a row; on PostgreSQL shorter texts are prefixes of three.
 
     Groups side by side and the last one cover the text; what has them all is compared with it.
+
+    shares: of the texts that have a common group; then only the rarest groups are asked for.
     """
     last = max(0, len(needle) - GRAM)
     windows = sorted({needle[k : k + GRAM] for k in (*range(0, last, GRAM), last)})
+    if shares:
+        windows = sorted(windows, key=lambda window: shares.get(window, 0.0))[:RAREST]
     if sqlite:
         return " AND ".join(_quoted(window, DOUBLE) for window in windows)
     return " & ".join(_quoted(window, SINGLE) + (":*" if len(window) < GRAM else "") for window in windows)

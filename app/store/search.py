@@ -40,6 +40,7 @@ from sqlalchemy.dialects.postgresql import TSQUERY
 from app.store import tables
 from app.store.database import Database
 from app.store.environments import reaches
+from app.store.gram_shares import GramShares
 from app.store.grams import GRAM, SEPARATOR, fold, wanted_grams
 from app.store.search_index import ORDER, SearchIndex, SearchKind
 
@@ -99,6 +100,7 @@ class Search:
 
     def __init__(self, database: Database, index: SearchIndex) -> None:
         self._database, self._index = database, index
+        self._shares = GramShares()
 
     def find(self, query: str, *, limit: int, allowed: str | None = None) -> tuple[list[SearchHit], bool]:
         """Find environments by name and title, and nodes, zones and objects by name and id.
@@ -134,7 +136,8 @@ class Search:
             return
         beginning = connection.execute(_ordered_query(scope.form, sqlite=sqlite), {**given, "limit": limit})
         yield from sorted(_ordered_match(row, needle) for row in beginning)
-        given |= {"wanted": wanted_grams(needle, sqlite=sqlite), "limit": MAX_CANDIDATES + limit}
+        wanted = wanted_grams(needle, sqlite=sqlite, shares=self._shares.current(connection))
+        given |= {"wanted": wanted, "limit": MAX_CANDIDATES + limit}
         for candidates in self._part_rows(connection, scope.form, given, is_short=len(needle) < GRAM):
             matches = (_best_match(row, needle) for row in candidates)
             yield from sorted(match for match in matches if match.rank == PART)

@@ -21,7 +21,8 @@ from app.store import search as search_module
 from app.store import search_index as index_module
 from app.store import tables
 from app.store.changes import Put, Replace
-from app.store.grams import fold
+from app.store.gram_shares import REFRESH_SECONDS, GramShares
+from app.store.grams import fold, wanted_grams
 from app.store.search import Search, SearchHit
 from app.store.search_index import SearchIndex
 from app.store.store import Store
@@ -300,3 +301,32 @@ def test_searches_do_not_queue_while_the_index_is_built(site: Store, monkeypatch
     for thread in threads:
         thread.join(20)
     assert len(results) == index_module.MAX_BUILDERS
+
+
+def test_only_the_rarest_groups_of_a_text_are_asked_for() -> None:
+    shares = {"doc": 0.9, "k 1": 0.2}
+    assert wanted_grams("dock 117", sqlite=False, shares=shares) == "'117' & 'k 1'"
+    assert wanted_grams("dock", sqlite=False, shares=shares) == "'ock' & 'doc'"
+    assert wanted_grams("dock 117", sqlite=False, shares={}) == "'117' & 'doc' & 'k 1'"
+
+
+def test_search_by_statistics_finds_the_same(store: Store) -> None:
+    store.environments.create("port")
+    nodes = [node(f"n{k}", float(k), f"Dock {k}") for k in range(400)]
+    samples.save(store, "port", Replace(samples.TOPOLOGY, features(nodes, "local")))
+    texts = ("ock 11", "ock 117", "dock 3", "k 39", "dock 400")
+    before = [store.search.find(text, limit=500) for text in texts]
+    now = 0.0
+    shares = GramShares(lambda: now)
+    with store._database.write() as connection:
+        if not store._database.sqlite:
+            shares.current(connection)
+            connection.exec_driver_sql("ANALYZE search_item")
+        now = REFRESH_SECONDS - 1
+        assert shares.current(connection) == {}
+        now = REFRESH_SECONDS
+        known = shares.current(connection)
+    assert store._database.sqlite or known["doc"] > 0.9 > known["k 1"]
+    search = Search(store._database, store.search._index)
+    assert [search.find(text, limit=500) for text in texts] == before
+    assert [len(hits) for hits, _ in before] == [11, 1, 111, 11, 0]
