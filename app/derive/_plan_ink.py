@@ -6,7 +6,9 @@ Walls are then the ink that remains without
 
 - coloured ink on a plan that is drawn in black or grey: routes, dimensions and marks;
 - separate pieces no larger than ``SYMBOL`` that are neither solid nor straight: letters, icons, furniture;
-- lines that are thinner than the walls, if most of the ink is thick, but for those that continue a wall: windows.
+- lines that are thinner than the walls, if most of the ink is thick, but for those that continue a wall: windows;
+- on plain paper, if walls are drawn as two lines or hatched: single lines no longer than a symbol, as of furniture and
+  letters that touch walls, of curtains and of the swings of doors.
 
 What is removed is neither wall nor floor: it may be furniture. To tell text by its strokes is from Epshtein et al. 2010
 (stroke width transform), to take thick lines before thin ones from Ahmed et al. 2011 (floor plan analysis).
@@ -14,6 +16,7 @@ What is removed is neither wall nor floor: it may be furniture. To tell text by 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +67,17 @@ THICK_METRES, THICK = 0.1, 0.67
 WINDOW_METRES = 3.0
 """Maximum length of a window between two thick walls."""
 
+STROKE_CELL_METRES = 0.05
+"""Size of the cells in which double and long lines are looked for."""
+
+STROKE_CELLS, STROKE_METRES, MAX_STROKE_METRES = 3, 1.0, 0.4
+"""Minimum thickness of a wall of two lines or hatching, its minimum length, and the maximum thickness."""
+
+STROKE_GAPS_METRES = (0.1, 0.2)
+"""Gaps between the two lines of a wall up to which both are one, closest lines first."""
+
+DOUBLE = 0.4
+"""Share of double lines, among them and long ones, from which short single lines are no walls."""
 
 AS_THICK = 0.6
 """Share of the width of walls from which a small separate piece is as thick as a wall."""
@@ -123,7 +137,8 @@ def read_drawing(tone: NDArray[np.uint8], grey: NDArray[np.uint8], ink: Mask, si
     windows = _between(thick, ink & ~thick, width, size) if is_thick else np.zeros_like(ink)
     kept, windows, symbols, count = _drop_symbols(ink & ~windows, windows, width, size)
     thick &= kept
-    walls = thick | windows if is_thick else kept
+    walls = thick | windows if is_thick else kept if tinted else _strokes(kept, size)
+    thick &= walls
     return Drawing(walls, kept & ~walls, others | symbols, thick, count, is_thick=is_thick, tinted=tinted)
 
 
@@ -270,6 +285,76 @@ def _thick(ink: Mask, size: float) -> Mask:
     core = cv2.morphologyEx(ink.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     # a square does not reach into the corners of slanted lines
     return np.asarray((cv2.dilate(core, np.ones((3, 3), np.uint8)) == 1) & ink)
+
+
+def _strokes(ink: Mask, size: float) -> Mask:
+    """Return ink of double or hatched lines, of single ones longer than symbols, and of what is solid.
+
+    Returns all ink if walls are not drawn as double lines.
+    """
+    import cv2
+
+    step = max(1, round(STROKE_CELL_METRES / size))
+    if STROKE_CELLS * step * size > MAX_STROKE_METRES:
+        return ink  # too coarse to show a wall as two lines
+    # the maximum of step x step pixels
+    block = np.ones((step, step), np.uint8)
+    cells = np.asarray(cv2.dilate(ink.view(np.uint8), block, anchor=(0, 0))[::step, ::step] == 1)
+    cell = step * size
+    long = _grown(_straight(cells, SYMBOL_METRES / cell)) & cells
+    double = _grown(_straight(_double(cells, cell), STROKE_METRES / cell)) & cells
+    kept = long | double
+    if int(double.sum()) < DOUBLE * max(1, int(kept.sum())):
+        return ink
+    pixels = cv2.resize(kept.view(np.uint8), None, fx=step, fy=step, interpolation=cv2.INTER_NEAREST)
+    pillar = np.ones((max(2, round(SOLID_METRES / size)),) * 2, np.uint8)
+    solid = cv2.morphologyEx(ink.view(np.uint8), cv2.MORPH_OPEN, pillar)
+    return np.asarray(((pixels[: ink.shape[0], : ink.shape[1]] == 1) & ink) | (solid == 1))
+
+
+def _grown(mask: Mask) -> Mask:
+    import cv2
+
+    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8)) == 1)
+
+
+def _double(cells: Mask, cell: float) -> Mask:
+    """Mark lines that lie side by side, with what is between them, unless they are thicker than a wall."""
+    import cv2
+
+    body = np.zeros(cells.shape, bool)
+    thin = np.ones((STROKE_CELLS, STROKE_CELLS), np.uint8)
+    side = max(STROKE_CELLS + 1, round(MAX_STROKE_METRES / cell))
+    for gap in STROKE_GAPS_METRES:  # a wide gap also fills what is between a wall and furniture beside it
+        shape = np.ones((round(gap / cell) + 1,) * 2, np.uint8)
+        filled = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, shape)
+        filled = cv2.morphologyEx(filled, cv2.MORPH_OPEN, thin)
+        body |= (filled == 1) & (cv2.morphologyEx(filled, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) == 0)
+    return body
+
+
+def _straight(cells: Mask, length: float) -> Mask:
+    """Return the parts of lines in any direction that are straight for a length in cells.
+
+    This is an opening with lines. Only marked cells are looked at, and for each direction fewer with each test.
+    """
+    half = max(1, round(length / 2))
+    padded = np.pad(cells, half)
+    flat, width = padded.ravel(), padded.shape[1]
+    lines = np.zeros_like(flat)
+    marked = np.flatnonzero(flat)
+    count = math.ceil(half * math.pi)  # one cell apart at the ends
+    for angle in np.arange(count) * (math.pi / count):
+        along = np.arange(-half, half + 1) / max(abs(math.cos(angle)), abs(math.sin(angle)))
+        along = along[np.abs(along) <= half + 0.5]
+        steps = np.rint(along * math.sin(angle)).astype(np.intp) * width
+        steps += np.rint(along * math.cos(angle)).astype(np.intp)
+        middles = marked
+        for step in (*steps[:: max(1, half // 4)], *steps):  # distant cells first: they rule out most
+            middles = middles[flat.take(middles + step)]
+        for step in steps:
+            lines[middles + step] = True
+    return lines.reshape(padded.shape)[half:-half, half:-half].copy()
 
 
 def _depth(ink: Mask) -> NDArray[np.float32]:

@@ -38,7 +38,7 @@ class Parameters(Segmentation):
     )
 
 
-@derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=30.0, version=2)
+@derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=30.0, version=3)
 def imagery_to_objects(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Objects in an image: fields, trees, vegetation, paths, roads, buildings; for a floor plan walls and floors.
 

@@ -30,7 +30,7 @@ class Parameters(Segmentation):
     )
 
 
-@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0, version=2)
+@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0, version=3)
 def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Occupancy grid from an image: trees, vegetation, buildings, water and walls are occupied.
 

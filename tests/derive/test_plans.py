@@ -134,6 +134,56 @@ def test_thin_lines_beside_thick_walls_are_no_walls_but_windows_are() -> None:
     assert value[15, 15] == UNKNOWN
 
 
+def drawn_in_two_lines() -> NDArray[np.uint8]:
+    """Return a plan of two rooms of 7 and 6 m: walls are two lines 0.2 m apart."""
+    pixels = np.full((240, 340, 3), 255, np.uint8)
+    for wall in range(2):
+        side = 4 * wall
+        cv2.rectangle(pixels, (30 + side, 30 + side), (304 - side, 204 - side), (0, 0, 0), 1)
+        cv2.line(pixels, (170 + side, 34), (170 + side, 200), (0, 0, 0), 1)
+    return pixels
+
+
+def test_furniture_that_touches_walls_of_two_lines_is_unknown() -> None:
+    pixels = drawn_in_two_lines()
+    cv2.rectangle(pixels, (60, 34), (92, 50), (0, 0, 0), 1)  # a desk at the wall
+    cv2.circle(pixels, (76, 56), 6, (0, 0, 0), 1)  # its chair
+    cv2.putText(pixels, "desk", (60, 72), cv2.FONT_HERSHEY_PLAIN, 0.9, (0, 0, 0), 1)
+    cv2.line(pixels, (76, 62), (76, 66), (0, 0, 0), 1)  # so that the label touches it
+    cv2.line(pixels, (34, 120), (114, 120), (0, 0, 0), 1)  # a partition of 4 m
+    cv2.rectangle(pixels, (230, 120), (237, 127), (0, 0, 0), -1)  # a pillar
+    cv2.ellipse(pixels, (174, 150), (24, 24), 0, 0, 90, (0, 0, 0), 1)  # the swing of a door
+    value = values(pixels)
+    occupied = value == OCCUPIED
+    assert not occupied[38:80, 40:160].any()
+    assert (value[44, 60], value[56, 82]) == (UNKNOWN, UNKNOWN), "the desk and the chair"
+    assert not occupied[140:180, 184:200].any(), "the swing"
+    assert value[120, 80] == OCCUPIED, "the partition"
+    assert value[123, 233] == OCCUPIED, "the pillar"
+    for row, column in ((30, 100), (34, 200), (100, 30), (100, 304), (100, 170), (204, 250)):
+        assert value[row, column] == OCCUPIED, "the walls"
+    assert value[100, 100] == value[180, 250] == FREE
+
+
+def test_short_walls_of_a_single_line_stay_walls_if_all_walls_are_so() -> None:
+    pixels = np.full((240, 300, 3), 255, np.uint8)
+    cv2.rectangle(pixels, (20, 20), (280, 220), (0, 0, 0), 1)
+    cv2.line(pixels, (60, 20), (60, 56), (0, 0, 0), 1)
+    cv2.line(pixels, (20, 56), (60, 56), (0, 0, 0), 1)
+    value = values(pixels)
+    assert value[40, 60] == value[56, 40] == OCCUPIED
+    assert value[40, 40] == FREE
+
+
+@pytest.mark.parametrize("turn", [0, 7, 20, 45, 78])
+def test_walls_of_two_lines_are_found_in_any_direction(turn: int) -> None:
+    matrix = cv2.getRotationMatrix2D((170, 120), turn, 1)
+    matrix[:, 2] += (60, 110)
+    pixels = cv2.warpAffine(drawn_in_two_lines(), matrix, (460, 460), borderValue=(255, 255, 255))
+    truth = cv2.warpAffine(drawn_in_two_lines(), matrix, (460, 460), borderValue=(255, 255, 255))[..., 0] < 128
+    assert (values(np.asarray(pixels, np.uint8)) == OCCUPIED)[truth].mean() >= 0.9
+
+
 def test_pillars_stay_walls() -> None:
     pixels = np.full((240, 300, 3), 255, np.uint8)
     cv2.rectangle(pixels, (20, 20), (280, 220), (0, 0, 0), 5)
