@@ -24,13 +24,13 @@ class GramShares:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._known: tuple[float, Mapping[str, float]] = (-REFRESH_SECONDS, {})
+        self._cache: tuple[float, Mapping[str, float]] = (-REFRESH_SECONDS, {})
 
     def current(self, connection: Connection) -> Mapping[str, float]:
         """Return the shares of the most common groups: none on SQLite, or if PostgreSQL has no statistics yet."""
         now = self._clock()
-        if connection.dialect.name == "postgresql" and now - self._known[0] >= REFRESH_SECONDS:
+        if connection.dialect.name == "postgresql" and now - self._cache[0] >= REFRESH_SECONDS:
             row = connection.execute(_STATISTICS).one_or_none()
             shares = dict(zip(row[0], row[1], strict=False)) if row is not None and row[0] else {}  # then their range
-            self._known = now, shares
-        return self._known[1]
+            self._cache = now, shares
+        return self._cache[1]

@@ -549,7 +549,13 @@ of an environment the title, if it differs. x, y: metres in the local frame. gra
 SQLite the virtual tables ``search_node`` and so on have them.
 """
 
-Index("ix_search_item_grams", search_item.c.grams, postgresql_using="gin", info=POSTGRESQL).ddl_if(dialect="postgresql")
+Index(
+    "ix_search_item_grams",
+    search_item.c.grams,
+    postgresql_using="gin",
+    postgresql_with={"gin_pending_list_limit": 128},  # kB, all of which a search reads
+    info=POSTGRESQL,
+).ddl_if(dialect="postgresql")
 
 audit = Table(
     "audit",

@@ -330,3 +330,14 @@ def test_search_by_statistics_finds_the_same(store: Store) -> None:
     search = Search(store._database, store.search._index)
     assert [search.find(text, limit=500) for text in texts] == before
     assert [len(hits) for hits, _ in before] == [11, 1, 111, 11, 0]
+
+
+def test_what_a_search_reads_of_new_items_is_bounded(store: Store) -> None:
+    store.environments.create("port")
+    nodes = [node(f"n{k}", float(k), f"Dock {k:x} of {k}") for k in range(3000)]
+    samples.save(store, "port", Replace(samples.TOPOLOGY, features(nodes, "local")))
+    assert len(store.search.find("dock", limit=50)[0]) == 50
+    if not store._database.sqlite:
+        with store._database.write() as connection:
+            pages = connection.exec_driver_sql("SELECT gin_clean_pending_list('ix_search_item_grams')").scalar_one()
+        assert pages <= 20
