@@ -96,8 +96,12 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what waits most: at the end, one worker would wait alone."""
-    items.sort(key=lambda item: not item.path.is_relative_to(TOP / "tests" / "chaos"))
+    """Begin with the longest tests: at the end, one worker would wait alone. Others take what is left of its part.
+
+    The page's tests stay together, so that few workers need a browser and a server for them.
+    """
+    folders = [TOP / "tests" / name for name in ("chaos", "web")]
+    items.sort(key=lambda item: [not item.path.is_relative_to(folder) for folder in folders])
 
 
 def pytest_collection_finish() -> None:
