@@ -56,8 +56,10 @@ def borders(wall: Mask, ground: Mask, narrowest: float, share: float, cell: floa
 
 
 def _pairs(faces: Points, narrowest: float, share: float, cell: float) -> tuple[Points, Points, Points, Points]:
-    """Return the gaps between faces of one line: where one ends and the next begins (points [n, 2]), the direction, and
-    how much of each face [n, 2] counts."""
+    """Return the gaps between faces that lie on one line.
+
+    Their beginnings and ends (x, y in cells [n, 2]), directions [n, 2], and how much of both faces counts [n, 2].
+    """
     tree = shapely.STRtree(shapely.points(faces[:, 0]))
     # faces have their ground on the same side: where one ends, the next on its line begins
     pairs = tree.query(shapely.points(faces[:, 1]), predicate="dwithin", distance=MAX_GAP / cell)
