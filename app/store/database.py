@@ -21,7 +21,7 @@ import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
-from app.backends.fence import check_fences
+from app.backends.fence import check_fences, limit_fenced
 from app.backends.notify import LocalNotifier, Notifier, SharedNotifier, new_number
 from app.backends.room import ROOM_BYTES, check_room
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
@@ -33,6 +33,12 @@ BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
 RECHECK_SECONDS = 60.0
 """Seconds between two checks of a database that was found damaged."""
+
+KEEPALIVE = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+"""Seconds, and number of probes: PostgreSQL and this process notice within some 10 s that the network is gone.
+
+Else the rows that an open transaction has changed would stay locked for the two hours of Linux's default.
+"""
 
 REPAIR = "stop the server, run `fleetmap verify`, and restore a backup of the database"
 _CORRUPT = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
@@ -75,7 +81,8 @@ def engine(url: str, *, readonly: bool) -> Engine:
         return sql_engine
     if parsed.get_backend_name() == "postgresql":
         settings = "-c synchronous_commit=on -c jit=off" + (" -c default_transaction_read_only=on" if readonly else "")
-        connect = {"connect_timeout": 5, "application_name": "fleetmap", "options": settings}
+        settings += "".join(f" -c tcp_{name}={value}" for name, value in KEEPALIVE.items())
+        connect = {"connect_timeout": 5, "application_name": "fleetmap", "options": settings, **KEEPALIVE}
         return create_engine(
             parsed.set(drivername="postgresql+psycopg"), connect_args=connect, pool_pre_ping=True, **options
         )
@@ -185,6 +192,7 @@ class Database:
             connection.execution_options(write=True)
             number = new_number()
             with connection.begin():
+                limit_fenced(connection)
                 yield connection
                 caller = None if upkeep else self._record(connection, self.now())
                 if notify:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
+from app.backends.fence import LIMIT_IDLE_TIME
 from app.errors import NotFound
 from app.event_types import EventType, check_members
 from app.store import tables
@@ -212,6 +213,8 @@ class Outbox:
         """Store the position up to which a relay has handed events over. It never decreases."""
         table, key = tables.relay, _RELAYS[relay]
         with self._database.write(notify=False, upkeep=True) as connection:
+            if connection.dialect.name == "postgresql":  # the next relay waits for the row
+                connection.exec_driver_sql(f"SELECT {LIMIT_IDLE_TIME}")
             stored_position = connection.execute(select(table.c.position).where(table.c.id == key)).scalar()
             if stored_position is None:
                 connection.execute(insert(table).values(id=key, position=position))

@@ -12,8 +12,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import Connection
 
 from app.backends.lead import LEASE_SECONDS, Lead, LeadLostError, Leads, SharedLead, SharedLeads
+from app.errors import Unavailable
 from app.store.store import Store
 from tests.events.conftest import eventually
 from tests.postgres import Cluster
@@ -218,6 +220,49 @@ class TestShared:
         finally:
             far.close()
             proxy.close()
+
+    def test_relay_that_stands_still_in_a_transaction_does_not_stop_its_successor(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It has stored its position and not committed yet: PostgreSQL ends the transaction, which frees the row."""
+        stored, goes_on = threading.Event(), threading.Event()
+        store.events.set_relayed(1)
+
+        def stand_still(_: Connection) -> None:
+            if threading.current_thread() is former:
+                stored.set()
+                goes_on.wait(120)
+
+        def store_late() -> None:
+            with contextlib.suppress(Unavailable):
+                store.events.set_relayed(2)
+
+        monkeypatch.setattr("app.store.database.check_fences", stand_still)
+        former = threading.Thread(target=store_late)
+        successor = threading.Thread(target=store.events.set_relayed, args=(3,), daemon=True)
+        former.start()
+        try:
+            assert stored.wait(60)
+            successor.start()
+            successor.join(60)
+            assert not successor.is_alive(), "it waits for the row"
+        finally:
+            goes_on.set()
+            former.join()
+        assert store.events.relay_position() == 3
+
+    def test_fenced_work_may_stand_still_for_a_limited_time(
+        self, store: Store, open_process: Callable[[], Leads]
+    ) -> None:
+        def limit() -> str:
+            with store._database.write() as connection:
+                return str(connection.exec_driver_sql("SHOW idle_in_transaction_session_timeout").scalar_one())
+
+        lead = open_process().lead("task")
+        eventually(lead.try_acquire)
+        with lead.fenced():
+            assert limit() == "30s"
+        assert limit() == "0"
 
     def test_lead_returns_after_restart_of_the_database(
         self, postgres_cluster: Cluster, open_process: Callable[[], Leads], caplog: pytest.LogCaptureFixture
