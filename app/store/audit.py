@@ -90,7 +90,7 @@ def record(connection: Connection, now: datetime) -> Caller | None:
         "environment": caller.environment,
         "target": caller.target,
     }
-    connection.execute(insert(tables.audit).values(**values))
+    connection.execute(insert(tables.audit), values)
     return caller
 
 

@@ -56,12 +56,16 @@ _COLUMNS: Final = (
 )
 
 
+_SELECTED: Final = blob.c.sha256.in_(bindparam("names", expanding=True))
+_ROWS: Final = select(*_COLUMNS).where(_SELECTED)
+_LOCKED: Final = select(blob.c.sha256).where(_SELECTED).order_by(blob.c.sha256).with_for_update()
+
+
 def select_rows(connection: Connection, names: Sequence[str]) -> dict[str, BlobRow]:
     """Read the rows that exist."""
     out: dict[str, BlobRow] = {}
     for start in range(0, len(names), BATCH):
-        query = select(*_COLUMNS).where(blob.c.sha256.in_(list(names[start : start + BATCH])))
-        for r in connection.execute(query):
+        for r in connection.execute(_ROWS, {"names": list(names[start : start + BATCH])}):
             stored = r.size if r.stored is None else r.stored
             coding = cast("Coding | None", r.coding)
             out[r.sha256] = BlobRow(r.sha256, r.size, r.pack, r.start, stored, coding, r.base, r.chain)
@@ -87,8 +91,7 @@ def lock(connection: Connection, hashes: Collection[str], *, kept: bool) -> None
     names = sorted(hashes)
     for start in range(0, len(names), BATCH):
         some = names[start : start + BATCH]
-        query = select(blob.c.sha256).where(blob.c.sha256.in_(some)).order_by(blob.c.sha256)
-        stored_names = set(connection.execute(query.with_for_update()).scalars())
+        stored_names = set(connection.execute(_LOCKED, {"names": some}).scalars())
         missing = [n for n in some if n not in stored_names]
         if missing:
             raise Unavailable(f"uploaded file {missing[0]} is no longer stored: send it again")

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import ormsgpack
-from sqlalchemy import Connection, Row, Select, func, select
+from sqlalchemy import Connection, Row, Select, bindparam, func, select
 
 from app.errors import Damaged, NotFound, Problem, Thinned
 from app.model.frame import Datum, Level
@@ -24,6 +24,27 @@ MANIFEST: Final = 1
 
 WITH_TEMPLATES: Final = 2
 """Encoding of manifests with templates: [2, datum, levels, parts, templates]."""
+
+
+def version_columns() -> Select[Any]:
+    """Return a query of versions' rows, each with ``tags``: their names in one text, None without any."""
+    table, tag = tables.version, tables.version_tag
+    of_version = (tag.c.environment_id == table.c.environment_id) & (tag.c.number == table.c.number)
+    tags = select(func.aggregate_strings(tag.c.name, TAG_SEPARATOR)).where(of_version)
+    return select(table, tags.scalar_subquery().label("tags"))
+
+
+_VERSION: Final = version_columns().where(
+    tables.version.c.environment_id == bindparam("environment"), tables.version.c.number == bindparam("number")
+)
+_SOURCES: Final = (
+    select(tables.source)
+    .where(
+        tables.source.c.environment_id == bindparam("environment"),
+        tables.source.c.number.in_(bindparam("numbers", expanding=True)),
+    )
+    .order_by(tables.source.c.number, tables.source.c.position)
+)
 
 
 def pack_manifest(
@@ -81,14 +102,6 @@ def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple
     return (Datum(**place) if place else None), tuple(Level(n, e) for n, e in levels), parts, templates
 
 
-def version_columns() -> Select[Any]:
-    """Return a query of versions' rows, each with ``tags``: their names in one text, None without any."""
-    table, tag = tables.version, tables.version_tag
-    of_version = (tag.c.environment_id == table.c.environment_id) & (tag.c.number == table.c.number)
-    tags = select(func.aggregate_strings(tag.c.name, TAG_SEPARATOR)).where(of_version)
-    return select(table, tags.scalar_subquery().label("tags"))
-
-
 def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Version:
     """Convert a row of ``version_columns`` and its sources into a value; a thinned one has no parts."""
     datum, levels, parts, templates = (
@@ -121,14 +134,8 @@ def warnings_from_row(rows: Sequence[Mapping[str, Any]]) -> tuple[Problem, ...]:
 
 def read_sources(connection: Connection, environment_id: str, numbers: Sequence[int]) -> dict[int, list[Source]]:
     """Read the sources of some versions, in the order of their upload."""
-    table = tables.source
-    query = (
-        select(table)
-        .where(table.c.environment_id == environment_id, table.c.number.in_(list(numbers)))
-        .order_by(table.c.number, table.c.position)
-    )
     out: dict[int, list[Source]] = {n: [] for n in numbers}
-    for r in connection.execute(query):
+    for r in connection.execute(_SOURCES, {"environment": environment_id, "numbers": list(numbers)}):
         out[r.number].append(Source(r.name, r.size, r.sha256, r.format, r.used, r.removed))
     return out
 
@@ -149,9 +156,7 @@ def read_if_kept(connection: Connection, environment: Row[Any], number: int) -> 
 
 def read_history(connection: Connection, environment: Row[Any], number: int) -> Version:
     """Read one version as the history lists it: without parts if it was thinned. Raises NotFound."""
-    table = tables.version
-    query = version_columns().where(table.c.environment_id == environment.id, table.c.number == number)
-    row = connection.execute(query).one_or_none()
+    row = connection.execute(_VERSION, {"environment": environment.id, "number": number}).one_or_none()
     if row is None:
         raise NotFound(f"{environment.name} has no version {number}; it has versions 0 to {environment.head}")
     return as_version(environment.name, row, read_sources(connection, environment.id, [number])[number])

@@ -90,17 +90,15 @@ def append_event(
         "author": author,
         "time": rfc3339(time),
     }
-    position = _advance(connection, 1)
-    connection.execute(
-        insert(tables.event).values(
-            position=position,
-            environment_id=environment_id if edge is None else _edge_stream(environment_id),
-            environment=environment,
-            sequence=sequence if edge is None else edge,
-            body=body,
-            time=time,
-        )
-    )
+    row = {
+        "position": _advance(connection, 1),
+        "environment_id": environment_id if edge is None else _edge_stream(environment_id),
+        "environment": environment,
+        "sequence": sequence if edge is None else edge,
+        "body": body,
+        "time": time,
+    }
+    connection.execute(insert(tables.event), row)
 
 
 def append_copies(connection: Connection, environment_id: str, events: Sequence[Event]) -> None:

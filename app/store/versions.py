@@ -7,7 +7,7 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any, Final, Literal
 
-from sqlalchemy import Connection, Row, func, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, func, insert, select, update
 
 from app import traces
 from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent
@@ -43,6 +43,11 @@ NAMES_AT_ONCE = 500
 MAX_REVERT_ATTEMPTS: Final = 8
 
 
+_CHANNEL: Final = select(tables.channel.c.version).where(
+    tables.channel.c.environment_id == bindparam("environment"), tables.channel.c.name == bindparam("channel")
+)
+
+
 def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> int:
     """Resolve a number, ``latest``, or a channel's name to a version's number. Raises NotFound."""
     if isinstance(ref, int):
@@ -51,9 +56,7 @@ def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> in
         return int(environment.head)
     if ref.isascii() and ref.isdigit() and len(ref) < 10:
         return int(ref)
-    table = tables.channel
-    query = select(table.c.version).where(table.c.environment_id == environment.id, table.c.name == ref)
-    number = connection.execute(query).scalar_one_or_none()
+    number = connection.execute(_CHANNEL, {"environment": environment.id, "channel": ref}).scalar_one_or_none()
     if number is None:
         near = nearest_channel(connection, environment, ref)
         raise NotFound(
@@ -76,21 +79,20 @@ def insert_version(
 
     area: of this version; KEEP if it is that of the version before, None if the next query computes it.
     """
-    connection.execute(
-        insert(tables.version).values(
-            environment_id=environment.id,
-            number=version.number,
-            root=version.root,
-            parent=version.parent,
-            author=version.author,
-            message=version.message,
-            time=version.time,
-            sequence=sequence,
-            changes=dict(version.changes),
-            warnings=[clean_problem(w).as_dict() for w in version.warnings],
-            **_content_values(version),
-        )
-    )
+    row = {
+        "environment_id": environment.id,
+        "number": version.number,
+        "root": version.root,
+        "parent": version.parent,
+        "author": version.author,
+        "message": version.message,
+        "time": version.time,
+        "sequence": sequence,
+        "changes": dict(version.changes),
+        "warnings": [clean_problem(w).as_dict() for w in version.warnings],
+        **_content_values(version),
+    }
+    connection.execute(insert(tables.version), row)
     insert_sources(connection, environment.id, version.number, version.sources, first=0)
     box = extent(version.parts, version.datum)
     west, south, east, north = box or (None, None, None, None)
