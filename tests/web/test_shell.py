@@ -191,6 +191,39 @@ def test_no_node_covers_the_name_of_an_area(open_page: Open, server: WebServer) 
     assert (without & ~with_nodes).sum() < 0.02 * without.sum(), "nodes cover the name"
 
 
+def test_legend_names_the_kinds_of_zones_that_are_on_the_map(open_page: Open, server: WebServer) -> None:
+    server.call("POST", "environments", json={"name": "zones"})
+
+    def put(*kinds: str) -> None:
+        changes = []
+        for x, kind in enumerate(kinds):
+            ring = [[x, 0], [x + 1, 0], [x + 1, 1], [x, 1], [x, 0]]
+            feature = {
+                "type": "Feature",
+                "id": kind,
+                "place": {"type": "Polygon", "coordinates": [ring]},
+                "geometry": None,
+                "properties": {"kind": kind},
+            }
+            changes.append({"op": "put", "layer": "zones", "feature": feature})
+        server.call("POST", "environments/zones/edits", json={"message": "", "changes": changes})
+
+    put("keepout")
+    page = open_page("/?site=zones")
+    lines = page.get_by_label("Legend").get_by_role("listitem")
+    expect(lines).to_have_text(["keepout"])
+    put("room", "door", "corridor")
+    page.reload()
+    expect(lines).to_have_text(["corridor, room", "door", "keepout"])
+    colours = [
+        lines.filter(has_text=name).locator("i").evaluate("key => getComputedStyle(key).backgroundColor")
+        for name in ("room", "door", "keepout")
+    ]
+    assert len(set(colours)) == 3
+    page.get_by_role("button", name="Hide Zones").click()
+    expect(lines).to_have_count(0)
+
+
 def test_markup_in_names_is_text(open_page: Open, server: WebServer) -> None:
     text = "<img src=x onerror=alert(1)>\u202egnp"
     server.call("POST", "environments", json={"name": "markup", "title": text})

@@ -35,11 +35,11 @@ import { coloursOf, maskColours } from "./palette";
 import { RasterLayer } from "./raster-layer";
 import { Streets } from "./streets";
 import { tileAddress, Tiles } from "./tiles";
+import { zoneClass, zonePaints } from "./zones";
 
 const PICK_PIXELS = 10;
 /** Changes beyond which all features are drawn anew. */
 const MAX_CHANGES = 2000;
-const AREA_KINDS = new Set(["room", "corridor", "door", "aisle", "row"]);
 const Z = {
   imagery: 0,
   voxels: 1,
@@ -422,32 +422,7 @@ export class SiteMap {
 
   private style(layer: "zones" | "objects" | "topology" | "location"): FeatureStyle {
     if (layer === "zones") {
-      return {
-        classOf: ({ properties }) => {
-          const kind = String(properties.kind ?? "");
-          return AREA_KINDS.has(kind) ? "area" : kind.includes("speed") ? "speed" : "keepout";
-        },
-        paints: () => ({
-          // Rooms and aisles are names of places, not limits: quiet, and with their names.
-          area: {
-            stroke: colour("object"),
-            fill: `color-mix(in srgb, ${colour("object")} 8%, transparent)`,
-            width: 1,
-            labels: this.resolution.peek() < 0.12,
-          },
-          speed: {
-            stroke: colour("speed"),
-            fill: `color-mix(in srgb, ${colour("speed")} 18%, transparent)`,
-            width: 1.5,
-            dash: [6, 4],
-          },
-          keepout: {
-            stroke: colour("keepout"),
-            fill: `color-mix(in srgb, ${colour("keepout")} 20%, transparent)`,
-            width: 1.5,
-          },
-        }),
-      };
+      return { classOf: zoneClass, paints: () => zonePaints(this.resolution.peek() < 0.12) };
     }
     if (layer === "location") {
       return {

@@ -2,8 +2,10 @@
 import { Crosshair, Eye, EyeOff } from "lucide-preact";
 import type { LayerPart } from "../../api/client";
 import { baseMap, isBaseMapShown, showBaseMap } from "../../map/base-map";
+import type { Feature } from "../../map/features";
 import { cssOf } from "../../map/palette";
 import { isHidden, isMask, rasterKey, toggleHidden } from "../../map/site-map";
+import { type ZoneClass, zoneClass, zoneKind } from "../../map/zones";
 import { can } from "../../session";
 import { palette, theme } from "../../theme";
 import { Button } from "../../ui/button";
@@ -72,7 +74,10 @@ export default function LayersView({ site, map }: ViewProps) {
           {text}
         </p>
       ))}
-      <Legend parts={rows.map(({ part }) => part)} />
+      <Legend
+        parts={rows.map(({ part }) => part)}
+        zones={site.features.value.filter((feature) => feature.layer === "zones" && feature.level === level)}
+      />
       <FeatureList site={site} map={map} />
     </div>
   );
@@ -167,7 +172,7 @@ function LayerRow({ row, site, map }: { row: Row } & ViewProps) {
   );
 }
 
-function Legend({ parts }: { parts: LayerPart[] }) {
+function Legend({ parts, zones }: { parts: LayerPart[]; zones: readonly Feature[] }) {
   const hasGrid = parts.some((part) => (part.layer === "occupancy" && !isMask(part)) || part.layer === "voxels");
   const has = (layer: string) => parts.some((part) => part.layer === layer) && !isHidden(layer);
   return (
@@ -192,16 +197,7 @@ function Legend({ parts }: { parts: LayerPart[] }) {
             <i class="key object" /> object
           </li>
         )}
-        {has("zones") && (
-          <>
-            <li>
-              <i class="key keepout" /> keepout
-            </li>
-            <li>
-              <i class="key speed" /> speed
-            </li>
-          </>
-        )}
+        {has("zones") && <ZoneLines zones={zones} />}
         {has("location") && (
           <li>
             <i class="key fence" /> fence
@@ -223,6 +219,22 @@ function Legend({ parts }: { parts: LayerPart[] }) {
       {hasGrid && <PaletteChoice />}
     </section>
   );
+}
+
+const ZONE_CLASSES: readonly ZoneClass[] = ["area", "door", "keepout", "speed"];
+
+/** The classes of zones that are on the map; the kinds of areas look alike, so that one line names all of them. */
+function ZoneLines({ zones }: { zones: readonly Feature[] }) {
+  const kinds = new Map(zones.map((zone) => [zoneKind(zone), zoneClass(zone)]));
+  return ZONE_CLASSES.map((drawn) => {
+    const named = [...kinds].filter(([, one]) => one === drawn).map(([kind]) => kind);
+    if (!named.length) return null;
+    return (
+      <li key={drawn}>
+        <i class={`key ${drawn}`} /> {drawn === "area" ? named.sort().join(", ") : drawn}
+      </li>
+    );
+  });
 }
 
 function Swatch({ value }: { value: number }) {
