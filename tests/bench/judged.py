@@ -1,10 +1,13 @@
 """Time and memory of derivations on the labelled maps, beside those of another checkout of this project.
 
     python -m tests.bench.judged --before ../before --kind scan --rounds 3
+    python -m tests.bench.judged --before ../before --made-up --pictures docs/images
 
 Each round runs a process in each checkout in turn, with the other checkout's own ``.venv``. A process derives once so
 that native code is compiled, then measures the CPU of at least five runs; the fastest of all rounds counts. Memory is
 the peak of ``tracemalloc`` in one more run: arrays and objects of Python, not what compiled code allocates by itself.
+
+With ``--pictures`` nothing is measured: what both checkouts derive is drawn side by side.
 """
 
 from __future__ import annotations
@@ -61,16 +64,81 @@ def _cases(kind: str | None, only: str, data: Path | None) -> Iterator[Case]:
             print(f"not measured: {error}", file=sys.stderr)
 
 
-def _measure(checkout: Path, step: str, path: Path) -> dict[str, float]:
-    """Run one process in a checkout."""
+def _made_up() -> Iterator[Case]:
+    """Yield what docs/images/derived-maps.png shows."""
+    from tests.bench import made_up_maps
+
+    for title, step, layers in made_up_maps.cases():
+        yield "made-up", title, step, layers
+
+
+def _run(checkout: Path, *arguments: str) -> str:
+    """Run this file as a process in a checkout, and return what it prints."""
     python = checkout / ".venv" / "bin" / "python"
-    command = [str(python if checkout != HERE else sys.executable), "-P", __file__, step, str(path)]
+    command = [str(python if checkout != HERE else sys.executable), "-P", __file__, *arguments]
     env = {**os.environ, "PYTHONPATH": str(checkout)}
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=checkout, env=env)
     if done.returncode:
-        raise RuntimeError(f"{checkout} {step}: {done.stderr[-2000:]}")
-    figures: dict[str, float] = json.loads(done.stdout)
+        raise RuntimeError(f"{checkout} {arguments[0]}: {done.stderr[-2000:]}")
+    return done.stdout
+
+
+def _measure(checkout: Path, step: str, path: Path) -> dict[str, float]:
+    figures: dict[str, float] = json.loads(_run(checkout, step, str(path)))
     return figures
+
+
+def _derive(step: str, path: Path, result: Path) -> None:
+    """Derive and store what a picture shows of it, free of a checkout's classes. This runs in either checkout."""
+    from app import derive, generate
+    from app.derive import DerivationNotes
+    from app.errors import FleetMapError
+    from app.model.features import Features
+
+    layers = pickle.loads(path.read_bytes())
+    derivation = derive.all_derivations().get(step)
+    if derivation is None and step != "complete_grid":
+        result.write_bytes(pickle.dumps({"fault": "not derived"}))
+        return
+    try:
+        if derivation is None:
+            derived = generate.run(step, 7, {}, layers, DerivationNotes())
+        else:
+            derived = derivation.function(layers, derivation.parameters(), DerivationNotes())
+    except FleetMapError as error:
+        result.write_bytes(pickle.dumps({"fault": str(error)}))
+        return
+    (part,) = derived.parts.values()
+    if isinstance(part, Features):
+        rows = [(shape, dict(words)) for shape, words in zip(part.geometry, part.properties, strict=True)]
+        result.write_bytes(pickle.dumps({"rows": rows}))
+    else:
+        result.write_bytes(pickle.dumps({"cells": part.cells}))
+
+
+def _draw(chosen: Iterator[Case], checkouts: list[Path], folder: Path, *, is_made_up: bool) -> None:
+    """Draw all cases; made-up ones as one picture."""
+    from tests.bench import judged_pictures
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with tempfile.TemporaryDirectory() as scratch:
+        path, result = Path(scratch) / "layers", Path(scratch) / "result"
+        for kind, name, step, layers in chosen:
+            path.write_bytes(pickle.dumps(layers))
+            columns = []
+            for checkout, called in zip(checkouts, ["before", "now"][-len(checkouts) :], strict=True):
+                _run(checkout, step, str(path), str(result))
+                columns.append((called, pickle.loads(result.read_bytes())))
+            title = name if is_made_up else f"{name}: {step}"
+            row = judged_pictures.side_by_side(title, layers, columns)
+            if is_made_up:
+                rows.append(row)
+            else:
+                row.save(folder / f"{kind}-{name}-{step}.png")
+            print(f"{name} {step}", file=sys.stderr, flush=True)
+    if rows:
+        judged_pictures.joined(rows).save(folder / "derived-maps.png", optimize=True)
 
 
 def _child(step: str, path: Path) -> None:
@@ -110,13 +178,19 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only labels whose name contains this")
     parser.add_argument("--data", type=Path, help="folder of the maps that the labels name")
     parser.add_argument("--rounds", type=int, default=3, help="number of processes in each checkout")
+    parser.add_argument("--made-up", action="store_true", help="made-up maps instead of labelled ones")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of what is derived before and now")
     options = parser.parse_args()
     checkouts = [HERE] if options.before is None else [options.before.resolve(), HERE]
+    chosen = _made_up() if options.made_up else _cases(options.kind, options.only, options.data)
+    if options.pictures:
+        _draw(chosen, checkouts, options.pictures, is_made_up=options.made_up)
+        return 0
     print("| kind | map | derivation | CPU ms, before | now | ratio | peak MB, before | now |")
     print("| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "layers"
-        for kind, name, step, layers in _cases(options.kind, options.only, options.data):
+        for kind, name, step, layers in chosen:
             path.write_bytes(pickle.dumps(layers))
             rounds = [[_measure(at, step, path) for at in checkouts] for _ in range(options.rounds)]
             best = [min(figures["ms"] for figures in column) for column in zip(*rounds, strict=True)]
@@ -129,7 +203,7 @@ def main() -> int:
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    if len(sys.argv) == 3 and not sys.argv[1].startswith("-"):
-        _child(sys.argv[1], Path(sys.argv[2]))
+    if len(sys.argv) in (3, 4) and not sys.argv[1].startswith("-"):
+        (_child if len(sys.argv) == 3 else _derive)(sys.argv[1], *map(Path, sys.argv[2:]))
     else:
         sys.exit(main())
