@@ -140,12 +140,29 @@ def shared() -> Path:
 @pytest.fixture(scope="session")
 def facts(shared: Path) -> ModuleType:
     """Independent readers that count facts of a file."""
-    return _tool(shared, "facts")
+    module = _tool(shared, "facts")
+    module.load_yaml = _kept(module.load_yaml)  # type: ignore[attr-defined]
+    return module
+
+
+def _kept(load: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
+    """Keep what large files hold: several tests compare each with what is served. Nothing that reads it changes it."""
+    kept: dict[bytes, Any] = {}
+
+    def load_kept(data: bytes) -> Any:
+        if len(data) < 100_000:
+            return load(data)
+        key = hashlib.sha256(data).digest()
+        if key not in kept:
+            kept[key] = load(data)
+        return kept[key]
+
+    return load_kept
 
 
 @pytest.fixture(scope="session")
-def same(shared: Path) -> Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]:
-    """Function same(format, original, served): the differences between the information of two maps.
+def same(shared: Path, facts: ModuleType) -> Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]:
+    """Function same(format, original, served): the differences between the information of two maps, by `facts`.
 
     The comparator reads large maps for seconds: it compares the same bytes once, also if two databases serve them.
     """

@@ -28,6 +28,7 @@ pieces count in which people drew. Figures, of both networks where that makes se
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -54,8 +55,9 @@ from tests.derive.judge import BadLabels, Case, Figure, Result
 REACH, ACCESS, APART, CLOSE = 2.0, 2.0, 3.0, 0.5
 """Metres: see above."""
 
-POINTS, CELLS, STEP = 36, 4000, 0.25
-"""Random points for detours; random cells for coverage; metres between places along the network's edges."""
+POINTS, CELLS, STEP, NEAREST = 36, 4000, 0.25, 4
+"""Random points for detours; random cells for coverage; metres between places along the network's edges; how many of
+them are looked at before all within reach are."""
 
 Bool = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -235,14 +237,21 @@ def _clear(start: Ints, end: Ints, mask: Bool) -> Bool:
 
 
 def _coverage(sample: Ints, places: Floats, ground: Ground) -> float:
+    """Share of cells that see a place: first the nearest places of each cell are looked at, then all others."""
     target = ground.cells(places)
-    reach = REACH / ground.grid.resolution
-    near = cKDTree(target).query_ball_point(sample, reach)
-    cell = np.repeat(np.arange(len(sample)), [len(k) for k in near])
-    other = np.array([k for some in near for k in some], np.int64)
+    reach = math.nextafter(REACH / ground.grid.resolution, math.inf)  # SciPy's bound is exclusive
+    tree = cKDTree(target)
+    _, near = tree.query(sample, min(NEAREST, len(target)), distance_upper_bound=reach)
+    near = near.reshape(len(sample), -1)
     covered = np.zeros(len(sample), bool)
-    seen = _clear(sample[cell], target[other], ground.free)
-    covered[cell[seen]] = True
+    for other in near.T:
+        left = np.flatnonzero(~covered & (other < len(target)))
+        covered[left] = _clear(sample[left], target[other[left]], ground.free)
+    rest = np.flatnonzero(~covered & (near[:, -1] < len(target)))
+    if len(rest):
+        pairs = cKDTree(sample[rest]).sparse_distance_matrix(tree, reach, output_type="ndarray")
+        cell, other = rest[pairs["i"]], pairs["j"]
+        covered[cell[_clear(sample[cell], target[other], ground.free)]] = True
     return float(covered.mean())
 
 
