@@ -23,6 +23,7 @@ from hypothesis import settings
 
 from app import native
 from tests.api.conftest import Api, running, settings_for
+from tests.api.ogc_sites import create_sites
 from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
 from tests.preloaded import SHARED_FORKER, Forker
 from tests.seaweed import s3_url, seaweed  # noqa: F401  fixtures
@@ -114,6 +115,14 @@ def pytest_collection_finish() -> None:
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
     """Server that most tests share; each uses its own environments."""
     with running(settings_for(tmp_path_factory.mktemp("server"))) as api:
+        yield api
+
+
+@pytest.fixture(scope="session")
+def ogc_sites(tmp_path_factory: pytest.TempPathFactory, shared: Path) -> Iterator[Api]:
+    """Server with the sites of `tests/api/ogc_sites.py`, for tests that only read."""
+    with running(settings_for(tmp_path_factory.mktemp("sites"))) as api:
+        create_sites(api, shared)
         yield api
 
 
