@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from app.derive import DerivationNotes
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound, Problem, TooLarge
 from app.model import obstacles, raster, solids, worlds
+from app.model.distinct import distinct
 from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.grid import OCCUPIED, UNKNOWN
 from app.model.layers import Layers
@@ -62,13 +63,13 @@ class LevelObstacles:
     @property
     def count(self) -> int:
         """Number of obstacles."""
-        return len(self.footprints) + len(np.unique(self.owner))
+        return len(self.footprints) + len(distinct(self.owner))
 
     def cut(self, low: float, high: float) -> LevelObstacles:
         """Return the obstacles between two heights above the floor, or at that height if both are equal."""
         meets = (self.triangles[:, :, 2].min(axis=1) <= high) & (self.triangles[:, :, 2].max(axis=1) >= low)
         # a solid that spans the band without a surface in it still fills it
-        meets = np.isin(self.owner, np.unique(self.owner[self._spans(low)])) | meets
+        meets = np.isin(self.owner, distinct(self.owner[self._spans(low)])) | meets
         standing = [
             k for k, (base, top) in enumerate(zip(self.base, self.top, strict=True)) if base <= high and top > low
         ]

@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from app.model.distinct import distinct
+
 Array = NDArray[np.float64]
 
 MAX_CELLS = 2**21
@@ -253,7 +255,7 @@ def _energy(xy: Array, course: Course, across: float) -> float:
         full[cells] = True
         counts = full.reshape(lines, steps).sum(axis=1).astype(np.float64)
     else:
-        counts = np.bincount(np.unique(cells) // steps).astype(np.float64)
+        counts = np.bincount(distinct(cells) // steps).astype(np.float64)
     return float(((counts - counts.mean()) ** 2).sum())
 
 
@@ -427,7 +429,7 @@ def _emptiness(field: RowField, xy: Array) -> float:
         low, high = max(a.low, b.low), min(a.high, b.high)
         edge = (b.v - a.v) * 3 / 8
         inside = (v > a.v + edge) & (v < b.v - edge) & (u > low) & (u < high)
-        full += len(np.unique(np.floor((u[inside] - low) / ALONG)))
+        full += len(distinct(np.floor((u[inside] - low) / ALONG)))
         total += max(1, int((high - low) / ALONG))
     return (1.0 - min(full / total, 1.0)) ** 2
 
@@ -465,7 +467,7 @@ def _segments(xy: Array, course: Course, across: float) -> list[Row]:
         members = members[(u[members] >= low_u + first * ALONG) & (u[members] < low_u + (last + 1) * ALONG)]
         if len(members) and float(np.ptp(u[members])) >= MIN_LENGTH:
             low, high = float(u[members].min()), float(u[members].max())
-            fill = len(np.unique(i[members])) * ALONG / (high - low)
+            fill = len(distinct(i[members])) * ALONG / (high - low)
             out.append(Row(float(v[members].mean()), low, high, min(1.0, fill), (below - top + 1) * across))
     return sorted(out, key=lambda row: row.v)
 

@@ -15,6 +15,7 @@ from app.derive import DerivationNotes, derives
 from app.derive._obstacles import LevelObstacles, sites, unreadable_error
 from app.errors import CannotConvert, MissingLayer
 from app.model import raster, solids, voxels
+from app.model.distinct import distinct
 from app.model.frame import GROUND
 from app.model.layers import MAP, Layers, PartKey
 from app.model.raster import Array, RasterFrame, Spans
@@ -156,7 +157,7 @@ def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, no
     codes = _codes(raster.surfaces(corners, frame, np.column_stack([levels[:-1], levels[1:]])), frame, first)
     if parameters.filled:
         inside = _codes(raster.insides(corners, owner, frame, (levels[:-1] + levels[1:]) / 2), frame, first)
-        codes = _distinct(np.concatenate([codes, inside]))
+        codes = distinct(np.concatenate([codes, inside]))
     if not len(codes):
         raise MissingLayer("no stored object has a body with an extent: upload walls, buildings or a world with solids")
     depth = np.full(len(codes), voxels.DEPTH, np.uint8)
@@ -177,24 +178,16 @@ def _codes(spans: Iterable[Spans], frame: RasterFrame, first: int) -> voxels.Cod
         portion = np.cumsum(part[:, 3] - part[:, 2]) // CELLS_PER_BLOCK
         for some in np.split(part, np.flatnonzero(np.diff(portion)) + 1):
             layer, row, column = raster.expand_spans(some)
-            waiting.append(_distinct(voxels.morton(column + x0, row + y0, layer + first)))
+            waiting.append(distinct(voxels.morton(column + x0, row + y0, layer + first)))
             size += len(waiting[-1])
             if size > MAX_VOXELS:
-                out, waiting, size = _distinct(np.concatenate([out, *waiting])), [], 0
+                out, waiting, size = distinct(np.concatenate([out, *waiting])), [], 0
                 if len(out) > MAX_VOXELS:
                     _raise_too_many(frame.resolution)
-    out = _distinct(np.concatenate([out, *waiting]))
+    out = distinct(np.concatenate([out, *waiting]))
     if len(out) > MAX_VOXELS:
         _raise_too_many(frame.resolution)
     return out
-
-
-def _distinct(codes: voxels.Codes) -> voxels.Codes:
-    """Return distinct codes, ascending. Sorts, because numpy.unique hashes Morton codes into few buckets."""
-    ordered = np.sort(codes)
-    new = np.ones(len(ordered), bool)
-    np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
-    return ordered[new]
 
 
 def _raise_too_many(resolution: float) -> None:

@@ -16,6 +16,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Invalid, Problem
+from app.model.distinct import distinct
 from app.model.features import MAX_ID, Features, Properties, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Datum
 from app.model.geodesy import LocalFrame, local_frame
@@ -247,7 +248,7 @@ def _split(drawing: _Drawing, xy: Metres, node: Places, join: float) -> tuple[Pl
     tips = np.concatenate(
         [np.arange(len(drawing.poi_owner)), drawing.first[open_line], drawing.last[open_line]]
     ).astype(np.intp)
-    tips = np.unique(node[tips])
+    tips = distinct(node[tips])
     if join <= 0.0 or not len(start) or not len(tips):
         return start, end, owner
     point, segment = _points_near_lines(

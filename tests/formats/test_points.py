@@ -218,8 +218,8 @@ def test_large_text_is_read_in_bounded_memory() -> None:
         assert peak < 10 * len(data), f"{to} {options}: {peak / len(data):.1f} times the text"
 
 
-def test_million_points_are_read_in_sorting_time() -> None:
-    n = 1_000_000
+def test_many_points_are_read_in_sorting_time() -> None:
+    n = 300_000
     dice = np.random.default_rng(5)
     body = dice.uniform(-50, 50, (n, 3)).astype("<f4").tobytes()
     head = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {n}\nHEIGHT 1\nDATA binary\n".encode()

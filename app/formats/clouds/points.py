@@ -27,6 +27,7 @@ from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Parts, ReadContext, WriteContext
 from app.formats._select import file_stem, select_part
 from app.limits import Limits
+from app.model.distinct import distinct
 from app.model.frame import MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.layers import MAP, Layers, Part, PartKey, Resources, cloud_name
@@ -257,8 +258,7 @@ def _merge_codes(
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint8] | None]:
     """Return unique codes, ascending, with the mean colour of their points."""
     if shade is None:
-        code = np.sort(code)
-        return code[np.concatenate([[True], code[1:] != code[:-1]])], None  # np.unique is 100 times slower
+        return distinct(code), None
     order = np.argsort(code, kind="stable")
     code = code[order]
     first = np.flatnonzero(np.concatenate([[True], code[1:] != code[:-1]]))

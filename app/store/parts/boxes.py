@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from app.model.distinct import distinct
 from app.model.geodesy import LocalFrame
 from app.store.values import Box
 
@@ -22,7 +23,7 @@ def bounding_box(points: NDArray[np.float64]) -> Box:
 
 def crossing_box(points: NDArray[np.float64]) -> Box:
     """Return the box in degrees around (longitude, latitude) points that excludes the widest gap of longitudes."""
-    longitude = np.unique(points[:, 0])
+    longitude = distinct(points[:, 0])
     south, north = float(points[:, 1].min()), float(points[:, 1].max())
     gaps = np.diff(longitude, append=longitude[:1] + 360.0)
     k = int(gaps.argmax())
