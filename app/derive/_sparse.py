@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,35 +178,44 @@ class _Merging:
             return False
         start, end = sorted(self._near[node])
         way = sum(math.dist(self._at[node], self._at[k]) for k in (start, end))
-        around = self._reached(start, node, SHORT_WAY * max(way, 2.0 * distance))
-        if around.get(end, math.inf) < math.inf:
+        if end in self._reached(start, node, SHORT_WAY * max(way, 2.0 * distance)):
             self._drop(node)
             return True
         for first in (start, end):
-            piece = self._reached(first, node, 2.0 * island)
-            whole = all(k in piece or k == node for member in piece for k in self._near[member])
-            if (
-                whole
-                and len(piece) <= MAX_VISITED
-                and all(math.dist(self._at[node], self._at[k]) < island for k in piece)
-            ):
+            piece = self._piece(first, node, island)
+            if piece:
                 for k in (node, *piece):
                     self._drop(k)
                 self.pieces += 1
                 return True
         return False
 
-    def _reached(self, start: int, without: int, limit: float) -> dict[int, float]:
-        """Return the nodes reached from one along edges within a length, and the lengths, without using a node."""
+    def _piece(self, first: int, node: int, island: float) -> set[int]:
+        """Return all nodes that one is joined with when another is gone, if all are within ``island`` of that one."""
+        piece: set[int] = set()
+        for k in self._reached(first, node, 2.0 * island):
+            if math.dist(self._at[node], self._at[k]) >= island:
+                return set()
+            piece.add(k)
+        whole = len(piece) <= MAX_VISITED and all(self._near[member] <= piece | {node} for member in piece)
+        return piece if whole else set()
+
+    def _reached(self, start: int, without: int, limit: float) -> Iterator[int]:
+        """Yield the nodes reached from one along edges within a length, without using a node."""
         lengths, queue = {start: 0.0}, [(0.0, start)]
+        yield start
         while queue and len(lengths) <= MAX_VISITED:
             far, current = heapq.heappop(queue)
-            for k in self._near[current] - {without}:
+            for k in self._near[current]:
+                if k == without:
+                    continue
                 length = far + math.dist(self._at[current], self._at[k])
-                if length <= limit and length < lengths.get(k, math.inf):
+                shortest = lengths.get(k)
+                if length <= limit and (shortest is None or length < shortest):
                     lengths[k] = length
                     heapq.heappush(queue, (length, k))
-        return lengths
+                    if shortest is None:
+                        yield k
 
     def _move(self, node: int, other: int, distance: float) -> bool:
         """Move a node away from another one."""

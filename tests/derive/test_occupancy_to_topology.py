@@ -110,20 +110,25 @@ def distances(g: OccupancyGrid) -> NDArray[np.float64]:
 
 def along(lines: Sequence[Any], step: float) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Places on lines with about this distance, all in one array, and where in it each line begins."""
+    ends = shapely.get_coordinates(lines).reshape(-1, 2, 2)  # straight lines
     length = shapely.length(lines)
     # even: a step to a diagonal neighbour is not met at the corner
     count = np.maximum(2, 2 * np.round(length / step / 2).astype(np.intp))
     begin = np.cumsum(count) - count
     number = np.arange(count.sum()) - np.repeat(begin, count)
-    at = number * np.repeat(length / (count - 1), count)
-    return np.asarray(shapely.get_coordinates(shapely.line_interpolate_point(np.repeat(lines, count), at))), begin
+    share = (number / np.repeat(count - 1, count))[:, None]
+    return np.repeat(ends[:, 0], count, 0) + share * np.repeat(ends[:, 1] - ends[:, 0], count, 0), begin
 
 
 def check(g: OccupancyGrid, f: Features, radius: float) -> nx.DiGraph:
     """Collision-free everywhere, both ways, and connected where free space is."""
     clearance = distances(g)
     network = graph_of(f)
-    edges = [item for item in f if item.properties["kind"] == "edge"]
+    both_ways = [item for item in f if item.properties["kind"] == "edge"]
+    for item in both_ways:
+        back = network.edges[item.properties["target"], item.properties["source"]]
+        assert back["width"] == item.properties["width"]
+    edges = [item for item in both_ways if item.properties["source"] < item.properties["target"]]
     places, begin = along([item.geometry for item in edges], g.resolution / 5)
     at = cells_at(g, places)
     nearest = np.minimum.reduceat(clearance[at[:, 0], at[:, 1]], begin) if edges else ()
@@ -132,7 +137,6 @@ def check(g: OccupancyGrid, f: Features, radius: float) -> nx.DiGraph:
         # The narrowest of all cells that are touched is at most the narrowest of those that were sampled.
         assert item.properties["width"] <= 2 * near - g.resolution + 1e-6
         assert item.properties["width"] >= max(0.0, 2 * (near - 1.5 * g.resolution) - g.resolution)
-        assert network.has_edge(item.properties["target"], item.properties["source"])
     place, _ = ndimage.label(clearance > radius * (1 + 1e-9), np.ones((3, 3)))
     pieces = list(nx.weakly_connected_components(network))
     labels = []
