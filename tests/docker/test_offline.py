@@ -78,8 +78,7 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     before = archive.read_bytes()
     assert bundle(folder).returncode == 0
     assert archive.read_bytes() == before, "it is the same each time"
-    with tarfile.open(archive) as tar:
-        tar.extractall(folder, filter="data")
+    subprocess.run(["tar", "-xf", archive], cwd=folder, check=True)
     return folder / archive.name.removesuffix(".tar")
 
 
