@@ -36,7 +36,7 @@ _BITS = np.uint64(0x03F79D71B4CB0A89)
 _BIT = np.zeros(64, np.int64)
 for _k in range(64):
     _BIT[((0x03F79D71B4CB0A89 << _k) & 0xFFFFFFFFFFFFFFFF) >> 58] = _k
-_S58, _S30, _S27, _S31, _S11 = (np.uint64(s) for s in (58, 30, 27, 31, 11))
+_S58, _S52, _S30, _S27, _S31, _S11 = (np.uint64(s) for s in (58, 52, 30, 27, 31, 11))
 _GAMMA, _MIX1, _MIX2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
@@ -156,33 +156,49 @@ def _observe(
 
 
 @native
-def _revise(domain: U64, a: int, b: int, allowed: U64, union: U64) -> int:
-    """Remove patterns from b's domain without partner in a's: 0 unchanged, 1 changed, -1 none would be left."""
+def _find_partners(domain: U64, a: int, d: int, allowed: U64, domains: U64, partners: U64) -> int:
+    """Return the row of ``partners[d]`` with all patterns allowed beside those of place a in direction d.
+
+    domains, partners: [4, 4096, words], the domains asked for last and their answers: many places have equal domains.
+    """
     words = domain.shape[1]
-    for j in range(words):
-        union[j] = ZERO
-    left = 1
+    digest = ZERO
+    for k in range(words):
+        digest = (digest ^ domain[a, k]) * _MIX1
+        digest ^= digest >> _S31
+    row = np.int64((digest * _GAMMA) >> _S52)
+    same = True
+    for k in range(words):
+        same = same and domains[d, row, k] == domain[a, k]
+    if same:
+        return row
+    for k in range(words):
+        domains[d, row, k] = domain[a, k]
+        partners[d, row, k] = ZERO
     for k in range(words):
         word = domain[a, k]
         while word != ZERO:
             low = word & (~word + ONE)
             p = (k << 6) + _BIT[np.int64((low * _BITS) >> _S58)]
             word ^= low
-            left = 0
             for j in range(words):
-                union[j] |= allowed[p, j]
-                if domain[b, j] & ~union[j] != ZERO:
-                    left = 1
-            if left == 0:
-                return 0
-    some = 0
-    for j in range(words):
-        if domain[b, j] & union[j] != ZERO:
-            some = 1
-    if some == 0:
+                partners[d, row, j] |= allowed[d, p, j]
+    return row
+
+
+@native
+def _keep(domain: U64, b: int, partners: U64, d: int, row: int) -> int:
+    """Remove patterns that are no partners from the domain of b: 0 unchanged, 1 changed, -1 none would be left."""
+    rest, less = ZERO, ZERO
+    for j in range(domain.shape[1]):
+        rest |= domain[b, j] & partners[d, row, j]
+        less |= domain[b, j] & ~partners[d, row, j]
+    if less == ZERO:
+        return 0
+    if rest == ZERO:
         return -1
-    for j in range(words):
-        domain[b, j] &= union[j]
+    for j in range(domain.shape[1]):
+        domain[b, j] &= partners[d, row, j]
     return 1
 
 
@@ -237,7 +253,7 @@ def collapse(
         shares[tile[p]] += weights[p]
     single = np.full(n, -1, np.int32)
     chance = np.empty(patterns, np.int64)
-    union = np.empty(words, np.uint64)
+    domains, partners = np.zeros((4, 4096, words), np.uint64), np.empty((4, 4096, words), np.uint64)
     queue = np.empty(n + 1, np.int64)
     waiting = np.zeros(n, np.uint8)
     head, size = 0, 0
@@ -278,7 +294,8 @@ def collapse(
                 b = neighbours[a, d]
                 if b < 0:
                     continue
-                outcome = _revise(domain, a, b, allowed[d], union)
+                row = _find_partners(domain, a, d, allowed, domains, partners)
+                outcome = _keep(domain, b, partners, d, row)
                 report[3] += words
                 if outcome == 0:
                     continue
