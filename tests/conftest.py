@@ -8,6 +8,7 @@ import importlib
 import itertools
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -150,23 +151,23 @@ def shared() -> Path:
 def facts(shared: Path) -> ModuleType:
     """Independent readers that count facts of a file."""
     module = _tool(shared, "facts")
-    module.load_yaml = _kept(module.load_yaml)  # type: ignore[attr-defined]
+    vars(module)["load_yaml"] = _with_cache(module.load_yaml)
     return module
 
 
-def _kept(load: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
-    """Keep what large files hold: several tests compare each with what is served. Nothing that reads it changes it."""
-    kept: dict[bytes, Any] = {}
+def _with_cache(load: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
+    """Parse large files once, as several tests compare each with what is served. Each caller gets a copy."""
+    contents: dict[bytes, bytes] = {}
 
-    def load_kept(data: bytes) -> Any:
+    def load_copy(data: bytes) -> Any:
         if len(data) < 100_000:
             return load(data)
         key = hashlib.sha256(data).digest()
-        if key not in kept:
-            kept[key] = load(data)
-        return kept[key]
+        if key not in contents:
+            contents[key] = pickle.dumps(load(data), pickle.HIGHEST_PROTOCOL)
+        return pickle.loads(contents[key])
 
-    return load_kept
+    return load_copy
 
 
 @pytest.fixture(scope="session")
