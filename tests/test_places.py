@@ -111,7 +111,7 @@ def insert(path: Path, text: str, before: str) -> None:
 def facts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Collect the lists of a copy of the package with all four additions."""
     copy = tmp_path_factory.mktemp("copy")
-    shutil.copytree(ROOT / "app", copy / "app", ignore=shutil.ignore_patterns("node_modules"))
+    shutil.copytree(ROOT / "app", copy / "app", ignore=shutil.ignore_patterns("__pycache__", "node_modules"))
     shutil.copytree(ROOT / "docs" / "hooks", copy / "docs" / "hooks")
     for name in ("pyproject.toml", "migrations"):
         (copy / name).symlink_to(ROOT / name)
