@@ -197,8 +197,9 @@ class _Merging:
             if math.dist(self._at[node], self._at[k]) >= island:
                 return set()
             piece.add(k)
-        whole = len(piece) <= MAX_VISITED and all(self._near[member] <= piece | {node} for member in piece)
-        return piece if whole else set()
+        joined = {node, *piece}
+        is_whole = len(piece) <= MAX_VISITED and all(self._near[member] <= joined for member in piece)
+        return piece if is_whole else set()
 
     def _reached(self, start: int, without: int, limit: float) -> Iterator[int]:
         """Yield the nodes reached from one along edges within a length, without using a node."""

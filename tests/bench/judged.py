@@ -127,9 +127,9 @@ def _draw(chosen: Iterator[Case], checkouts: list[Path], folder: Path, *, is_mad
         for kind, name, step, layers in chosen:
             path.write_bytes(pickle.dumps(layers))
             columns = []
-            for checkout, called in zip(checkouts, ["before", "now"][-len(checkouts) :], strict=True):
+            for checkout, label in zip(checkouts, ["before", "now"][-len(checkouts) :], strict=True):
                 _run(checkout, step, str(path), str(result))
-                columns.append((called, pickle.loads(result.read_bytes())))
+                columns.append((label, pickle.loads(result.read_bytes())))
             title = name if is_made_up else f"{name}: {step}"
             row = judged_pictures.side_by_side(title, layers, columns)
             if is_made_up:
@@ -138,7 +138,7 @@ def _draw(chosen: Iterator[Case], checkouts: list[Path], folder: Path, *, is_mad
                 row.save(folder / f"{kind}-{name}-{step}.png")
             print(f"{name} {step}", file=sys.stderr, flush=True)
     if rows:
-        judged_pictures.joined(rows).save(folder / "derived-maps.png", optimize=True)
+        judged_pictures.stack(rows).save(folder / "derived-maps.png", optimize=True)
 
 
 def _child(step: str, path: Path) -> None:

@@ -48,9 +48,9 @@ class _Panel:
         self.corner, self.metres = corner, (pixels.shape[1] * size, len(pixels) * size)
         self.scale = width / self.metres[0]
         self.size = (width, round(self.metres[1] * self.scale))
-        self.given = self.fitted(pixels)
+        self.base = self.fit(pixels)
 
-    def fitted(self, pixels: NDArray[np.uint8]) -> Image.Image:
+    def fit(self, pixels: NDArray[np.uint8]) -> Image.Image:
         """Return a picture of the map in the size of the panel, RGB."""
         is_larger = pixels.shape[1] > self.size[0]
         how = Image.Resampling.BOX if is_larger else Image.Resampling.NEAREST
@@ -61,19 +61,19 @@ class _Panel:
         x, y = ((shapely.get_coordinates(shape) - self.corner) * self.scale).T
         return list(zip(x.tolist(), (self.size[1] - y).tolist(), strict=True))
 
-    def drawn(self, derived: Derived) -> Image.Image:
+    def draw(self, derived: Derived) -> Image.Image:
         """Return what was derived: the grid, or features over the map."""
         if "cells" in derived:
-            return self.fitted(grey(derived["cells"]))
-        out = self.given.copy()
+            return self.fit(grey(derived["cells"]))
+        out = self.base.copy()
         for shape, properties in sorted(derived.get("rows", []), key=lambda row: row[1].get("kind") == "node"):
-            self._draw(out, shape, properties.get("kind", ""))
+            self._draw_shape(out, shape, properties.get("kind", ""))
         return out
 
-    def _draw(self, out: Image.Image, shape: Any, kind: str) -> None:
+    def _draw_shape(self, out: Image.Image, shape: Any, kind: str) -> None:
         if shape.geom_type.startswith(("Multi", "GeometryCollection")):
             for part in shape.geoms:
-                self._draw(out, part, kind)
+                self._draw_shape(out, part, kind)
             return
         pen = ImageDraw.Draw(out, "RGBA")
         if kind in AREAS:
@@ -97,7 +97,7 @@ def grey(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def summary(derived: Derived) -> str:
-    """Say in words what was derived."""
+    """Return in words how much was derived, or why nothing was."""
     if "fault" in derived:
         return str(derived["fault"])
     if "rows" not in derived:
@@ -119,10 +119,10 @@ def side_by_side(title: str, layers: Layers, columns: Sequence[tuple[str, Derive
     is_picture = not isinstance(next(iter(layers.parts.values())), OccupancyGrid)
     count = len(columns) + is_picture
     panel = _Panel(layers, (WIDTH - EDGE) // count - EDGE)
-    panels = [("map", panel.given)] * is_picture
+    panels = [("map", panel.base)] * is_picture
     for name, derived in columns:
-        said = summary(derived)
-        panels.append((f"{name}: {said}" if said else name, panel.drawn(derived)))
+        counts = summary(derived)
+        panels.append((f"{name}: {counts}" if counts else name, panel.draw(derived)))
     out = Image.new("RGB", (WIDTH, panel.size[1] + 2 * LINE + EDGE // 2), BACKGROUND)
     pen, font = ImageDraw.Draw(out), ImageFont.load_default(15)
     pen.text((EDGE, 2), title, (0, 0, 0), font)
@@ -133,7 +133,7 @@ def side_by_side(title: str, layers: Layers, columns: Sequence[tuple[str, Derive
     return out
 
 
-def joined(rows: Sequence[Image.Image]) -> Image.Image:
+def stack(rows: Sequence[Image.Image]) -> Image.Image:
     """Return pictures below each other in a few colours, so that the file is small."""
     out = Image.new("RGB", (WIDTH, sum(row.height + EDGE for row in rows) + EDGE), BACKGROUND)
     top = EDGE

@@ -38,18 +38,18 @@ TINTS = ((225, 205, 245), (205, 225, 250), (255, 228, 208), (214, 236, 214), (24
 
 def cases() -> Iterator[tuple[str, str, Layers]]:
     """Yield titles, derivations, and the layers that these get."""
-    office = _grid(made_up("office", levels=1))
-    small = made_up("office", levels=1, length=14.0)
+    office = _grid(make_site("office", levels=1))
+    small = make_site("office", levels=1, length=14.0)
     yield "Network of an office's grid", "occupancy_to_topology", _layers(office)
     yield "Rooms (blue), corridors (green) and doors (red) of the same grid", "occupancy_to_zones", _layers(office)
-    yield "Network of a cluttered hall", "occupancy_to_topology", _layers(_grid(made_up("cluttered_hall")))
-    yield "Grid of a plan with walls of two lines", "imagery_to_occupancy", _picture(double_lines(small))
-    yield "Grid of a coloured plan", "imagery_to_occupancy", _picture(coloured(small))
+    yield "Network of a cluttered hall", "occupancy_to_topology", _layers(_grid(make_site("cluttered_hall")))
+    yield "Grid of a plan with walls of two lines", "imagery_to_occupancy", _picture(double_line_plan(small))
+    yield "Grid of a coloured plan", "imagery_to_occupancy", _picture(visitor_plan(small))
     title = "Objects of a scan: walls (blue), furniture (orange), posts (green) and other obstacles (grey)"
     yield title, "occupancy_to_objects", _layers(scan(office))
 
 
-def made_up(generator: str, **options: Any) -> Layers:
+def make_site(generator: str, **options: Any) -> Layers:
     """Return a made-up site."""
     return generate.run(generator, SEED, options, Layers({}), DerivationNotes())
 
@@ -126,7 +126,7 @@ def _rooms(paper: _Paper) -> list[Any]:
     return [hole for hole in holes if hole.area > 1.0]
 
 
-def double_lines(site: Layers) -> NDArray[np.uint8]:
+def double_line_plan(site: Layers) -> NDArray[np.uint8]:
     """Draw walls as two lines, with the furniture, the swings of the doors and dimensions: uint8 [h, w, 3]."""
     paper = _Paper(site)
     for item in paper.furniture():
@@ -150,7 +150,7 @@ def double_lines(site: Layers) -> NDArray[np.uint8]:
     return paper.pixels
 
 
-def coloured(site: Layers) -> NDArray[np.uint8]:
+def visitor_plan(site: Layers) -> NDArray[np.uint8]:
     """Draw thick walls around tinted rooms with names and symbols, as for visitors: uint8 [h, w, 3]."""
     paper = _Paper(site)
     rooms = _rooms(paper)

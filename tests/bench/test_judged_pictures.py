@@ -11,7 +11,7 @@ from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, PartKey
 from tests.bench.judged_pictures import AREAS, EDGE, INK, LINE, WIDTH, side_by_side, summary
-from tests.bench.made_up_maps import PIXEL, coloured, double_lines, made_up, scan
+from tests.bench.made_up_maps import PIXEL, double_line_plan, make_site, scan, visitor_plan
 
 
 def room() -> OccupancyGrid:
@@ -64,8 +64,8 @@ def test_scan_sees_no_inside_of_walls() -> None:
 
 
 def test_drawn_plans_show_rooms_that_are_derived() -> None:
-    site = made_up("office", levels=1, length=14.0)
-    for pixels in (double_lines(site), coloured(site)):
+    site = make_site("office", levels=1, length=14.0)
+    for pixels in (double_line_plan(site), visitor_plan(site)):
         image = GeoImage(pixels, (PIXEL, 0.0, 0.0, 0.0, -PIXEL, len(pixels) * PIXEL))
         layers = Layers({PartKey("imagery", "ground", "plan"): image})
         (grid,) = imagery_to_occupancy(layers, Parameters(), DerivationNotes()).parts.values()
