@@ -149,8 +149,6 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyStore]:
     store = FaultyStore(0)
     for name, value in {**ACCESS, "AWS_ENDPOINT_URL": store.endpoint}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr("app.backends.blob_s3.STALL_SECONDS", 1)
-    monkeypatch.setattr("app.backends.blob_s3.CONNECT_SECONDS", 1)
     yield store
     store.close()
 
@@ -165,9 +163,18 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyStore]:
     ],
 )
 def test_failing_store_is_named_with_its_reason(
-    faulty: FaultyStore, tmp_path: Path, status: int, seconds: float, error: type[Exception], reason: str
+    faulty: FaultyStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    status: int,
+    seconds: float,
+    error: type[Exception],
+    reason: str,
 ) -> None:
     faulty.fault = Fault(status, seconds)
+    if seconds:
+        monkeypatch.setattr("app.backends.blob_s3.STALL_SECONDS", 1)
+        monkeypatch.setattr("app.backends.blob_s3.CONNECT_SECONDS", 1)
     failing = S3Files("s3://maps/x", tmp_path)
     failing.prepare()
     with pytest.raises(error, match=reason) as caught:
