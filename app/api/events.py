@@ -35,8 +35,11 @@ from app.events import messages
 from app.events.bus import DeferredReply, Reply
 from app.store.values import Event
 
-COMMIT_POLL_SECONDS = 0.02
-"""Seconds between reads of the host's commit counter."""
+INTERVAL_SECONDS = 0.02
+"""Shortest time between two looks at the log."""
+
+WAIT_SECONDS = 0.2
+"""Longest wait of a thread for a commit, as the server may stop."""
 
 POLL_SECONDS = 1.0
 KEEP_ALIVE_SECONDS = 15.0
@@ -75,27 +78,22 @@ class EventFeed:
         self.streams = 0
         self.ending = False
 
-    async def wait(self, seconds: float, robots: RobotSubscription | None = None) -> None:
-        """Wait for a commit or a change of ``robots``, but no longer than ``seconds``."""
-        if robots is None:
-            await self._wait_for_commit(seconds)
-            return
-        waits = [asyncio.create_task(self._wait_for_commit(seconds)), asyncio.create_task(robots.wait())]
+    def next_change(self) -> asyncio.Event:
+        """Return what is set after the next commit. To miss none, call it before reading the log."""
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._follow_counter(self._services.store.generation()))
+        return self._changed
+
+    async def wait(self, changed: asyncio.Event, seconds: float, robots: RobotSubscription | None = None) -> None:
+        """Wait for ``changed`` or a change of ``robots``, but no longer than ``seconds``."""
+        waits: list[asyncio.Task[Any]] = [asyncio.create_task(changed.wait())]
+        if robots is not None:
+            waits.append(asyncio.create_task(robots.wait()))
         try:
-            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(waits, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         finally:
             for waiting in waits:
                 waiting.cancel()
-
-    async def _wait_for_commit(self, seconds: float) -> None:
-        if self._task is None or self._task.done():
-            self._task = asyncio.create_task(self._read_counter())
-        changed = self._changed
-        try:
-            async with asyncio.timeout(seconds):
-                await changed.wait()
-        except TimeoutError:
-            return
 
     async def events(self, environment: str | None, start: int) -> list[StreamEvent]:
         """Return the next events after a position; streams at the same position share the read.
@@ -121,18 +119,17 @@ class EventFeed:
         """End all streams, since the server stops; clients reconnect later."""
         self.ending = True
         self._changed.set()
+        self._services.store.generation.wake()
 
-    async def _read_counter(self) -> None:
-        seen = self._services.store.generation()
-        last = 0.0
-        while self.streams:
-            await asyncio.sleep(COMMIT_POLL_SECONDS)
-            last += COMMIT_POLL_SECONDS
-            now = self._services.store.generation()
-            if now != seen or last > POLL_SECONDS:
-                seen, last = now, 0.0
+    async def _follow_counter(self, seen: int) -> None:
+        generation, last_look = self._services.store.generation, time.monotonic()
+        while self.streams and not self.ending:
+            is_new = await asyncio.to_thread(generation.wait, seen, WAIT_SECONDS)
+            if is_new or time.monotonic() - last_look > POLL_SECONDS:
+                seen, last_look = generation(), time.monotonic()
                 self._changed.set()
                 self._changed = asyncio.Event()
+                await asyncio.sleep(INTERVAL_SECONDS)
 
 
 @router.get(
@@ -278,6 +275,7 @@ async def _stream(
         quiet = 0.0
         loop = asyncio.get_running_loop()
         while True:
+            changed = feed.next_change()
             try:
                 page = await feed.events(environment, start)
                 if not await bearer.is_valid():
@@ -305,7 +303,7 @@ async def _stream(
             if not follow or feed.ending:
                 return
             before = loop.time()
-            await feed.wait(KEEP_ALIVE_SECONDS, robots)
+            await feed.wait(changed, KEEP_ALIVE_SECONDS, robots)
             quiet += loop.time() - before
             if quiet >= KEEP_ALIVE_SECONDS:
                 quiet = 0.0

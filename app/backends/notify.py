@@ -1,9 +1,10 @@
 """Notify: a number that changes with each commit, which caches and streams compare.
 
 Local: eight bytes of a file in the blob folder, mapped into memory by all processes of a server; reading them takes
-less than a microsecond, a database query about a hundred. Shared: a commit also notifies the other servers through
-PostgreSQL, and one process of each changes the number there. Notifications may be lost with a connection, so caches
-expire after one second anyway, and what waits for commits reads the database now and then.
+less than a microsecond, a database query about a hundred, and threads can wait for their change. Shared: a commit also
+notifies the other servers through PostgreSQL, and one process of each changes the number there. Notifications may be
+lost with a connection, so caches expire after one second anyway, and what waits for commits reads the database now and
+then.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import os
 import secrets
 import struct
 import threading
+import time
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -22,6 +24,7 @@ import psycopg
 from sqlalchemy import Connection
 
 from app.backends.direct import DirectConnection
+from app.backends.futex import POLL_SECONDS, Futex
 from app.backends.lead import Lead
 
 log = logging.getLogger(__name__)
@@ -47,6 +50,7 @@ class CommitCounter:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._map: mmap.mmap | None = None
+        self._futex: Futex | None = None
         self._number = 0
         self._lock = threading.Lock()
 
@@ -63,11 +67,32 @@ class CommitCounter:
             self._number = number
         else:
             _NUMBER.pack_into(shared, 0, number)
+        self.wake()
+
+    def wait(self, number: int, seconds: float) -> bool:
+        """Wait while the number is ``number``, but no longer than so many seconds; return whether it is another one.
+
+        May return early with False, for example after ``wake``.
+        """
+        if self() == number:
+            futex = self._futex
+            if futex is None:
+                time.sleep(min(seconds, POLL_SECONDS))
+            else:
+                futex.wait(number % 2**32, seconds)
+        return self() != number
+
+    def wake(self) -> None:
+        """End the waits of all threads, since there is something else to do."""
+        futex = self._futex
+        if futex is not None:
+            futex.wake()
 
     def close(self) -> None:
         """Close the mapping."""
         with self._lock:
             if self._map is not None:
+                self._futex = None
                 self._map.close()
                 self._map = None
 
@@ -82,7 +107,9 @@ class CommitCounter:
                     if os.fstat(descriptor).st_size < _NUMBER.size:
                         # not a sparse file: on a full disk, access to its mapping would kill the process
                         os.pwrite(descriptor, bytes(_NUMBER.size), 0)
-                    self._map = mmap.mmap(descriptor, _NUMBER.size)
+                    memory = mmap.mmap(descriptor, _NUMBER.size)
+                    self._futex = Futex(memory)
+                    self._map = memory
                 except OSError:
                     return None
                 finally:

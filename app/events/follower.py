@@ -12,8 +12,8 @@ from app.events.leader import POLL_SECONDS, LeaderThread
 from app.store.store import Store
 from app.store.values import Event
 
-COMMIT_POLL_SECONDS = 0.004
-"""Interval between two reads of the commit counter in shared memory."""
+WAIT_SECONDS = 0.2
+"""Longest wait for a commit until the thread checks that it still leads."""
 
 PAGE = 500
 
@@ -38,7 +38,8 @@ class Follower(LeaderThread):
         trouble: start of the log line when the state becomes ``down``.
     """
 
-    commit_poll_seconds = COMMIT_POLL_SECONDS
+    interval_seconds = 0.004
+    """Shortest time between two looks at the log, so that many commits cost no more than one."""
 
     def __init__(self, store: Store, data_dir: Path, name: str, leads: Leads, *, well: str, trouble: str) -> None:
         super().__init__(data_dir, name, leads, well=well, trouble=trouble)
@@ -51,10 +52,20 @@ class Follower(LeaderThread):
             return
         # Also return periodically: a notification may have been lost, and the connection must be checked.
         last_read = time.monotonic()
-        while self._term.goes_on and not self._stopping.wait(self.commit_poll_seconds):
-            is_new = self._store.generation() != generation or time.monotonic() - last_read > POLL_SECONDS
-            if is_new or self._has_more():
+        while not self._is_ending():
+            is_new = self._store.generation.wait(generation, min(WAIT_SECONDS, POLL_SECONDS))
+            age = time.monotonic() - last_read
+            if is_new or age > POLL_SECONDS or self._has_more():
+                self._stopping.wait(self.interval_seconds - age)
                 return
+
+    def _stop(self) -> None:
+        super()._stop()
+        self._wake()
+
+    def _wake(self) -> None:
+        """Have the thread look for something to do besides new events."""
+        self._store.generation.wake()
 
     @abstractmethod
     def _hand_over(self) -> bool:

@@ -50,7 +50,7 @@ class LeaderThread(ABC):
 
     def close(self) -> None:
         """Stop the thread, release its resources and then the lead."""
-        self._stopping.set()
+        self._stop()
         self._thread.join(15)
         self._release()
         self._lead.release()
@@ -59,6 +59,10 @@ class LeaderThread(ABC):
     @abstractmethod
     def _run_once(self) -> None:
         """Do pending work, then wait for more. Raises FleetMapError while it is down."""
+
+    def _stop(self) -> None:
+        """Have the thread end. Subclasses also end their waits for something else."""
+        self._stopping.set()
 
     @abstractmethod
     def _release(self) -> None:

@@ -133,6 +133,7 @@ class Relay(Follower):
         if self._replayed_for != outlet.opened:
             history = self._store.events.history
             self._choice = self._chooser.submit(history, self._position(), outlet.history, MAX_REPLAYED_EVENTS)
+            self._choice.add_done_callback(lambda _: self._wake())
             self._replayed_for = outlet.opened
         self._take_choice()
         self._publish_state({**outlet.state, "leader": True})  # only now: without the database nothing is published

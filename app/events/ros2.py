@@ -24,6 +24,7 @@ import zenoh
 from zenoh import ext
 
 from app.backends.lead import Leads
+from app.backends.notify import CommitCounter
 from app.errors import FleetMapError
 from app.events import cdr, leader, ros_names
 from app.events.bus import BusOptions, connection_error, session_configuration
@@ -37,7 +38,12 @@ FRAME = "map"
 """Frame id of all maps, the default of Nav2 and topological_navigation."""
 
 HEARTBEAT_SECONDS = 0.5
-COMMIT_POLL_SECONDS = 0.02
+INTERVAL_SECONDS = 0.02
+"""Shortest time between two looks at the versions."""
+
+WAIT_SECONDS = 0.2
+"""Longest wait for a commit until the thread checks that it still leads."""
+
 VERSION_POLL_SECONDS = 5.0
 """Maximum interval between two reads of the database: another host may have committed."""
 
@@ -162,7 +168,7 @@ class Ros2Publisher(LeaderThread):
         data_dir: Path,
         leads: Leads,
         *,
-        generation: Callable[[], int],
+        generation: CommitCounter,
         look: LookUpVersions,
         fetch: Fetch,
     ) -> None:
@@ -184,9 +190,16 @@ class Ros2Publisher(LeaderThread):
         self._publish_changes(self._look_up_versions())
         self._publish_state({"state": "connected", "topics": len(self._owners)})
         last_read = time.monotonic()
-        while self._term.goes_on and not self._stopping.wait(COMMIT_POLL_SECONDS):
-            if self._generation() != generation or time.monotonic() - last_read > VERSION_POLL_SECONDS:
+        while not self._is_ending():
+            is_new = self._generation.wait(generation, WAIT_SECONDS)
+            age = time.monotonic() - last_read
+            if is_new or age > VERSION_POLL_SECONDS:
+                self._stopping.wait(INTERVAL_SECONDS - age)
                 return
+
+    def _stop(self) -> None:
+        super()._stop()
+        self._generation.wake()
 
     def _open(self) -> bool:
         try:

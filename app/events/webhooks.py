@@ -123,7 +123,7 @@ def next_attempts(before: Attempts, attempt: Attempt) -> Attempts:
 class WebhookSender(Follower):
     """Thread that finds webhooks with something to send, and lets a courier send it."""
 
-    commit_poll_seconds = 0.05
+    interval_seconds = 0.05
 
     def __init__(self, store: Store, data_dir: Path, leads: Leads, rules: OutgoingRules) -> None:
         super().__init__(store, data_dir, NAME, leads, well="webhooks: this server sends", trouble="webhooks: down")
@@ -145,6 +145,7 @@ class WebhookSender(Follower):
                 self._couriers[key] = Courier(self._store, self._rules, webhook)
             if self._couriers[key].is_due(webhook, last):
                 self._working[key] = self._threads.submit(self._couriers[key].run, self._term, self._stopping.is_set)
+                self._working[key].add_done_callback(lambda _: self._wake())
         self._publish_state({"state": "connected", "leader": True})
         return False
 

@@ -24,6 +24,7 @@ import zenoh
 from zenoh import ext
 
 from app.backends.lead import LocalLeads
+from app.backends.notify import CommitCounter
 from app.errors import Unavailable
 from app.events import cdr, ros_names
 from app.events.bus import BusOptions, router_configuration
@@ -486,7 +487,7 @@ def test_ros2_keeps_last_map_and_retries_when_content_is_unavailable(
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         LocalLeads(tmp_path),
-        generation=lambda: 0,
+        generation=CommitCounter(tmp_path),
         look=lambda: {"farm": version("farm", str(state["root"]))},
         fetch=fetch,
     )
@@ -522,7 +523,7 @@ def test_ros2_error_of_one_environment_does_not_affect_others(
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         LocalLeads(tmp_path),
-        generation=lambda: 0,
+        generation=CommitCounter(tmp_path),
         look=lambda: {name: version(name, "r") for name in ("bad", "good")},
         fetch=fetch,
     )
@@ -548,7 +549,7 @@ def test_ros2_reports_missing_router_and_connects_later(tmp_path: Path, monkeypa
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         LocalLeads(tmp_path),
-        generation=lambda: 0,
+        generation=CommitCounter(tmp_path),
         look=lambda: {"farm": version("farm", "r")},
         fetch=lambda _: TopicContent({None: SMALL}, None),
     )
@@ -580,7 +581,7 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         LocalLeads(tmp_path),
-        generation=lambda: 0,
+        generation=CommitCounter(tmp_path),
         look=lambda: {name: version(name, "r") for name in content},
         fetch=lambda request: content[request.environment],
     )
@@ -589,7 +590,7 @@ def test_one_topic_belongs_to_one_level_of_one_environment(
         BusOptions(mode="client", connect=endpoint),
         tmp_path,
         LocalLeads(tmp_path),
-        generation=lambda: 0,
+        generation=CommitCounter(tmp_path),
         look=lambda: {"a-b": version("a-b", "r")},
         fetch=lambda _: TopicContent({None: replace(SMALL, resolution=3.0)}, None),
     )

@@ -1,0 +1,44 @@
+"""Waiting in the kernel until memory that processes share has another value: Linux's futex, which Python lacks."""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import platform
+import sys
+import time
+from typing import Final
+
+POLL_SECONDS: Final = 0.004
+"""Where the kernel has no futex, a wait ends after this time, so that the caller reads the memory again."""
+
+_WAIT, _WAKE, _ALL = 0, 1, 2**31 - 1  # linux/futex.h; without its flag "private", as other processes wait, too
+_NUMBERS = {"x86_64": 202, "aarch64": 98, "riscv64": 98}  # of the system call; all three are little-endian
+_NUMBER = _NUMBERS.get(platform.machine(), 0) if sys.platform == "linux" and sys.maxsize > 2**32 else 0
+_system_call = ctypes.CDLL(None).syscall if _NUMBER else None
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+class Futex:
+    """The first four bytes of a mapping that may be closed while threads wait: they go on then, or at their time."""
+
+    def __init__(self, memory: mmap.mmap) -> None:
+        self._address = ctypes.c_void_p(ctypes.addressof(ctypes.c_uint32.from_buffer(memory)))
+
+    def wait(self, value: int, seconds: float) -> None:
+        """Wait while the bytes are ``value`` (little-endian), until ``wake``, but no longer; may return early."""
+        if _system_call is None:
+            time.sleep(min(seconds, POLL_SECONDS))
+            return
+        time_limit = _Timespec(int(seconds), int(seconds % 1 * 1e9))
+        arguments = (ctypes.c_uint32(value), ctypes.byref(time_limit), None, ctypes.c_uint32(0))
+        _system_call(ctypes.c_long(_NUMBER), self._address, ctypes.c_int(_WAIT), *arguments)
+
+    def wake(self) -> None:
+        """Wake all threads of all processes that wait."""
+        if _system_call is not None:
+            arguments = (ctypes.c_uint32(_ALL), None, None, ctypes.c_uint32(0))
+            _system_call(ctypes.c_long(_NUMBER), self._address, ctypes.c_int(_WAKE), *arguments)
