@@ -70,6 +70,13 @@ def check_history(servers: Servers, count: int) -> float:
     return time.monotonic() - start
 
 
+def wait_until_idle(url: str) -> None:
+    """Wait for a moment in which no server is in a transaction."""
+    busy = "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND xact_start < now()"
+    with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
+        eventually(lambda: connection.execute(busy).fetchone() == (0,))
+
+
 def test_server_takes_over_from_killed_and_stopped_leader(
     servers: Servers, session: zenoh.Session, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,6 +123,7 @@ def test_server_takes_over_from_leader_without_network(
         with zenoh.open(client_config(servers.zenoh)) as robot:
             listener = Listener(robot, "fleetmap/farm/events")
             listener.wait(lambda e: e.sequences() == [1])
+            wait_until_idle(servers.url)  # rows of a transaction are locked until PostgreSQL ends it
             seconds = take_over(servers, listener, far, lambda: setattr(proxy, "is_silent", True))
             assert listener.sequences() == [1, 2, 3]
         servers.all.remove(far)
