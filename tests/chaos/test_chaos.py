@@ -92,7 +92,7 @@ def check(fleet: Fleet) -> None:
     eventually(lambda: fleet.reader.sequences[-1:] == [last])
     assert fleet.reader.sequences == expected, "server-sent events: a gap or a repeat"
     # A new leader publishes new events first, then those that it may have missed.
-    eventually(lambda: sorted(set(fleet.listener.sequences())) == expected)
+    fleet.listener.wait(lambda listener: sorted(listener.sequences()) == expected, 250)
     received = eventually(lambda: (s := _in_order(fleet.receiver.sequences(ENVIRONMENT)))[-1:] == [last] and s)
     assert received == expected, "webhook: a gap, or an event before an earlier one"
     assert fleet.receiver.problems == []

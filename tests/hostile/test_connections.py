@@ -21,9 +21,11 @@ from tests.certificates import Authority
 from tests.cli.conftest import ServerProcess
 
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}
-CLOSED_SECONDS = 1.0
-PATIENCE_SECONDS = 10.0
-"""Additional time in seconds that a test waits on a busy machine."""
+CLOSED_SECONDS = 6.0
+"""Longest time from a response that ends its connection to that end."""
+
+PATIENCE_SECONDS = 60.0
+"""Time in seconds that a test waits for what must happen, on any machine."""
 
 JSON_HEAD = "Content-Type: application/json\r\nContent-Length: 100000\r\n"
 
@@ -214,7 +216,7 @@ def test_rejected_body_is_not_awaited(api: Api) -> None:
             answer, seconds = read_to_end(line, chunk)
         assert answer.startswith(f"HTTP/1.1 {status} ".encode()), f"{target}: {answer[:200]!r}"
         assert b"connection: close\r\n" in answer, target
-        assert seconds < CLOSED_SECONDS + PATIENCE_SECONDS / 2, target
+        assert seconds < CLOSED_SECONDS, target
 
 
 def test_rejected_large_body_gets_a_response(api: Api) -> None:
