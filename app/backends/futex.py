@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import mmap
 import platform
 import sys
 import time
-from typing import Final
+from typing import Any, Final
 
 POLL_SECONDS: Final = 0.004
-"""Where the kernel has no futex, a wait ends after this time, so that the caller reads the memory again."""
+"""Where the kernel does not wait, a wait ends after this time, so that the caller reads the memory again."""
 
 _WAIT, _WAKE, _ALL = 0, 1, 2**31 - 1  # linux/futex.h; without its flag "private", as other processes wait, too
 _NUMBERS = {"x86_64": 202, "aarch64": 98, "riscv64": 98}  # of the system call; all three are little-endian
 _NUMBER = _NUMBERS.get(platform.machine(), 0) if sys.platform == "linux" and sys.maxsize > 2**32 else 0
-_system_call = ctypes.CDLL(None).syscall if _NUMBER else None
+_system_call = ctypes.CDLL(None, use_errno=True).syscall if _NUMBER else None
 
 
 class _Timespec(ctypes.Structure):
@@ -30,15 +31,19 @@ class Futex:
 
     def wait(self, value: int, seconds: float) -> None:
         """Wait while the bytes are ``value`` (little-endian), until ``wake``, but no longer; may return early."""
-        if _system_call is None:
-            time.sleep(min(seconds, POLL_SECONDS))
-            return
         time_limit = _Timespec(int(seconds), int(seconds % 1 * 1e9))
         arguments = (ctypes.c_uint32(value), ctypes.byref(time_limit), None, ctypes.c_uint32(0))
-        _system_call(ctypes.c_long(_NUMBER), self._address, ctypes.c_int(_WAIT), *arguments)
+        if _call(self._address, _WAIT, *arguments) not in (0, errno.EAGAIN, errno.EINTR, errno.ETIMEDOUT):
+            time.sleep(min(seconds, POLL_SECONDS))
 
     def wake(self) -> None:
         """Wake all threads of all processes that wait."""
-        if _system_call is not None:
-            arguments = (ctypes.c_uint32(_ALL), None, None, ctypes.c_uint32(0))
-            _system_call(ctypes.c_long(_NUMBER), self._address, ctypes.c_int(_WAKE), *arguments)
+        _call(self._address, _WAKE, ctypes.c_uint32(_ALL), None, None, ctypes.c_uint32(0))
+
+
+def _call(address: ctypes.c_void_p, operation: int, *arguments: Any) -> int:
+    """Call the kernel; return the number of its error, or 0."""
+    if _system_call is None:
+        return errno.ENOSYS
+    failed = _system_call(ctypes.c_long(_NUMBER), address, ctypes.c_int(operation), *arguments) < 0
+    return ctypes.get_errno() if failed else 0

@@ -53,11 +53,11 @@ class Follower(LeaderThread):
         # Also return periodically: a notification may have been lost, and the connection must be checked.
         last_read = time.monotonic()
         while not self._is_ending():
-            is_new = self._store.generation.wait(generation, min(WAIT_SECONDS, POLL_SECONDS))
             age = time.monotonic() - last_read
-            if is_new or age > POLL_SECONDS or self._has_more():
+            if self._store.generation() != generation or age > POLL_SECONDS or self._has_more():
                 self._stopping.wait(self.interval_seconds - age)
                 return
+            self._store.generation.wait(generation, min(WAIT_SECONDS, POLL_SECONDS))
 
     def _stop(self) -> None:
         super()._stop()

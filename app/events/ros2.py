@@ -191,11 +191,11 @@ class Ros2Publisher(LeaderThread):
         self._publish_state({"state": "connected", "topics": len(self._owners)})
         last_read = time.monotonic()
         while not self._is_ending():
-            is_new = self._generation.wait(generation, WAIT_SECONDS)
             age = time.monotonic() - last_read
-            if is_new or age > VERSION_POLL_SECONDS:
+            if self._generation() != generation or age > VERSION_POLL_SECONDS:
                 self._stopping.wait(INTERVAL_SECONDS - age)
                 return
+            self._generation.wait(generation, WAIT_SECONDS)
 
     def _stop(self) -> None:
         super()._stop()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import resource
 import subprocess
 import sys
@@ -101,13 +103,22 @@ def test_counter_may_be_closed_while_a_thread_waits(tmp_path: Path) -> None:
     assert not waiting.is_alive()
 
 
+def refuse(*_: object) -> int:
+    """A kernel that does not allow to wait."""
+    ctypes.set_errno(errno.EPERM)
+    return -1
+
+
+@pytest.mark.parametrize("system_call", [None, refuse])
 @pytest.mark.parametrize("folder", ["", "absent"])
 def test_waiting_without_the_kernel_looks_now_and_then(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, system_call: object
 ) -> None:
-    monkeypatch.setattr(futex, "_system_call", None)
+    monkeypatch.setattr(futex, "_system_call", system_call)
     counter = CommitCounter(tmp_path / folder)
-    before = counter()
+    before, start = counter(), time.monotonic()
+    assert not counter.wait(before, 0.004)
+    assert time.monotonic() - start >= 0.004
     timer = threading.Timer(0.1, counter.change)
     timer.start()
     while not counter.wait(before, 250):
