@@ -279,7 +279,7 @@ def _points_near_lines(
     """Find pairs (point, line) within a distance, sorted; in portions of bounded memory (hostile drawings)."""
     tree = shapely.STRtree(lines)
     limit = 1_000_000 + 10 * (len(points) + len(lines))
-    portion = max(1, 50_000_000 // len(lines))
+    portion = max(1, 5_000_000 // len(lines))
     pair_blocks: list[NDArray[np.intp]] = []
     total = 0
     for begin in range(0, len(points), portion):
