@@ -8,6 +8,7 @@ the log and have no id. A stream ends soon after its token or session.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
@@ -86,9 +87,12 @@ class EventFeed:
 
     async def wait(self, changed: asyncio.Event, seconds: float, robots: RobotSubscription | None = None) -> None:
         """Wait for ``changed`` or a change of ``robots``, but no longer than ``seconds``."""
-        waits: list[asyncio.Task[Any]] = [asyncio.create_task(changed.wait())]
-        if robots is not None:
-            waits.append(asyncio.create_task(robots.wait()))
+        if robots is None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    await changed.wait()
+            return
+        waits: list[asyncio.Task[Any]] = [asyncio.create_task(changed.wait()), asyncio.create_task(robots.wait())]
         try:
             await asyncio.wait(waits, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         finally:

@@ -24,7 +24,7 @@ class _Timespec(ctypes.Structure):
 
 
 class Futex:
-    """The first four bytes of a mapping that may be closed while threads wait: they go on then, or at their time."""
+    """The first four bytes of a mapping. It may be closed while threads wait, which does not wake them."""
 
     def __init__(self, memory: mmap.mmap) -> None:
         self._address = ctypes.c_void_p(ctypes.addressof(ctypes.c_uint32.from_buffer(memory)))

@@ -72,15 +72,16 @@ class CommitCounter:
     def wait(self, number: int, seconds: float) -> bool:
         """Wait while the number is ``number``, but no longer than so many seconds; return whether it is another one.
 
-        May return early with False, for example after ``wake``.
+        May return early with False, for example after ``wake`` or ``close``.
         """
-        if self() == number:
-            futex = self._futex
-            if futex is None:
-                time.sleep(min(seconds, POLL_SECONDS))
-            else:
-                futex.wait(number % 2**32, seconds)
-        return self() != number
+        if self() != number:
+            return True
+        futex = self._futex
+        if futex is None:
+            time.sleep(min(seconds, POLL_SECONDS))
+        else:
+            futex.wait(number % 2**32, seconds)
+        return self._futex is futex and self() != number
 
     def wake(self) -> None:
         """End the waits of all threads, since there is something else to do."""
@@ -89,12 +90,10 @@ class CommitCounter:
             futex.wake()
 
     def close(self) -> None:
-        """Close the mapping."""
+        """Give up the mapping, which ends with its last reader."""
         with self._lock:
-            if self._map is not None:
-                self._futex = None
-                self._map.close()
-                self._map = None
+            self.wake()
+            self._futex = self._map = None
 
     def _open(self) -> mmap.mmap | None:
         with self._lock:

@@ -13,7 +13,7 @@ from app.store.store import Store
 from app.store.values import Event
 
 WAIT_SECONDS = 0.2
-"""Longest wait for a commit until the thread checks that it still leads."""
+"""Longest wait for a commit until the thread checks that it still leads, and for a call of ``wake`` that it missed."""
 
 PAGE = 500
 
@@ -39,7 +39,7 @@ class Follower(LeaderThread):
     """
 
     interval_seconds = 0.004
-    """Shortest time between two looks at the log, so that many commits cost no more than one."""
+    """Shortest time between two looks at the log, so that a burst of commits costs one."""
 
     def __init__(self, store: Store, data_dir: Path, name: str, leads: Leads, *, well: str, trouble: str) -> None:
         super().__init__(data_dir, name, leads, well=well, trouble=trouble)

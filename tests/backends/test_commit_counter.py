@@ -49,6 +49,9 @@ def test_commit_counter_without_folder_counts_in_process(tmp_path: Path) -> None
     assert counter() != before
 
 
+ENDLESS = 1000.0
+"""Seconds: a wait that is not ended exceeds the time limit of its test."""
+
 CHANGE = """
 import time
 from pathlib import Path
@@ -68,9 +71,9 @@ def test_waiting_ends_with_a_change_of_another_process(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path)
     before = counter()
     process = subprocess.Popen([sys.executable, "-c", CHANGE.format(folder=str(tmp_path))])
-    assert counter.wait(before, 250)
+    assert counter.wait(before, ENDLESS)
     assert process.wait(60) == 0
-    assert counter.wait(before, 250), "it has changed already"
+    assert counter.wait(before, ENDLESS), "it has changed already"
     counter.close()
 
 
@@ -83,28 +86,42 @@ def test_waiting_sleeps_once_and_ends_in_time(tmp_path: Path) -> None:
     counter.close()
 
 
-def test_all_waiting_threads_are_woken(tmp_path: Path) -> None:
+def start_waiting(counter: CommitCounter) -> threading.Thread:
+    thread = threading.Thread(target=counter.wait, args=(counter(), ENDLESS), daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_change_wakes_all_threads(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path)
-    waiting = [threading.Thread(target=counter.wait, args=(counter(), 250.0)) for _ in range(3)]
+    waiting = [start_waiting(counter) for _ in range(3)]
+    time.sleep(0.5)  # one that has not begun to wait until now sees the change
+    counter.change()
     for thread in waiting:
-        thread.start()
-    while any(thread.is_alive() for thread in waiting):  # again, as a thread may not have begun to wait
+        thread.join()
+    counter.close()
+
+
+def test_waiting_ends_without_a_change_when_woken(tmp_path: Path) -> None:
+    counter = CommitCounter(tmp_path)
+    before, thread = counter(), start_waiting(counter)
+    while thread.is_alive():  # again, as it may not have begun to wait
         counter.wake()
         time.sleep(0.01)
+    assert counter() == before
     counter.close()
 
 
-def test_counter_may_be_closed_while_a_thread_waits(tmp_path: Path) -> None:
+def test_closing_ends_the_wait_of_a_thread(tmp_path: Path) -> None:
     counter = CommitCounter(tmp_path)
-    waiting = threading.Thread(target=counter.wait, args=(counter(), 0.5))
-    waiting.start()
-    counter.close()
-    waiting.join(60)
-    assert not waiting.is_alive()
+    thread = start_waiting(counter)
+    while thread.is_alive():  # again, as it may not have begun to wait
+        counter.close()
+        time.sleep(0.01)
 
 
 def refuse(*_: object) -> int:
-    """A kernel that does not allow to wait."""
+    """A kernel that does not allow waiting."""
     ctypes.set_errno(errno.EPERM)
     return -1
 
@@ -121,7 +138,7 @@ def test_waiting_without_the_kernel_looks_now_and_then(
     assert time.monotonic() - start >= 0.004
     timer = threading.Timer(0.1, counter.change)
     timer.start()
-    while not counter.wait(before, 250):
+    while not counter.wait(before, ENDLESS):
         pass
     timer.join()
     assert counter() != before

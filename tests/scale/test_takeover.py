@@ -70,11 +70,16 @@ def check_history(servers: Servers, count: int) -> float:
     return time.monotonic() - start
 
 
+IDLE = """
+SELECT (SELECT position FROM relay WHERE id = 1) = (SELECT position FROM log) AND NOT EXISTS (
+    SELECT FROM pg_stat_activity WHERE datname = current_database() AND xact_start < now())
+"""
+
+
 def wait_until_idle(url: str) -> None:
-    """Wait for a moment in which no server is in a transaction."""
-    busy = "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND xact_start < now()"
+    """Wait for a moment in which all events are noted as published, and no server is in a transaction."""
     with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
-        eventually(lambda: connection.execute(busy).fetchone() == (0,))
+        eventually(lambda: connection.execute(IDLE).fetchone() == (True,))
 
 
 def test_server_takes_over_from_killed_and_stopped_leader(
