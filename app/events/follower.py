@@ -8,12 +8,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from app.backends.lead import Leads
-from app.events.leader import POLL_SECONDS, LeaderThread
+from app.events.leader import POLL_SECONDS, WAIT_SECONDS, LeaderThread
 from app.store.store import Store
 from app.store.values import Event
-
-WAIT_SECONDS = 0.2
-"""Longest wait for a commit until the thread checks that it still leads, and for a call of ``wake`` that it missed."""
 
 PAGE = 500
 

@@ -19,6 +19,9 @@ log = logging.getLogger(__name__)
 POLL_SECONDS = 1.0
 """Interval between attempts of a server's other processes to get its lock, and pause after an error."""
 
+WAIT_SECONDS = 0.2
+"""Longest wait for a commit until a thread checks that it still leads, and for a call that should have woken it."""
+
 STAND_BY_SECONDS = 0.05
 """Interval at which the process that takes part for its server checks whether it leads."""
 

@@ -28,7 +28,7 @@ from app.backends.notify import CommitCounter
 from app.errors import FleetMapError
 from app.events import cdr, leader, ros_names
 from app.events.bus import BusOptions, connection_error, session_configuration
-from app.events.leader import POLL_SECONDS, LeaderThread
+from app.events.leader import POLL_SECONDS, WAIT_SECONDS, LeaderThread
 from app.events.ros_names import EnvironmentSelector, Keys, Topic
 from app.store.values import Version
 
@@ -40,9 +40,6 @@ FRAME = "map"
 HEARTBEAT_SECONDS = 0.5
 INTERVAL_SECONDS = 0.02
 """Shortest time between two looks at the versions."""
-
-WAIT_SECONDS = 0.2
-"""Longest wait for a commit until the thread checks that it still leads."""
 
 VERSION_POLL_SECONDS = 5.0
 """Maximum interval between two reads of the database: another host may have committed."""

@@ -22,7 +22,7 @@ from tests.cli.conftest import ServerProcess
 
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}
 CLOSED_SECONDS = 6.0
-"""Longest time from a response that ends its connection to that end."""
+"""Longest time from a response that announces the end of its connection to this end."""
 
 PATIENCE_SECONDS = 60.0
 """Time in seconds that a test waits for what must happen, on any machine."""
