@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -97,13 +97,25 @@ def pytest_xdist_auto_num_workers() -> int:
     return len(os.sched_getaffinity(0)) + 2
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Let each worker read the files from another one on: what it compiles, which takes longest, the others find."""
+    report = yield
+    if (worker := getattr(collector.config, "workerinput", None)) and isinstance(collector, pytest.Directory):
+        first = len(report.result) * int(worker["workerid"].removeprefix("gw")) // worker["workercount"]
+        report.result = report.result[first:] + report.result[:first]
+    return report
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest tests: at the end, one worker would wait alone. Others take what is left of its part.
 
     The page's tests stay together, so that few workers need a browser and a server for them.
     """
     folders = [TOP / "tests" / name for name in ("chaos", "web")]
-    items.sort(key=lambda item: [not item.path.is_relative_to(folder) for folder in folders])
+    items.sort(key=lambda item: ([not item.path.is_relative_to(folder) for folder in folders], item.path))
 
 
 def pytest_collection_finish() -> None:
