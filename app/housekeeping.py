@@ -124,11 +124,11 @@ class _Housekeeping:
             store.channels.apply_due_moves(datetime.now(UTC))
             store.channels.advance_rollouts(datetime.now(UTC), next_step)
             store.overlays.end_due(datetime.now(UTC))
-            store.versions.remove_expired_dry_runs()
-            store.drafts.remove_expired()
             store.search_index.refresh(SEARCH_BATCH)
             store.robot_counts.join()
             if is_beat:
+                store.versions.remove_expired_dry_runs()
+                store.drafts.remove_expired()
                 store.sessions.sweep()
                 self._services.jobs.sweep()
             if datetime.now(UTC) >= self._collect_at and self._content.try_acquire():

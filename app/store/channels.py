@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final, Literal
 
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
@@ -28,6 +28,22 @@ from app.store.overlays import CHANGE_CLOSURES, read_closures
 from app.store.pending import check_committed
 from app.store.rollout_robots import OnlineCache, RolloutRobots
 from app.store.values import LATEST, Position, Version, rfc3339
+
+_channel, _owner = tables.channel, tables.environment
+_DUE_MOVES: Final = (
+    select(_owner.c.name.label("environment"), _channel.c.name)
+    .join(_owner, _owner.c.id == _channel.c.environment_id)
+    .where(_channel.c.planned_at <= bindparam("now"), _channel.c.rollout_state.is_distinct_from("waiting"))
+    .where(_owner.c.deleted.is_(None))
+    .where(_owner.c.centre.is_(None) | _channel.c.rollout_state.is_(None))
+    .order_by(_channel.c.planned_at, _owner.c.name, _channel.c.name)
+)
+_IN_ROLLOUT: Final = (
+    select(_channel, _owner.c.name.label("environment"))
+    .join(_owner, _owner.c.id == _channel.c.environment_id)
+    .where(_channel.c.rollout_state.in_(OPEN_ROLLOUTS), _owner.c.deleted.is_(None), _owner.c.centre.is_(None))
+    .order_by(_owner.c.name, _channel.c.name)
+)
 
 _NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 
@@ -184,17 +200,8 @@ class Channels:
 
         A mirror carries out the moves that wait for nothing but their time, since it may be cut off from its centre.
         """
-        table, owner = tables.channel, tables.environment
-        query = (
-            select(owner.c.name.label("environment"), table.c.name)
-            .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.planned_at <= now, table.c.rollout_state.is_distinct_from("waiting"))
-            .where(owner.c.deleted.is_(None))
-            .where(owner.c.centre.is_(None) | table.c.rollout_state.is_(None))
-            .order_by(table.c.planned_at, owner.c.name, table.c.name)
-        )
         with self._database.read() as connection:
-            due = connection.execute(query).all()
+            due = connection.execute(_DUE_MOVES, {"now": now}).all()
         out = []
         for environment, name in due:
             with self._database.write() as connection:
@@ -215,15 +222,8 @@ class Channels:
         decide: chooses the step of a rollout, given the robots of its channel. It is called again inside the
         transaction, so that it decides on the current state; before, counts of large channels may be some seconds old.
         """
-        table, owner = tables.channel, tables.environment
-        query = (
-            select(table, owner.c.name.label("environment"))
-            .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.rollout_state.in_(OPEN_ROLLOUTS), owner.c.deleted.is_(None), owner.c.centre.is_(None))
-            .order_by(owner.c.name, table.c.name)
-        )
         with self._database.read() as connection:
-            rows = connection.execute(query).all()
+            rows = connection.execute(_IN_ROLLOUT).all()
             due = [r for r in rows if _next(connection, r, now, decide, self._online) is not None]
         out = []
         for due_row in due:

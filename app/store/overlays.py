@@ -15,7 +15,7 @@ from contextlib import suppress
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, func, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, func, insert, select, update
 
 from app.errors import Conflict, NotFound
 from app.event_types import EventType
@@ -51,6 +51,16 @@ CHANGE_CLOSURES: Final = frozenset({"overlay.accepted", "overlay.ended"})
 
 MAX_ENDED_PER_CALL: Final = 100
 """Maximum number of overlays that are ended in one call."""
+
+_overlay, _owner = tables.overlay, tables.environment
+_DUE: Final = (
+    select(_overlay.c.id, _overlay.c.state, _owner.c.name.label("environment"))
+    .join(_owner, _owner.c.id == _overlay.c.environment_id)
+    .where(_overlay.c.expires <= bindparam("now"), _overlay.c.state.in_(("pending", "accepted")))
+    .where(_owner.c.deleted.is_(None))
+    .order_by(_overlay.c.expires, _overlay.c.id)
+    .limit(MAX_ENDED_PER_CALL)
+)
 
 
 class Overlays:
@@ -167,16 +177,9 @@ class Overlays:
 
     def end_due(self, now: datetime) -> None:
         """End overlays that are due: pending ones expire, closures are lifted, each with its event."""
-        table, owner = tables.overlay, tables.environment
-        query = (
-            select(table.c.id, table.c.state, owner.c.name.label("environment"))
-            .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.expires <= now, table.c.state.in_(("pending", "accepted")), owner.c.deleted.is_(None))
-            .order_by(table.c.expires, table.c.id)
-            .limit(MAX_ENDED_PER_CALL)
-        )
+        table = tables.overlay
         with self._database.read() as connection:
-            due = connection.execute(query).all()
+            due = connection.execute(_DUE, {"now": now}).all()
         for due_row in due:
             with suppress(NotFound), self._database.write(upkeep=True) as connection:
                 row = environment_row(connection, due_row.environment, lock=True, mirrored=True)

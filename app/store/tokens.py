@@ -9,7 +9,7 @@ import secrets
 from datetime import datetime, timedelta
 from typing import Any, Final, get_args
 
-from sqlalchemy import Row, delete, insert, select, update
+from sqlalchemy import Row, bindparam, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from app.errors import Conflict, Invalid, NotFound, Unavailable
@@ -26,6 +26,9 @@ SECRET_BYTES: Final = 32
 
 USE_INTERVAL: Final = timedelta(hours=1)
 """Minimum time between two stored uses of a token."""
+
+_EXPIRED: Final = tables.token.c.ended.is_(None) & (tables.token.c.expires <= bindparam("now"))
+_ANY_EXPIRED: Final = select(tables.token.c.id).where(_EXPIRED).limit(1)
 
 
 class Tokens:
@@ -144,13 +147,13 @@ class Tokens:
 
     def end_expired(self) -> int:
         """Mark expired tokens as ended, and return how many: they stay so, even if the clock is set back."""
-        table, now = tables.token, self._database.now()
-        expired = table.c.ended.is_(None) & (table.c.expires <= now)
+        now = self._database.now()
         with self._database.read() as connection:
-            if connection.execute(select(table.c.id).where(expired).limit(1)).first() is None:
+            if connection.execute(_ANY_EXPIRED, {"now": now}).first() is None:
                 return 0
         with self._database.write(upkeep=True) as connection:
-            count = int(connection.execute(update(table).where(expired).values(ended=now)).rowcount)
+            ending = update(tables.token).where(_EXPIRED).values(ended=now)
+            count = int(connection.execute(ending, {"now": now}).rowcount)
         log.info("tokens: expired (count=%d, time=%s)", count, rfc3339(now))
         return count
 
