@@ -6,12 +6,14 @@ import contextlib
 import json
 import logging
 import threading
+import time
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
 from app.backends.documents import write_private
 from app.backends.lead import LeadLostError, Leads, Term
+from app.backends.notify import CommitCounter
 from app.errors import FleetMapError
 
 log = logging.getLogger(__name__)
@@ -27,17 +29,26 @@ STAND_BY_SECONDS = 0.05
 
 
 class LeaderThread(ABC):
-    """Thread that works while its process leads. Writes its state to ``NAME.json`` for all processes of the server.
+    """Thread that works after commits while its process leads.
+
+    It writes its state to ``NAME.json`` for all processes of the server.
 
     Args:
+        generation: counter of the commits.
         well: log line when the state becomes ``connected``.
         trouble: start of the log line when the state becomes ``down``.
     """
 
+    interval_seconds = 0.004
+    """Shortest time between two looks at the database, so that a burst of commits costs one."""
+
     _term: Term
     """Term in which the present ``_run_once`` began: it stores nothing in a later one."""
 
-    def __init__(self, data_dir: Path, name: str, leads: Leads, *, well: str, trouble: str) -> None:
+    def __init__(
+        self, generation: CommitCounter, data_dir: Path, name: str, leads: Leads, *, well: str, trouble: str
+    ) -> None:
+        self._generation = generation
         self._data_dir, self._name, self._healthy_state, self._problem = data_dir, name, well, trouble
         self._host_lead, self._lead = leads.host_lead(name), leads.lead(name)
         self._is_new = True
@@ -53,7 +64,8 @@ class LeaderThread(ABC):
 
     def close(self) -> None:
         """Stop the thread, release its resources and then the lead."""
-        self._stop()
+        self._stopping.set()
+        self._wake()
         self._thread.join(15)
         self._release()
         self._lead.release()
@@ -62,10 +74,6 @@ class LeaderThread(ABC):
     @abstractmethod
     def _run_once(self) -> None:
         """Do pending work, then wait for more. Raises FleetMapError while it is down."""
-
-    def _stop(self) -> None:
-        """Have the thread end. Subclasses also end their waits for something else."""
-        self._stopping.set()
 
     @abstractmethod
     def _release(self) -> None:
@@ -106,6 +114,24 @@ class LeaderThread(ABC):
             except Exception:  # noqa: BLE001  logged by _on_unexpected_error
                 self._on_unexpected_error()
                 self._stopping.wait(POLL_SECONDS)
+
+    def _wait_for_commit(self, generation: int, seconds: float) -> None:
+        """Wait for a commit after the one of this number, or for more to do: at most ``seconds``."""
+        start = time.monotonic()
+        while not self._is_ending():
+            age = time.monotonic() - start
+            if self._generation() != generation or age > seconds or self._has_more():
+                self._stopping.wait(self.interval_seconds - age)
+                return
+            self._generation.wait(generation, min(WAIT_SECONDS, seconds))
+
+    def _has_more(self) -> bool:
+        """Whether there is something to do besides what was committed."""
+        return False
+
+    def _wake(self) -> None:
+        """Have the thread look for something to do besides what was committed."""
+        self._generation.wake()
 
     def _is_ending(self) -> bool:
         """Whether to end ``_run_once``: the process stops, or another server may lead or have led meanwhile."""

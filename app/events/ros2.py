@@ -28,7 +28,7 @@ from app.backends.notify import CommitCounter
 from app.errors import FleetMapError
 from app.events import cdr, leader, ros_names
 from app.events.bus import BusOptions, connection_error, session_configuration
-from app.events.leader import POLL_SECONDS, WAIT_SECONDS, LeaderThread
+from app.events.leader import POLL_SECONDS, LeaderThread
 from app.events.ros_names import EnvironmentSelector, Keys, Topic
 from app.store.values import Version
 
@@ -38,9 +38,6 @@ FRAME = "map"
 """Frame id of all maps, the default of Nav2 and topological_navigation."""
 
 HEARTBEAT_SECONDS = 0.5
-INTERVAL_SECONDS = 0.02
-"""Shortest time between two looks at the versions."""
-
 VERSION_POLL_SECONDS = 5.0
 """Maximum interval between two reads of the database: another host may have committed."""
 
@@ -158,6 +155,8 @@ class _PublishedEnvironment:
 class Ros2Publisher(LeaderThread):
     """Thread that publishes maps to ROS 2. One process of all servers publishes; if it dies, another takes over."""
 
+    interval_seconds = 0.02
+
     def __init__(
         self,
         options: Ros2Options,
@@ -169,9 +168,10 @@ class Ros2Publisher(LeaderThread):
         look: LookUpVersions,
         fetch: Fetch,
     ) -> None:
-        super().__init__(data_dir, NAME, leads, well="ROS 2 publisher: connected", trouble="ROS 2 publisher: down")
+        title = "ROS 2 publisher"
+        super().__init__(generation, data_dir, NAME, leads, well=f"{title}: connected", trouble=f"{title}: down")
         self._options, self._bus = options, bus
-        self._generation, self._look_up_versions, self._fetch = generation, look, fetch
+        self._look_up_versions, self._fetch = look, fetch
         self._session: zenoh.Session | None = None
         self._node: Any = None
         self._entities = 0
@@ -186,17 +186,7 @@ class Ros2Publisher(LeaderThread):
         generation = self._generation()
         self._publish_changes(self._look_up_versions())
         self._publish_state({"state": "connected", "topics": len(self._owners)})
-        last_read = time.monotonic()
-        while not self._is_ending():
-            age = time.monotonic() - last_read
-            if self._generation() != generation or age > VERSION_POLL_SECONDS:
-                self._stopping.wait(INTERVAL_SECONDS - age)
-                return
-            self._generation.wait(generation, WAIT_SECONDS)
-
-    def _stop(self) -> None:
-        super()._stop()
-        self._generation.wake()
+        self._wait_for_commit(generation, VERSION_POLL_SECONDS)
 
     def _open(self) -> bool:
         try:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from app.backends.lead import LocalLeads
+from app.backends.notify import CommitCounter
 from app.errors import Unavailable
 from app.events.leader import LeaderThread, read_state
 from tests.events.conftest import eventually
@@ -22,7 +23,8 @@ class Rounds(LeaderThread):
     """Each round calls ``work``, then says that all is well."""
 
     def __init__(self, folder: Path, work: Callable[[], object]) -> None:
-        super().__init__(folder, "some", LocalLeads(folder), well="it goes on", trouble="IT STOPPED")
+        leads = LocalLeads(folder)
+        super().__init__(CommitCounter(folder), folder, "some", leads, well="it goes on", trouble="IT STOPPED")
         self.work, self.rounds, self.stumbles, self.shut = work, 0, 0, 0
 
     def _run_once(self) -> None:
