@@ -49,6 +49,7 @@ class Cluster:
         options += " -c max_connections=80"
         if not self.synced:
             options += " -c fsync=off"  # its files outlive its processes; tests cut no power
+            options += " -c autovacuum=off"  # at any moment, it would give a test statistics, or clean up for it
         command = [str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "60", "-l", str(home / "log")]
         return self.run(*command, "-o", options, "start")
 
