@@ -49,7 +49,6 @@ class Cluster:
         options += " -c max_connections=80"
         if not self.synced:
             options += " -c fsync=off"  # its files outlive its processes; tests cut no power
-            options += " -c autovacuum=off"  # at any moment, it would give a test statistics, or clean up for it
         command = [str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "60", "-l", str(home / "log")]
         return self.run(*command, "-o", options, "start")
 
@@ -139,6 +138,9 @@ def _as_user() -> tuple[list[str], int | None]:
 def postgres_cluster() -> Iterator[Cluster]:
     """Cluster; skips if PostgreSQL or PostGIS is not installed, and fails if CI is set."""
     with running_cluster() as cluster:
+        with cluster.connect() as connection:  # at any moment, autovacuum would give a test statistics
+            connection.execute("ALTER SYSTEM SET autovacuum = off")
+            connection.execute("SELECT pg_reload_conf()")
         yield cluster
 
 
