@@ -101,7 +101,10 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_make_collect_report(
     collector: pytest.Collector,
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Let each worker read the files from another one on: what it compiles, which takes longest, the others find."""
+    """Let each worker begin to read the test files at another one.
+
+    Compiling takes the most time, and a worker need not compile what others have compiled.
+    """
     report = yield
     if (worker := getattr(collector.config, "workerinput", None)) and isinstance(collector, pytest.Directory):
         first = len(report.result) * int(worker["workerid"].removeprefix("gw")) // worker["workercount"]
@@ -112,7 +115,8 @@ def pytest_make_collect_report(
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest tests: at the end, one worker would wait alone. Others take what is left of its part.
 
-    The page's tests stay together, so that few workers need a browser and a server for them.
+    The page's tests stay together, so that few workers need a browser and a server for them. All workers must have the
+    same order, though each begins to read at another file.
     """
     folders = [TOP / "tests" / name for name in ("chaos", "web")]
     items.sort(key=lambda item: ([not item.path.is_relative_to(folder) for folder in folders], item.path))

@@ -42,7 +42,7 @@ class Follower(LeaderThread):
         """Hand over what there is, then wait for a commit."""
         generation = self._generation()
         if not self._hand_over():
-            # Not for ever: a notification may have been lost, and the connection must be checked.
+            # Not forever: a notification may have been lost, and the connection must be checked.
             self._wait_for_commit(generation, POLL_SECONDS)
 
     @abstractmethod

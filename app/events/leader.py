@@ -116,7 +116,7 @@ class LeaderThread(ABC):
                 self._stopping.wait(POLL_SECONDS)
 
     def _wait_for_commit(self, generation: int, seconds: float) -> None:
-        """Wait for a commit after the one of this number, or for more to do: at most ``seconds``."""
+        """Wait until the counter is no longer at ``generation``, or there is more to do; at most ``seconds``."""
         start = time.monotonic()
         while not self._is_ending():
             age = time.monotonic() - start
