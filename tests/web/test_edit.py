@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.web.conftest import TABLET, Open, WebServer
 
@@ -305,21 +305,26 @@ def test_an_ended_session_keeps_the_draft(server: WebServer, edit: Edit) -> None
     site = make_network(server, "ended", a=(10, 10), b=(20, 10), c=(15, 15))
     editing = edit(site)
     page = editing.page
+    checks: list[Route] = []  # their answer comes after the next sign-in
+    page.route("**/checks?*", lambda route: checks.append(route) if route.request.post_data else route.continue_())
     editing.click(15, 10)
     page.get_by_role("button", name="Make one-way").click()
     page.get_by_label("New property", exact=True).fill("speed_limit")
     page.get_by_label("Value of the new property").fill("0.8")
-    page.get_by_role("button", name="Set", exact=True).click()
+    with page.expect_request(lambda request: "speed_limit" in (request.post_data or "")):
+        page.get_by_role("button", name="Set", exact=True).click()
     editing.changes("2 changes")
     review = page.locator("button", has_text=re.compile("^Review$"))
     expect(review).to_be_enabled()
     page.context.clear_cookies()
-    review.dispatch_event("click")  # a check may have opened the dialog before
+    review.click()
     dialog = page.get_by_role("dialog", name="Sign in again")
     expect(dialog).to_be_visible()
     dialog.get_by_label("Token").fill(server.token)
     dialog.get_by_role("button", name="Sign in").click()
     expect(dialog).to_be_hidden()
+    with page.expect_response(lambda answer: answer.status == 401):
+        checks[-1].fulfill(status=401, json={"status": 401, "title": "Not signed in", "detail": "ended"})
     page.get_by_role("button", name=re.compile("^Save ")).click()
     expect(page.get_by_text("Saved as v2")).to_be_visible()
     edges = [one["properties"] for one in features(server, site).values() if one["properties"]["kind"] == "edge"]

@@ -17,7 +17,7 @@ export type Role = "viewer" | "mirror" | "robot" | "editor" | "admin";
 /** Whether the server answered the last request. */
 export const online = signal(true);
 
-/** Number of 401 responses: the session watches it. */
+/** Number of 401 responses in the present session, which watches it. */
 export const unauthenticated = signal(0);
 
 /** Number of times that the server was back, or a session began: what could not be loaded is loaded again. */
@@ -110,7 +110,13 @@ export function isAbort(error: unknown): boolean {
   return error instanceof DOMException && error.name === "AbortError";
 }
 
+/** Counts a 401 response, unless another session began since its request was sent: `returns` was `since` then. */
+export function countRefusal(status: number, since: number): void {
+  if (status === 401 && returns.peek() === since) unauthenticated.value += 1;
+}
+
 async function watchedFetch(input: Request): Promise<Response> {
+  const since = returns.peek();
   let response: Response;
   try {
     response = await fetch(input);
@@ -119,8 +125,8 @@ async function watchedFetch(input: Request): Promise<Response> {
     online.value = false;
     throw ApiError.offline();
   }
+  countRefusal(response.status, since);
   online.value = response.headers.get("fleetmap-offline") === null; // the service worker marks what it kept
-  if (response.status === 401) unauthenticated.value += 1;
   return response;
 }
 

@@ -1,5 +1,5 @@
 /** Uploads with progress, which `fetch` does not report. */
-import { ApiError, asProblem, online, unauthenticated } from "./client";
+import { ApiError, asProblem, countRefusal, online, returns } from "./client";
 
 interface SendOptions {
   headers?: Record<string, string>;
@@ -12,6 +12,7 @@ interface SendOptions {
 export function sendForm<T>(path: string, form: FormData, { headers, signal, onProgress }: SendOptions = {}) {
   return new Promise<T>((resolve, reject) => {
     const call = new XMLHttpRequest();
+    const since = returns.peek();
     const abort = () => call.abort();
     call.open("POST", path);
     call.responseType = "json";
@@ -24,8 +25,8 @@ export function sendForm<T>(path: string, form: FormData, { headers, signal, onP
       reject(ApiError.offline());
     };
     call.onload = () => {
+      countRefusal(call.status, since);
       online.value = true;
-      if (call.status === 401) unauthenticated.value += 1;
       if (call.status >= 200 && call.status < 300) resolve(call.response as T);
       else reject(new ApiError(asProblem(call.response, call)));
     };
