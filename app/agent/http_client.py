@@ -151,7 +151,7 @@ class ServerClient:
         self._http.close()
 
     def interrupt(self) -> None:
-        """Abort requests that wait for a response. Safe to call from any thread or a signal handler."""
+        """Abort requests that wait for a response. Safe to call from any thread."""
         for connection in self._sockets:
             with contextlib.suppress(OSError):
                 socket.socket.shutdown(connection, socket.SHUT_RDWR)

@@ -5,17 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 import sys
 from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli import completion, options, output
+from app.cli.signals import call_at_stop
 from app.errors import Invalid
 
 if TYPE_CHECKING:
@@ -229,12 +228,7 @@ def _required_formats(text: str) -> tuple[str, ...]:
 
 def _run(agent: Agent, *, once: bool) -> None:
     """Run the agent until it is stopped by a signal, or once."""
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        agent.stop()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, stop)
+    call_at_stop(agent.stop)
     try:
         agent.open()
         if once:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
 from contextlib import closing
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli import local, options, output
+from app.cli.signals import call_at_stop
 from app.errors import Invalid, NotFound
 
 if TYPE_CHECKING:
@@ -135,8 +135,7 @@ def _follow(settings: Settings, url: str, token: str, environments: list[str], k
             return
         logging.config.dictConfig(logs.config(settings.log_level, settings.log_format))
         stop = threading.Event()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: stop.set())
+        call_at_stop(stop.set)
         leads.start()
         output.print_result(f"following {centre.url}")
         sys.stdout.flush()
