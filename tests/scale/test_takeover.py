@@ -71,13 +71,17 @@ def check_history(servers: Servers, count: int) -> float:
 
 
 IDLE = """
-SELECT (SELECT position FROM relay WHERE id = 1) = (SELECT position FROM log) AND NOT EXISTS (
-    SELECT FROM pg_stat_activity WHERE datname = current_database() AND xact_start < now())
+SELECT (SELECT position FROM relay WHERE id = 1) = (SELECT position FROM log)
+    AND NOT EXISTS (SELECT FROM environment WHERE search_stale)
+    AND NOT EXISTS (SELECT FROM pg_stat_activity WHERE datname = current_database() AND xact_start < now())
 """
 
 
 def wait_until_idle(url: str) -> None:
-    """Wait for a moment in which all events are noted as published, and no server is in a transaction."""
+    """Wait until no server is in a transaction, nor has something to write: events are relayed, the search is current.
+
+    Rows of a transaction are locked until its server goes on, or PostgreSQL ends it after up to 30 s.
+    """
     with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
         eventually(lambda: connection.execute(IDLE).fetchone() == (True,))
 
@@ -97,6 +101,7 @@ def test_server_takes_over_from_killed_and_stopped_leader(
     for number in (signal.SIGSTOP, signal.SIGKILL):
         leader = servers.leader()
         eventually(lambda: sum(server.leads for server in servers.all) == 1)
+        wait_until_idle(servers.url)
         seconds[number.name] = take_over(servers, listener, leader, lambda s=leader, n=number: s.signal(n))
         servers.all.remove(leader)
         count = len(listener.sequences())
@@ -128,7 +133,7 @@ def test_server_takes_over_from_leader_without_network(
         with zenoh.open(client_config(servers.zenoh)) as robot:
             listener = Listener(robot, "fleetmap/farm/events")
             listener.wait(lambda e: e.sequences() == [1])
-            wait_until_idle(servers.url)  # rows of a transaction are locked until PostgreSQL ends it
+            wait_until_idle(servers.url)
             seconds = take_over(servers, listener, far, lambda: setattr(proxy, "is_silent", True))
             assert listener.sequences() == [1, 2, 3]
         servers.all.remove(far)
