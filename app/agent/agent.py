@@ -133,7 +133,7 @@ class Agent:
         self._folder.close()
 
     def stop(self) -> None:
-        """Request the end of ``run``, from another thread. Not from a signal's handler: it takes locks."""
+        """Request the end of ``run``. Safe to call from any thread, but not in a signal handler: it takes locks."""
         self._stopping.set()
         self._wake.set()
         self._web.interrupt()

@@ -18,12 +18,11 @@ def stop():
 call_at_stop(stop)
 with lock:
     signal.raise_signal(signal.{name})
-sys.exit(7 if stopped.wait(60) else 1)
+sys.exit(0 if stopped.wait(60) else 1)
 """
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_signal_may_come_while_the_main_thread_holds_a_lock(name: str) -> None:
     root = Path(__file__).resolve().parents[2]
-    arguments = [sys.executable, "-c", SCRIPT.format(name=name)]
-    assert subprocess.run(arguments, cwd=root, timeout=120, check=False).returncode == 7
+    subprocess.run([sys.executable, "-c", SCRIPT.format(name=name)], cwd=root, timeout=120, check=True)

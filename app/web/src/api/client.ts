@@ -110,7 +110,7 @@ export function isAbort(error: unknown): boolean {
   return error instanceof DOMException && error.name === "AbortError";
 }
 
-/** Counts a 401 response, unless another session began since its request was sent: `returns` was `since` then. */
+/** Counts a 401 response, unless a session began after its request was sent. since: `returns` at that time. */
 export function countRefusal(status: number, since: number): void {
   if (status === 401 && returns.peek() === since) unauthenticated.value += 1;
 }
