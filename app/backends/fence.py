@@ -21,9 +21,6 @@ LIMIT_IDLE_TIME: Final = "set_config('idle_in_transaction_session_timeout', '200
 So it blocks those who wait for the right for no more than 2 s.
 """
 
-_LIMIT_WORK: Final = "SELECT set_config('idle_in_transaction_session_timeout', '30000', true)"
-"""The same from a transaction's start, as its rows block a successor; with time to compute between statements."""
-
 
 class FenceError(Unavailable):
     """The right to store was lost: somebody else may have it."""
@@ -47,12 +44,6 @@ def fenced_by(fence: Fence) -> Iterator[None]:
         yield
     finally:
         _fences.reset(token)
-
-
-def limit_fenced(connection: Connection) -> None:
-    """Limit how long a transaction on PostgreSQL may stand still, if it needs a right. Call it first."""
-    if _fences.get() and connection.dialect.name == "postgresql":
-        connection.exec_driver_sql(_LIMIT_WORK)
 
 
 def check_fences(connection: Connection) -> None:

@@ -140,7 +140,7 @@ class BackupTarget:
 
     def write_table(self, name: str, columns: Sequence[str], segments: Iterable[bytes]) -> int:
         """Store the rows of a table's segments; returns their number. Raises Damaged, Conflict for an unknown table."""
-        with self._database.write(notify=False, upkeep=True) as connection:
+        with self._database.write(notify=False, upkeep=True, alone=True) as connection:  # waits for segments
             table = _table(connection, name, columns)
             if name in SEEDS:
                 connection.execute(delete(table))

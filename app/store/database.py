@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import orjson
-from sqlalchemy import Connection, Engine, create_engine, event, exc
+from sqlalchemy import Connection, Engine, create_engine, event, exc, func, select
 from sqlalchemy.engine import make_url
 
-from app.backends.fence import check_fences, limit_fenced
+from app.backends.fence import check_fences
 from app.backends.notify import LocalNotifier, Notifier, SharedNotifier, new_number
 from app.backends.room import ROOM_BYTES, check_room
 from app.errors import DISK_FULL_ERRNOS, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
@@ -33,6 +33,12 @@ BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
 RECHECK_SECONDS = 60.0
 """Seconds between two checks of a database that was found damaged."""
+
+MAX_STANDSTILL_SECONDS = 30
+"""Maximum time between two statements of a transaction that writes, after which PostgreSQL ends it.
+
+Others wait for the rows that it has locked, and its server may have stopped. It is enough to compute something.
+"""
 
 KEEPALIVE = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
 """Seconds, and number of probes: PostgreSQL and this process notice within some 10 s that the network is gone.
@@ -182,17 +188,20 @@ class Database:
             yield connection
 
     @contextmanager
-    def write(self, *, notify: bool = True, upkeep: bool = False) -> Iterator[Connection]:
+    def write(self, *, notify: bool = True, upkeep: bool = False, alone: bool = False) -> Iterator[Connection]:
         """Begin a transaction that writes: all or nothing, durable when it ends.
 
         Within a fence (``app.backends.fence``) only who still has the right can commit it. notify: whether caches are
-        notified, on all servers. upkeep: no change by a user, so that it gets no row in the audit log.
+        notified, on all servers. upkeep: no change by a user, so that it gets no row in the audit log. alone: nobody
+        else uses the database, so that it may stand still for any time.
         """
         with self._write_turn(), self.connection() as connection:
             connection.execution_options(write=True)
             number = new_number()
             with connection.begin():
-                limit_fenced(connection)
+                if not self.sqlite and not alone:
+                    limit = f"{MAX_STANDSTILL_SECONDS}s"
+                    connection.execute(select(func.set_config("idle_in_transaction_session_timeout", limit, True)))
                 yield connection
                 caller = None if upkeep else self._record(connection, self.now())
                 if notify:

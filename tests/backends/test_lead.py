@@ -251,19 +251,6 @@ class TestShared:
             former.join()
         assert store.events.relay_position() == 3
 
-    def test_fenced_work_may_stand_still_for_a_limited_time(
-        self, store: Store, open_process: Callable[[], Leads]
-    ) -> None:
-        def limit() -> str:
-            with store._database.write() as connection:
-                return str(connection.exec_driver_sql("SHOW idle_in_transaction_session_timeout").scalar_one())
-
-        lead = open_process().lead("task")
-        eventually(lead.try_acquire)
-        with lead.fenced():
-            assert limit() == "30s"
-        assert limit() == "0"
-
     def test_lead_returns_after_restart_of_the_database(
         self, postgres_cluster: Cluster, open_process: Callable[[], Leads], caplog: pytest.LogCaptureFixture
     ) -> None:

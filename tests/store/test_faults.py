@@ -21,6 +21,7 @@ import pytest
 from app.errors import Damaged, Invalid, NotFound, Unavailable
 from app.model.features import Features
 from app.model.layers import VECTOR_LAYERS, Layers
+from app.store import versions
 from app.store.changes import Changes, Replace
 from app.store.encode import compress, digest
 from app.store.store import Store
@@ -70,6 +71,57 @@ def test_closed_store_keeps_no_connection_that_a_thread_still_uses(database_url:
     store.environments.page()  # by a thread that the end of its process overtook
     assert store._database.engine.pool is pool
     assert pool.checkedin() == 0  # type: ignore[attr-defined]
+
+
+@pytest.mark.postgres
+@pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
+def test_commit_of_a_stopped_server_blocks_others_for_a_limited_time(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stands still right after it has locked the environment: PostgreSQL ends its transaction."""
+    store.environments.create("farm", datum=DATUM)
+    head = store.versions.get("farm").number
+    stops, goes_on = threading.Event(), threading.Event()
+    check_head, refused = versions._check_head, []
+
+    def stand_still(*arguments: Any) -> None:
+        if threading.current_thread() is stopped:
+            stops.set()
+            goes_on.wait(120)
+        check_head(*arguments)
+
+    def commit_late() -> None:
+        with pytest.raises(Unavailable) as caught:
+            save(store, "farm", Replace(TOPOLOGY, network(2)))
+        refused.append(caught.value)
+
+    monkeypatch.setattr(versions, "_check_head", stand_still)
+    monkeypatch.setattr("app.store.database.MAX_STANDSTILL_SECONDS", 1)
+    stopped = threading.Thread(target=commit_late)
+    other = threading.Thread(target=save, args=(store, "farm", Replace(TOPOLOGY, network(3))), daemon=True)
+    stopped.start()
+    try:
+        assert stops.wait(60)
+        other.start()
+        other.join(60)
+        assert not other.is_alive(), "it waits for the environment's row"
+    finally:
+        goes_on.set()
+        stopped.join()
+    assert refused
+    assert store.versions.get("farm").number == head + 1, "only the other commit is stored"
+
+
+@pytest.mark.postgres
+@pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
+def test_writing_transactions_may_stand_still_for_a_limited_time(store: Store) -> None:
+    def limit(**options: bool) -> str:
+        with store._database.write(**options) as connection:
+            return str(connection.exec_driver_sql("SHOW idle_in_transaction_session_timeout").scalar_one())
+
+    assert (limit(), limit(upkeep=True), limit(alone=True)) == ("30s", "30s", "0")
+    with store._database.read() as connection:
+        assert connection.exec_driver_sql("SHOW idle_in_transaction_session_timeout").scalar_one() == "0"
 
 
 def test_kill_9_leaves_old_or_new_state(store: Store):
