@@ -154,7 +154,7 @@ class BackupTarget:
         """Migrate to the schema of this release, and have made anew what the backup leaves out."""
         schema.upgrade_restored(self._database)
         environment, collection, server = tables.environment, tables.collection, tables.server
-        stale = {"indexed": -1, "area_stale": True, "search_version": -1, "search_sequence": -1, "search_updated": None}
+        stale = {"area_stale": True, "search_version": -1, "search_sequence": -1, "search_updated": None}
         with self._database.write(notify=False, upkeep=True) as connection:
             connection.execute(update(environment).values(stale))
             connection.execute(update(collection).values(purges=collection.c.collected + 1))

@@ -9,10 +9,26 @@ from __future__ import annotations
 from typing import Any, Final
 
 import orjson
-from sqlalchemy import ColumnElement, Connection, Select, and_, cast, column, func, literal, or_, select, table, tuple_
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    LargeBinary,
+    Select,
+    and_,
+    cast,
+    column,
+    func,
+    literal,
+    or_,
+    select,
+    table,
+    tuple_,
+)
 from sqlalchemy.dialects.postgresql import TSQUERY
 
 from app.store import tables
+from app.store.column_types import from_wkb
+from app.store.extent import geometry as to_geometry
 from app.store.grams import GRAM, wanted_grams
 from app.store.parts.boxes import split_box
 from app.store.values import Box
@@ -28,6 +44,22 @@ _GRAMS: Final = table("environment_text", column("environment_id"), column("gram
 
 _WHOLE: Final = -1
 """Piece that stands for an environment's extent."""
+
+
+def intersects(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> ColumnElement[bool]:
+    """Return a condition: the row's box, or on PostgreSQL its geometry's, intersects a box in degrees."""
+    conditions: list[ColumnElement[bool]] = []
+    for part in split_box(box):
+        if dialect == "postgresql":
+            shape = from_wkb(literal(to_geometry(part), LargeBinary))
+            conditions.append(func.ST_Intersects(geometry, shape))
+            continue
+        west, south, east, north = part
+        across = table.c.west > table.c.east
+        inside = and_(table.c.west <= east, table.c.east >= west)
+        wrapped = and_(across, or_(table.c.west <= east, table.c.east >= west))
+        conditions.append(and_(table.c.south <= north, table.c.north >= south, or_(and_(~across, inside), wrapped)))
+    return or_(*conditions)
 
 
 def few_environments(connection: Connection, q: str | None, box: Box | None) -> list[ColumnElement[bool]]:

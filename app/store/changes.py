@@ -19,7 +19,6 @@ __all__ = [
     "Changes",
     "Delete",
     "Drop",
-    "IndexRows",
     "Keep",
     "Operation",
     "Prepared",
@@ -88,23 +87,13 @@ class Changes:
 
 
 @dataclass(frozen=True, slots=True)
-class IndexRows:
-    """Changes to the head's spatial index: ids to remove, and (id, box in degrees, WKB in degrees) to put."""
-
-    key: PartKey
-    removed: tuple[str, ...]
-    put: tuple[tuple[str, tuple[float, float, float, float], bytes], ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Prepared:
     """A version ready to be committed on top of version ``base``; plain data, so that it can cross processes.
 
     chunks: hash (hex) -> stored bytes of all chunks that are missing or damaged in the base. blobs: SHA-256 -> content
     of files that belong to the content (resources). changes: counts by layer. changed: whether the root differs from
-    the base's, or the provenance of derived parts is renewed. index: the changes to the index if they are few, else
-    None (the next query updates it). area: KEEP if it is the base's, None if the next query computes it. pending: the
-    dry run or draft that stored the content, which must still exist.
+    the base's, or the provenance of derived parts is renewed. area: KEEP if it is the base's, None if the next query
+    computes it. pending: the dry run or draft that stored the content, which must still exist.
     """
 
     base: int
@@ -117,6 +106,5 @@ class Prepared:
     changes: dict[str, Any]
     changed: bool
     blobs: Mapping[str, bytes] = field(default_factory=dict)
-    index: tuple[IndexRows, ...] | None = None
     area: Area | Literal[Keep.KEEP] | None = None
     pending: Pending | None = None

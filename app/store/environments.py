@@ -27,11 +27,10 @@ from app.store.base import (
     environment_row,
     upsert,
 )
-from app.store.box_index import few_environments
+from app.store.box_index import few_environments, intersects
 from app.store.changes import KEEP
 from app.store.chunks import Chunks
 from app.store.database import Database
-from app.store.index import intersects
 from app.store.manifest import read_version
 from app.store.prepare import frame_changes, summarise, version_root
 from app.store.values import Box, Environment, Version
@@ -81,7 +80,6 @@ class Environments:
                 "root": empty,
                 "sequence": sequence,
                 "datum": None,
-                "indexed": 0,
                 "area_stale": False,
                 "created": now,
                 "updated": now,
@@ -89,12 +87,11 @@ class Environments:
             _insert_environment(connection, name, values)
             row = environment_row(connection, name)
             start = _empty_version(name, empty, checked_text(author, "an author"), now)
-            insert_version(connection, row, start, sequence=sequence, indexed=0, area=KEEP)
+            insert_version(connection, row, start, sequence=sequence, area=KEEP)
             first = None
             if datum is not None or clone is not None:
                 first = replace(_first_version(connection, start, datum, clone), changes=changes)
-                indexed = 0 if first.parts else 1
-                insert_version(connection, row, first, sequence=sequence + 1, indexed=indexed, area=area)
+                insert_version(connection, row, first, sequence=sequence + 1, area=area)
             _append_event(connection, row, "environment.created", sequence, name, author, now, previous=None)
             if first is not None:
                 append_version_event(connection, row, start, first, sequence + 1)
@@ -103,7 +100,7 @@ class Environments:
     def _initial_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
         changes: dict[str, Any] = {}
         if clone is not None:
-            changes, _ = summarise(self._chunks.stage(), {}, {e.key: e for e in clone.parts})
+            changes = summarise(self._chunks.stage(), {}, {e.key: e for e in clone.parts})
         place = datum or (clone.datum if clone else None)
         changes |= template_changes(NO_TEMPLATES, clone.templates if clone else NO_TEMPLATES)
         return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))

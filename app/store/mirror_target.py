@@ -250,7 +250,7 @@ class MirrorTarget:
             for version, sequence in page.versions:
                 if version.number <= row.head:
                     continue
-                insert_version(connection, row, version, sequence=sequence, indexed=row.indexed, area=None)
+                insert_version(connection, row, version, sequence=sequence, area=None)
             if row.head < 0 and not page.versions:
                 raise Untrusted(f"{PAGE_PROBLEM}: {page.name} has no version")
             if page.base is not None:
@@ -336,7 +336,6 @@ def _claim_row(connection: Connection, page: MirrorPage, centre: str) -> Row[Any
         "root": "",
         "sequence": 0,
         "datum": None,
-        "indexed": -1,
         "area_stale": True,
         "created": read_time(members["created"]),
         "updated": read_time(members["updated"]),
@@ -355,7 +354,7 @@ def _clear(connection: Connection, row: Row[Any]) -> None:
     overlay = tables.overlay
     connection.execute(delete(overlay).where(overlay.c.environment_id == row.id, overlay.c.id.not_in(queued)))
     owner = tables.environment
-    values = {"head": -1, "root": "", "sequence": 0, "closures_sequence": 0, "indexed": -1, "area_stale": True}
+    values = {"head": -1, "root": "", "sequence": 0, "closures_sequence": 0, "area_stale": True}
     connection.execute(update(owner).where(owner.c.id == row.id).values(values))
     connection.execute(update(tables.collection).values(purges=tables.collection.c.purges + 1))
 

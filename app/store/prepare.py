@@ -7,29 +7,25 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-import shapely
 
 from app.errors import Invalid, NotFound
 from app.model.frame import Datum, Level
-from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import LAYERS, PART_TYPES, VECTOR_LAYERS, PartKey
 from app.model.templates import NO_TEMPLATES, Templates, template_changes
 from app.store import diff, parts, tree
 from app.store.area import area_after
-from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
-from app.store.diff import CellChanges, FeatureChanges
-from app.store.encode import bounds, compress, from_wkb, pack, root_hash, to_wkb
+from app.store.changes import KEEP, Changes, Delete, Drop, Operation, Prepared, Replace
+from app.store.diff import CellChanges
+from app.store.encode import compress, pack, root_hash
 from app.store.gc_pause import gc_paused
-from app.store.parts.boxes import coordinates, crossing_box
-from app.store.parts.features import Item, edit_features, empty_features
+from app.store.parts.features import edit_features, empty_features
 from app.store.parts.roots import EncodedPart, PartRoot, read_root
 from app.store.tree import ChunkStage
 from app.store.values import PartEntry, Provenance, Version
 
-MAX_INDEX_ROWS: Final = 2000
-"""Maximum number of changed features for an update of the head's index with the commit; else on the next query."""
-
+MAX_COMPARED: Final = 2000
+"""Number of features of a new or emptied part above which they are counted without a comparison."""
 
 IsIntact = Callable[[str], bool]
 """Predicate: whether all stored chunks of a part (its hash) still match their hashes."""
@@ -48,12 +44,10 @@ def prepare_further(
     with gc_paused():
         prepared = _prepare(draft, current, changes, is_intact)
         before, after = ({entry.key: entry for entry in parts} for parts in (base.parts, prepared.parts))
-        summary, _ = summarise(draft, before, after)
+        summary = summarise(draft, before, after)
     summary |= frame_changes(base.datum, prepared.datum, base.levels, prepared.levels)
     summary |= template_changes(base.templates, prepared.templates)
-    return replace(
-        prepared, base=base.number, changes=summary, changed=prepared.root != base.root, index=None, area=None
-    )
+    return replace(prepared, base=base.number, changes=summary, changed=prepared.root != base.root, area=None)
 
 
 def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
@@ -83,13 +77,10 @@ def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIn
     if root == base.root and not renewed:
         same = Prepared(base.number, root, fresh, base.parts, datum, levels, templates, {}, changed=False, area=KEEP)
         return replace(same, blobs=blobs)
-    summary, features = summarise(draft, before, entries, replaced)
+    summary = summarise(draft, before, entries, replaced)
     summary |= frame_changes(base.datum, datum, base.levels, levels)
     summary |= template_changes(base.templates, templates)
     summary |= {"renewed": renewed} if renewed else {}
-    index = None
-    if datum == base.datum and not damaged:
-        index = index_rows(features, datum)
     return Prepared(
         base.number,
         root,
@@ -101,7 +92,6 @@ def _prepare(draft: ChunkStage, base: Version, changes: Changes, is_intact: IsIn
         summary,
         changed=True,
         blobs=blobs,
-        index=index,
         area=None if damaged else area_after(draft, base.parts, listed, base.datum, datum),
     )
 
@@ -238,31 +228,26 @@ def summarise(
     before: Mapping[PartKey, PartEntry],
     after: Mapping[PartKey, PartEntry],
     replaced: Mapping[PartKey, Replace] | None = None,
-) -> tuple[dict[str, Any], dict[PartKey, FeatureChanges] | None]:
-    """Count changes by layer; list the changed features of each vector part (None if too many for the index)."""
+) -> dict[str, Any]:
+    """Count changes by layer."""
     out: dict[str, Any] = {}
-    features: dict[PartKey, FeatureChanges] | None = {}
     keys = differing_keys(before, after)
     names = part_names(sorted(before.keys() | after.keys()))
     for key in keys:
         a, b = before.get(key), after.get(key)
         if key.layer in VECTOR_LAYERS:
             total = out.setdefault(key.layer, {"added": 0, "changed": 0, "deleted": 0})
-            if (a is None or not a.count) and b is not None and b.count > MAX_INDEX_ROWS:
+            if (a is None or not a.count) and b is not None and b.count > MAX_COMPARED:
                 total["added"] += b.count
-                features = None
                 continue
-            if (b is None or not b.count) and a is not None and a.count > MAX_INDEX_ROWS:
+            if (b is None or not b.count) and a is not None and a.count > MAX_COMPARED:
                 total["deleted"] += a.count
-                features = None
                 continue
             changed = diff.features(draft, read_roots(draft, key, before), read_roots(draft, key, after))
             for name, count in changed.counts().items():
                 total[name] += count
             if changed.document:
                 total["document"] = True
-            if features is not None:
-                features[key] = changed
         elif key.layer == "occupancy":
             operation = (replaced or {}).get(key)
             new = operation.part if operation else None
@@ -274,7 +259,7 @@ def summarise(
         else:
             other = diff.diff_other_parts(draft, read_roots(draft, key, before), read_roots(draft, key, after))
             out.setdefault(key.layer, {})[names[key]] = other
-    return out, features
+    return out
 
 
 def cells_of_new_grid(grid: OccupancyGrid) -> CellChanges:
@@ -306,48 +291,6 @@ def frame_changes(
             "to": [{"name": v.name, "elevation": v.elevation} for v in new_levels],
         }
     return out
-
-
-# --- the head's index ---
-
-
-def index_rows(
-    changed: Mapping[PartKey, FeatureChanges] | None, datum: Datum | None, limit: int | None = MAX_INDEX_ROWS
-) -> tuple[IndexRows, ...] | None:
-    """Return the changes to the head's index, None if they are more than ``limit``."""
-    if changed is None:
-        return None
-    count = sum(len(c.added) + len(c.changed) + len(c.deleted) for c in changed.values())
-    if limit is not None and count > limit:
-        return None
-    out = []
-    for key in sorted(changed):
-        c = changed[key]
-        items = {i: c.after[i] for i in (*c.added, *c.changed)}
-        out.append(IndexRows(key, (*c.changed, *c.deleted), located_items(items, datum)))
-    return tuple(out)
-
-
-def located_items(
-    items: Mapping[str, Item], datum: Datum | None
-) -> tuple[tuple[str, tuple[float, float, float, float], bytes], ...]:
-    """Return (id, box in degrees, WKB in degrees) of the items with a position on earth."""
-    chosen = [i for i, item in items.items() if item.anchor == 1 or datum is not None]
-    if not chosen:
-        return ()
-    geometry = from_wkb([items[i].wkb for i in chosen])
-    local = np.array([items[i].anchor == 0 for i in chosen])
-    if datum is not None and local.any():
-        geometry[local] = local_frame(datum).geometries_to_wgs84(geometry[local])
-    boxes = bounds(geometry)
-    wkb = to_wkb(np.asarray(shapely.force_2d(geometry), object))  # the index is two-dimensional
-    out = []
-    for k in np.flatnonzero(np.isfinite(boxes).all(axis=1)).tolist():
-        west, south, east, north = boxes[k].tolist()
-        if east - west > 180.0:
-            west, south, east, north = crossing_box(coordinates(geometry[k]))
-        out.append((chosen[k], (west, south, east, north), bytes(wkb[k])))
-    return tuple(out)
 
 
 # --- new chunks ---

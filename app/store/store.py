@@ -31,7 +31,6 @@ from app.store.edge_changes import EdgeChanges
 from app.store.environments import Environments
 from app.store.fleet_figures import FleetFigures
 from app.store.garbage_collection import GarbageCollector
-from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.made_maps import MadeMaps
 from app.store.mirror_source import MirrorSource
@@ -100,7 +99,6 @@ class Store:
         self.edge_changes = EdgeChanges(database)
         self.events = Outbox(database)
         self.webhooks = Webhooks(database)
-        self.index = SpatialIndex(database, self.chunks)
         self.areas = Areas(database, self.chunks)
         self.search_index = SearchIndex(database, self.chunks)
         self.search = Search(database, self.search_index)

@@ -54,7 +54,7 @@ environment = Table(
     Column("sequence", BigInteger, nullable=False),
     Column("closures_sequence", BigInteger, nullable=False, server_default="0"),
     Column("datum", JSON(none_as_null=True), nullable=True),
-    Column("indexed", Integer, nullable=False),
+    Column("indexed", Integer, nullable=False, default=-1),
     Column("created", UtcDateTime, nullable=False),
     Column("updated", UtcDateTime, nullable=False),
     Column("deleted", UtcDateTime, nullable=True),
@@ -71,12 +71,12 @@ environment = Table(
     Column("edge_sequence", BigInteger, nullable=False, server_default="0"),
 )
 """Environments. head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event
-that changed the closures in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be
-computed from the head before it is read.
+that changed the closures in force. area_stale: whether ``area`` has to be computed from the head before it is read.
+indexed, index_stale: not used, as ``place``.
 
 search_version: the version that ``search_item`` shows; negative while there is none. search_sequence, search_updated:
-``sequence`` and ``updated`` at that time; every change raises one of them. index_stale, search_stale: whether ``place``
-and ``search_item`` may be behind, as the database computes it.
+``sequence`` and ``updated`` at that time; every change raises one of them. search_stale: whether ``search_item``
+may be behind, as the database computes it.
 
 centre, centre_epoch: URL and epoch of the server that a mirror follows, NULL for an environment of this server.
 edge_sequence: number of changes of closures that a mirror made by itself.
@@ -517,7 +517,7 @@ place = Table(
     Column("geometry", WkbGeometry, nullable=False),
     Index("ix_place_feature", "environment_id", "feature"),
 )
-"""The heads' vector items on earth, for queries across environments. Can be rebuilt from the trees at any time."""
+"""Not used: an index that no query read. Servers of the release before may still write it."""
 
 Index("ix_place_geometry", place.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
 Index("ix_place_box", place.c.south, place.c.north, place.c.west, place.c.east)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
@@ -542,16 +542,6 @@ class Delta:
     other: tuple[PartKey, ...] = ()
     datum: bool = False
     levels: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class FeatureHit:
-    """A feature of some environment's head inside a box on earth: box in degrees."""
-
-    environment: str
-    key: PartKey
-    id: str
-    box: Box = field(default=(0.0, 0.0, 0.0, 0.0))
 
 
 class Position(NamedTuple):

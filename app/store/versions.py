@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, bindparam, func, insert, select, update
 from app import traces
 from app.errors import Conflict, Damaged, NotFound, Problem, StaleParent
 from app.model.templates import template_changes
-from app.store import blob_rows, chunks, drafts, dry_runs, index, outbox, parts, tables
+from app.store import blob_rows, chunks, drafts, dry_runs, outbox, parts, tables
 from app.store.area import area_after, write_area
 from app.store.audit import skip_audit
 from app.store.base import (
@@ -72,7 +72,6 @@ def insert_version(
     version: Version,
     *,
     sequence: int,
-    indexed: int,
     area: Area | Literal[Keep.KEEP] | None,
 ) -> None:
     """Write a version's rows and make it the head. The caller has locked the environment's row.
@@ -104,7 +103,6 @@ def insert_version(
             root=version.root,
             sequence=sequence,
             datum=version.datum.as_dict() if version.datum else None,
-            indexed=indexed,
             updated=version.time,
             west=west,
             south=south,
@@ -284,10 +282,7 @@ class Versions:
                 return read_version(connection, row, row.head)
             before = read_version(connection, row, row.head)
             blob_rows.lock(connection, set(prepared.blobs), kept=True)
-            sequence, indexed = row.sequence + 1, row.indexed
-            if prepared.index is not None and row.indexed == row.head:
-                index.apply(connection, row.id, prepared.index)
-                indexed = row.head + 1
+            sequence = row.sequence + 1
             version = Version(
                 environment=row.name,
                 number=row.head + 1,
@@ -304,7 +299,7 @@ class Versions:
                 parts=prepared.parts,
                 templates=prepared.templates,
             )
-            insert_version(connection, row, version, sequence=sequence, indexed=indexed, area=prepared.area)
+            insert_version(connection, row, version, sequence=sequence, area=prepared.area)
             _remember(connection, row.id, idempotency, version.number, now)
             stored = read_version(connection, row, version.number)
             append_version_event(connection, row, before, version, sequence)
@@ -416,7 +411,7 @@ class Versions:
         if changed:
             area = area_after(self._chunks.stage(), head.parts, target.parts, head.datum, target.datum)
             before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
-            changes, _ = summarise(self._chunks.stage(), before, after)
+            changes = summarise(self._chunks.stage(), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
             changes |= template_changes(head.templates, target.templates)
         contents = (target.parts, target.datum, target.levels, target.templates)

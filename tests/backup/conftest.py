@@ -134,7 +134,7 @@ def rows_of(store: Store) -> Rows:
 
 
 MADE_ANEW = {
-    *("indexed", "area_stale", "epoch", "presence_checked"),
+    *("area_stale", "epoch", "presence_checked"),
     *("search_version", "search_sequence", "search_updated"),
 }
 """Columns that a restore changes."""

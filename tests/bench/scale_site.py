@@ -87,8 +87,6 @@ def fill(url: str, folder: Path, environments: int, versions: int) -> None:
             elif versions > SHORT and history is None:
                 history = _read_history(connection, first, versions - NEWEST)
             number += _fill_environment(store, connection, environment, versions, history)
-    with joined(store):
-        store.index.refresh()  # of those with a copied history; commits have done the others
     store.search_index.refresh(environments)
     store.search_index.merge()  # as every day
     store.garbage.collect(GRACE)  # the first one, which looks at everything

@@ -78,7 +78,7 @@ def copy_rows(source: Path, target: Connection) -> None:
                     target.execute(table.insert(), values)
     finally:
         origin.close()
-    target.execute(text("UPDATE environment SET indexed = -1, search_version = -1, area_stale = true"))
+    target.execute(text("UPDATE environment SET search_version = -1, area_stale = true"))
 
 
 @each_release

@@ -63,14 +63,6 @@ def test_committed_dry_run_equals_the_direct_commit(farm: Store) -> None:
     assert (version.number, version.pending, version.sources) == (2, None, dry.sources)
     with pytest.raises(StaleParent):
         commit(farm, dry)
-    hits = {(hit.environment, hit.id) for hit in farm.index.find(box(farm, direct))}
-    assert {i for name, i in hits if name == "farm"} == {i for name, i in hits if name == "direct"} != set()
-
-
-def box(store: Store, version: Version) -> tuple[float, float, float, float]:
-    bounds = store.environments.get(version.environment).bounds
-    assert bounds is not None
-    return bounds
 
 
 def test_dry_run_of_another_head_is_refused(farm: Store) -> None:

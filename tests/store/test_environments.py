@@ -111,9 +111,6 @@ def test_extent_crosses_antimeridian(store: Store, anchor: str):
     assert store.environments.page(bbox=(179.0, -18, -179.0, -16))[0]
     assert store.environments.page(bbox=(-179.99, -18, -179.0, -16))[0]
     assert not store.environments.page(bbox=(-179.0, -18, 179.0, -16))[0]
-    ids = {f.id for f in store.index.find((179.0, -18, -179.0, -16))}
-    assert {"a", "b"} <= ids
-    assert {f.id for f in store.index.find((-180.0, -18, -179.0, -16))} == ids - {"a"}
     inside = store.content.features(store.versions.get("fiji"), OBJECTS, bbox=(179.0, -18, -179.0, -16), crs="wgs84")
     assert {"a", "b"} <= set(inside.ids)
 
@@ -130,47 +127,6 @@ def test_boxes_are_joined_across_antimeridian():
     shapes = [shapely.from_wkb(geometry(b)) for b in ((1, 2, 1, 2), (1, 2, 3, 2), (1, 2, 3, 4), (170, 0, -170, 1))]
     assert [s.geom_type for s in shapes] == ["Point", "LineString", "Polygon", "MultiPolygon"]
     assert geometry(None) is None
-
-
-def test_index_follows_every_head(store: Store):
-    store.environments.create("farm", datum=Datum(53.2, -0.5))
-    save(store, "farm", *replaces(everything()))
-    everywhere = (-180.0, -90.0, 180.0, 90.0)
-
-    def expected() -> set[tuple[str, str]]:
-        out = set()
-        for key, part in store.content.load(store.versions.get("farm")).vector("objects").items():
-            out |= {(key.layer, i) for i, g in zip(part.ids, part.geometry, strict=True) if not g.is_empty}
-        for layer in ("topology", "location", "zones"):
-            for part in store.content.load(store.versions.get("farm")).vector(layer).values():  # type: ignore[arg-type]
-                out |= {(layer, i) for i in part.ids}
-        return out
-
-    def indexed_items() -> set[tuple[str, str]]:
-        return {(f.key.layer, f.id) for f in store.index.find(everywhere, limit=10_000)}
-
-    assert indexed_items() == expected()
-    far = features([("n3", shapely.Point(5000, 0), {})], "local")
-    head = save(store, "farm", Delete(TOPOLOGY, ("n1", "n2")), Put(TOPOLOGY, far))
-    assert indexed_items() == expected()
-    assert ("topology", "n1") not in indexed_items()
-    (moved,) = [f for f in store.index.find(everywhere, layer="topology", limit=10_000) if f.id == "n3"]
-    assert moved.box[0] > -0.43
-    save(store, "farm", datum=Datum(10.0, 20.0))
-    assert indexed_items() == expected()
-    (moved,) = [f for f in store.index.find((19, 9, 21, 11), layer="topology", limit=10_000) if f.id == "n3"]
-    assert moved.box[1] == pytest.approx(10.0, abs=0.01)
-    store.versions.revert("farm", head.number, author="a", message="")
-    many = network(5000)
-    save(store, "farm", Replace(TOPOLOGY, many))
-    assert indexed_items() == expected()
-    assert len(store.index.find(everywhere, limit=7)) == 7
-    save(store, "farm", datum=None)
-    assert indexed_items() == {("objects", "e"), ("objects", "m"), ("location", "fence")}
-    store.index.rebuild()
-    assert indexed_items() == {("objects", "e"), ("objects", "m"), ("location", "fence")}
-    store.environments.delete("farm")
-    assert indexed_items() == set()
 
 
 def test_environment_delete_restore_and_purge(store: Store):

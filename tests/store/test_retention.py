@@ -118,7 +118,6 @@ def test_content_goes_with_collection_and_verify_finds_nothing_wrong(history: St
     result = history.verifier().run()
     assert result.findings == []
     assert result.checked["version"] == 2
-    history.index.rebuild()
     assert history.search_index.refresh(10) >= 0
     head = history.versions.get("farm")
     history.chunks.forget()
@@ -127,12 +126,10 @@ def test_content_goes_with_collection_and_verify_finds_nothing_wrong(history: St
 
 def test_index_behind_a_thinned_version_is_built_afresh(history: Store):
     with history._database.write() as connection:
-        connection.execute(text("UPDATE environment SET indexed = 7, search_version = 7, search_sequence = 0"))
+        connection.execute(text("UPDATE environment SET search_version = 7, search_sequence = 0"))
     assert 7 in thin(history)
     history.garbage.collect(timedelta(0))
-    assert history.index.refresh() == 1
     assert history.search_index.refresh(10) >= 1
-    assert history.index.find((-180, -90, 180, 90), layer="topology")
 
 
 def _channel(store: Store) -> None:
