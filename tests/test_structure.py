@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import dataclasses
 import gc
-from collections import defaultdict
+import re
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -101,6 +102,12 @@ WRITING = {
 """Functions that write files, besides ``open`` with such a mode."""
 
 
+CALLED_FROM_OUTSIDE = {
+    "app/agent/ros/launch/fleetmap_agent.launch.py:generate_launch_description": "by ROS 2's launch",
+    "app/web/build.py:PageBuildHook": "by hatchling",
+}
+"""Names that occur once, with their reasons."""
+
 Nodes = dict[type[ast.AST], list[Any]]
 """The nodes of a syntax tree by their class."""
 
@@ -187,6 +194,31 @@ def test_private_modules_are_imported_in_their_package_only() -> None:
 def is_module(pieces: list[str]) -> bool:
     path = TOP.joinpath(*pieces)
     return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def defined_names(nodes: Nodes) -> Iterator[str]:
+    """Names of functions, classes and constants of a module, and of methods that override none of a base class."""
+    for node in (*functions(nodes), *nodes[ast.ClassDef]):
+        if not node.col_offset and not node.decorator_list:
+            yield node.name
+    for node in (*nodes[ast.Assign], *nodes[ast.AnnAssign]):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        yield from (one.id for one in targets if isinstance(one, ast.Name) and not one.col_offset)
+    for node in nodes[ast.ClassDef]:
+        if not node.bases:
+            methods = [one for one in node.body if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)]
+            yield from (one.name for one in methods if not one.name.startswith("__"))
+
+
+def test_what_only_tests_use_is_not_kept() -> None:
+    """What is defined is named a second time: in the code, or in the documentation of what plug-ins may use."""
+    places = [(TOP / "app").rglob("*.py"), (TOP / "migrations").rglob("*.py"), (TOP / "docs").rglob("*.md")]
+    words = Counter(word for paths in places for path in paths for word in re.findall(r"\w+", path.read_text()))
+    unused = {
+        f"{path}:{name}" for path, nodes in modules("app").items() for name in defined_names(nodes) if words[name] == 1
+    }
+    assert unused - set(CALLED_FROM_OUTSIDE) == set()
+    assert set(CALLED_FROM_OUTSIDE) - unused == set(), "no exceptions any more"
 
 
 def calls_of_writers(nodes: Nodes) -> Iterator[str]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from app.backup.packs import PackReference
-from app.backup.repository import Repository, Snapshot, SnapshotList
+from app.backup.repository import Repository, SnapshotList
 from app.errors import Damaged
 
 
@@ -52,8 +52,3 @@ def _pack_problem(repository: Repository, pack: PackReference) -> str | None:
     except OSError as error:
         return f"the pack {pack.name[:16]}… cannot be read ({type(error).__name__})"
     return None
-
-
-def total_size(snapshots: Sequence[Snapshot]) -> int:
-    """Return the bytes of the packs of all backups, each counted once."""
-    return sum(pack.size for pack in {pack for snapshot in snapshots for pack in snapshot.packs})

@@ -456,13 +456,3 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
             raise Invalid(f"duplicate parameter {name[:80]!r}: give it once", [Problem("duplicate", where=name[:80])])
         out[name] = value
     return out
-
-
-def wait_connected(bus: Bus, seconds: float) -> bool:
-    """Wait until the bus is connected, at most ``seconds``. Return whether it is."""
-    deadline = time.monotonic() + seconds
-    while not bus.ensure_connected():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.05)
-    return True

@@ -136,10 +136,6 @@ class LocalFrame:
         out[:, 0], out[:, 1] = longitude, latitude
         return out
 
-    def yaw_to_heading(self, yaw: float) -> float:
-        """Convert a local yaw (radians, counter-clockwise from +x) to degrees clockwise from north, in [0, 360)."""
-        return (90.0 - math.degrees(yaw) + self.datum.heading) % 360.0
-
     def geometries_to_local(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
         """Convert shapely geometries from degrees to metres. Raises Invalid if one is too far from the datum."""
         return _transform(geometry, self._to_bounded_local)

@@ -99,12 +99,6 @@ def read_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> Mesh:
     return Mesh(vertices, faces, part, names)
 
 
-def load_mesh(data: bytes, name: str, max_faces: int = MAX_FACES) -> tuple[Array, Faces]:
-    """Read a mesh file as (vertices float64 [n, 3] in metres, faces int64 [m, 3]); see ``read_mesh``."""
-    mesh = read_mesh(data, name, max_faces)
-    return mesh.vertices, mesh.faces
-
-
 _ParsedMesh = tuple[Array, Faces, NDArray[np.int64], tuple[tuple[str, ...], ...]]
 
 

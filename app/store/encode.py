@@ -90,7 +90,6 @@ _BINARY: Final = re.compile(rb"[\xc4-\xc6]")
 """Pattern of the first byte of a MessagePack binary, or by chance of text (such as č): then JSON decides."""
 
 LEVEL: Final = 1
-MAX_CHUNK: Final = 2**31 - 1
 
 EMPTY_BOX: Final = (np.inf, np.inf, -np.inf, -np.inf)
 """Box without content: joined with any box it gives that box."""
@@ -327,11 +326,6 @@ def interleave(x: NDArray[np.uint64], y: NDArray[np.uint64]) -> NDArray[np.uint6
     return _spread(x) | (_spread(y) << np.uint64(1))
 
 
-def deinterleave(code: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
-    """Split Morton codes into (x, y)."""
-    return _gather(code), _gather(code >> np.uint64(1))
-
-
 _SPREAD: Final = (
     (16, 0x0000FFFF0000FFFF),
     (8, 0x00FF00FF00FF00FF),
@@ -345,14 +339,6 @@ def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
     out = v.astype(np.uint64)
     for shift, mask in _SPREAD:
         out = (out | (out << np.uint64(shift))) & np.uint64(mask)
-    return out
-
-
-def _gather(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    out = v & np.uint64(_SPREAD[-1][1])
-    for k in range(len(_SPREAD) - 1, -1, -1):
-        mask = _SPREAD[k - 1][1] if k else 0x00000000FFFFFFFF
-        out = (out | (out >> np.uint64(_SPREAD[k][0]))) & np.uint64(mask)
     return out
 
 

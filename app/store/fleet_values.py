@@ -181,10 +181,6 @@ class Robot:
     place: RobotPlace | None = None
     placed: datetime | None = None
 
-    def has_failed_with(self, root: str) -> bool:
-        """Return whether it reports a failure of a version."""
-        return self.report.state == "failed" and self.report.root == root
-
 
 @dataclass(frozen=True, slots=True)
 class FailedRobot:

@@ -124,12 +124,6 @@ class SearchIndex:
         self._apply(plans)
         return len(stale)
 
-    def rebuild(self) -> None:
-        """Have all rows made again from the trees."""
-        with self._database.write(upkeep=True) as connection:
-            connection.execute(update(tables.environment).values(search_version=-1, search_sequence=-1))
-        self._damaged.clear()
-
     def merge(self) -> None:
         """Join the segments of SQLite's indexes of texts, some pages in a transaction: queries read each segment."""
         if not self._database.sqlite:

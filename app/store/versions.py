@@ -358,14 +358,6 @@ class Versions:
                 out.update({r.name: r.sha256 for r in connection.execute(query)})
         return out
 
-    def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
-        """Add files of an upload without changes to a version; returns the version with all of its files."""
-        with self._database.write() as connection:
-            row = environment_row(connection, environment, lock=True)
-            read_version(connection, row, version)
-            _append_sources(connection, row.id, version, sources)
-            return read_version(connection, row, version)
-
     def revert(
         self,
         environment: str,

@@ -193,11 +193,6 @@ class _IdatWriter:
         self.out.seek(0, io.SEEK_END)
 
 
-def cells_to_png(cells: Bytes) -> bytes:
-    """Encode canonical cells (bottom row first) as grey PNG: values 0…100, 255 unknown; the map's top row on top."""
-    return encode_png(cells, flip=True)
-
-
 def overlay_png(grid: OccupancyGrid) -> bytes:
     """Encode a grid as PNG overlay for a map: occupied black, free white, in between grey, unknown transparent.
 

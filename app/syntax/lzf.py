@@ -20,7 +20,6 @@ MAX_INTERPRETED_BYTES = 2**22
 """Size in bytes up to which compiling takes longer than it saves."""
 
 MAX_MATCH_BYTES = 264
-MAX_OFFSET_BYTES = 8192
 TABLE_BITS = 14
 
 Bytes = NDArray[np.uint8]

@@ -29,6 +29,7 @@ from tests.api.conftest import Api, parts, running, settings_for
 from tests.events.conftest import eventually
 from tests.preloaded import run_preloaded
 from tests.seaweed import Fault, FaultyStore, Seaweed
+from tests.store.samples import add_sources
 
 pytestmark = pytest.mark.postgres
 
@@ -218,7 +219,7 @@ def test_verify_repairs_files_wherever_they_are(settings: list[Settings], tmp_pa
     (tmp_path / "originals").mkdir()
     (tmp_path / "originals" / "cloud.bin").write_bytes(data)
     name = store.blobs.put(data)
-    store.versions.add_sources("farm", 0, [Source("cloud.bin", len(data), name)])
+    add_sources(store, "farm", 0, Source("cloud.bin", len(data), name))
     store.blobs.files.write({f"{name[:2]}/{name}": data[1:] + b"x"})
     for key in ("intact", "damaged", "lost"):
         store.made_maps.publish(key, b"{}", [key.encode()])
@@ -261,7 +262,7 @@ def test_collection_beside_uploads_of_another_server_loses_nothing(settings: lis
             for k in range(30):
                 name = uploading.blobs.put(contents[k % 3])
                 try:
-                    uploading.versions.add_sources("farm", 0, [Source(f"f{k}", 70_000, name)])
+                    add_sources(uploading, "farm", 0, Source(f"f{k}", 70_000, name))
                 except Unavailable as error:
                     assert "send it again" in error.detail
                 else:

@@ -296,7 +296,7 @@ def test_lookup_table_is_applied_when_writing_png() -> None:
 
 def test_png_of_cells_has_the_top_row_on_top() -> None:
     cells = np.array([[0, 100, 255], [1, 2, 3]], np.uint8)
-    image = Image.open(io.BytesIO(images.cells_to_png(cells)))
+    image = Image.open(io.BytesIO(images.encode_png(cells, flip=True)))
     assert image.mode == "L"
     assert np.asarray(image).tolist() == [[1, 2, 3], [0, 100, 255]]
 
@@ -315,7 +315,7 @@ def test_png_writing_memory_stays_near_output_size() -> None:
     cells.flags.writeable = False
     tracemalloc.start()
     try:
-        images.cells_to_png(cells)
+        images.encode_png(cells, flip=True)
         assert tracemalloc.get_traced_memory()[1] < cells.nbytes
     finally:
         tracemalloc.stop()

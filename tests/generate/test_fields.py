@@ -23,7 +23,7 @@ from app.model.frame import GROUND, Datum
 from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED
 from app.model.layers import Layers, PartKey
-from app.model.meshes import load_mesh
+from app.model.meshes import read_mesh
 from tests.api.conftest import Api
 from tests.generate import site_checks
 
@@ -172,10 +172,10 @@ def test_orchard_trees_follow_parameters() -> None:
 
 
 def test_crown_mesh_is_closed_ball() -> None:
-    vertices, faces = load_mesh(_trees.crown_mesh(), "crown.stl")
-    corners = vertices[faces]
-    assert len(faces) == 80
-    assert np.linalg.norm(vertices, axis=1) == pytest.approx(1.0, abs=1e-5)
+    mesh = read_mesh(_trees.crown_mesh(), "crown.stl")
+    corners = mesh.vertices[mesh.faces]
+    assert len(mesh.faces) == 80
+    assert np.linalg.norm(mesh.vertices, axis=1) == pytest.approx(1.0, abs=1e-5)
     volume = np.einsum("ij,ij->i", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2]).sum() / 6
     assert 3.6 < volume < 4 / 3 * math.pi, "its sides look outwards"
 

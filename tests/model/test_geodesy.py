@@ -103,16 +103,6 @@ def test_local_axes_follow_heading() -> None:
     assert right.to_local(north)[0, 0] < -100
 
 
-@pytest.mark.parametrize("heading", [0.0, 45.0, -90.0, 213.0])
-@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5, math.pi])
-def test_yaw_converts_to_heading(heading: float, yaw: float) -> None:
-    frame = LocalFrame(Datum(53.0, 0.1, 0.0, heading))
-    (start, end) = frame.to_wgs84(np.array([[0.0, 0.0], [math.cos(yaw), math.sin(yaw)]]))
-    azimuth, _, _ = WGS84.inv(*start, *end)
-    assert abs((frame.yaw_to_heading(yaw) - azimuth + 180) % 360 - 180) < 1e-5
-    assert 0 <= frame.yaw_to_heading(yaw) < 360
-
-
 def test_points_across_antimeridian_stay_neighbours() -> None:
     for longitude, other in ((179.9999, -179.9999), (-179.9999, 179.9999), (180.0, -179.9998), (-180.0, 179.9998)):
         frame = LocalFrame(Datum(-16.8, longitude))

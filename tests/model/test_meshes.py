@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from app.errors import Invalid, TooLarge
-from app.model.meshes import Mesh, load_mesh, read_mesh
+from app.model.meshes import Mesh, read_mesh
 
 
 def stl(*triangles: Any, count: int | None = None, head: bytes = b"") -> bytes:
@@ -88,10 +88,10 @@ def test_real_meshes_equal_trimesh(shared: Path, facts_json: dict[str, Any]) -> 
 
 def test_turtlebot_wall_is_in_inches_and_unrotated(shared: Path) -> None:
     path = shared / "data/gazebo_sdf/turtlebot3_world/models/turtlebot3_world/meshes/wall.dae"
-    vertices, faces = load_mesh(path.read_bytes(), path.name)
-    assert len(faces) == 48
-    assert vertices.max(axis=0) == pytest.approx([450 * 0.0254, 519.615 * 0.0254, 200 * 0.0254])
-    assert vertices.min(axis=0) == pytest.approx([-450 * 0.0254, -519.615 * 0.0254, 0])
+    mesh = read_mesh(path.read_bytes(), path.name)
+    assert len(mesh.faces) == 48
+    assert mesh.vertices.max(axis=0) == pytest.approx([450 * 0.0254, 519.615 * 0.0254, 200 * 0.0254])
+    assert mesh.vertices.min(axis=0) == pytest.approx([-450 * 0.0254, -519.615 * 0.0254, 0])
 
 
 @pytest.mark.parametrize(
@@ -105,8 +105,8 @@ def test_turtlebot_wall_is_in_inches_and_unrotated(shared: Path) -> None:
     ],
 )
 def test_stl_is_read_as_binary_and_text(data: bytes) -> None:
-    vertices, faces = load_mesh(data, "a.STL")
-    assert vertices[faces].tolist() == [[list(map(float, v)) for v in TRIANGLE]]
+    mesh = read_mesh(data, "a.STL")
+    assert mesh.vertices[mesh.faces].tolist() == [[list(map(float, v)) for v in TRIANGLE]]
 
 
 def test_obj_reads_polygons_negative_indexes_and_parts() -> None:
@@ -237,7 +237,7 @@ BOMB = (
 def test_rejected_mesh_names_file(name: str, data: bytes, message: str) -> None:
     start = time.process_time()
     with pytest.raises(Invalid) as caught:
-        load_mesh(data, f"models/{name}")
+        read_mesh(data, f"models/{name}")
     assert message in caught.value.detail
     assert caught.value.detail.startswith(f"models/{name} ")
     assert caught.value.problems[0].file == f"models/{name}"
@@ -254,9 +254,9 @@ def test_rejected_mesh_names_file(name: str, data: bytes, message: str) -> None:
     ],
 )
 def test_mesh_triangles_are_limited(name: str, data: bytes) -> None:
-    assert len(load_mesh(data, name, 11)[1]) == 11
+    assert len(read_mesh(data, name, 11).faces) == 11
     with pytest.raises(TooLarge, match=f"{name} has .* triangles; the limit is 10"):
-        load_mesh(data, name, 10)
+        read_mesh(data, name, 10)
 
 
 def test_large_mesh_is_read_quickly() -> None:

@@ -14,9 +14,11 @@ from app.model.grid import OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
 from app.model.voxels import VoxelMap
+from app.store.base import environment_row
 from app.store.changes import Changes, Operation, Replace
 from app.store.store import Store
-from app.store.values import Provenance, Version
+from app.store.values import Provenance, Source, Version
+from app.store.versions import _append_sources
 
 DATUM = Datum(53.2, -0.5, 12.0, 10.0)
 TOPOLOGY = PartKey("topology", "ground", NETWORK)
@@ -125,6 +127,14 @@ def save(store: Store, environment: str, *operations: Operation, base: Version |
     """Prepare on the head and commit."""
     prepared = store.versions.prepare(base or store.versions.get(environment), Changes(tuple(operations), **frame))
     return store.versions.commit(environment, prepared, author="ann", message="edit")
+
+
+def add_sources(store: Store, environment: str, number: int, *sources: Source) -> Version:
+    """Add files to a version, as an upload without changes does to the head; returns the version."""
+    with store._database.write() as connection:
+        row = environment_row(connection, environment, lock=True)
+        _append_sources(connection, row.id, number, sources)
+    return store.versions.get(environment, number)
 
 
 def rows(f: Features) -> dict[str, tuple[str, Any, bool]]:

@@ -18,7 +18,7 @@ from app.store.blob_rows import BlobRow, select_rows
 from app.store.changes import Changes, Drop, Replace
 from app.store.store import Store
 from app.store.values import Source
-from tests.store.samples import TOPOLOGY, grid, network, save
+from tests.store.samples import TOPOLOGY, add_sources, grid, network, save
 
 HEIGHT, WIDTH = 1000, 2500
 
@@ -174,7 +174,7 @@ def test_versions_of_an_older_release_are_not_collected(store: Store) -> None:
     store.garbage.collect(timedelta(0))
     save(store, "farm", Replace(TOPOLOGY, network(300)))
     name = store.blobs.put(b"s" * 100)
-    store.versions.add_sources("farm", 1, [Source("s", 100, name)])
+    add_sources(store, "farm", 1, Source("s", 100, name))
     with store._database.write() as connection:
         connection.exec_driver_sql("UPDATE chunk SET kept = false, used = 5")
         connection.exec_driver_sql("UPDATE blob SET kept = false, used = 5")

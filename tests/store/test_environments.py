@@ -19,7 +19,19 @@ from app.store.changes import Delete, Put, Replace
 from app.store.extent import extent, geometry, join
 from app.store.store import Store
 from app.store.values import PartEntry, Provenance
-from tests.store.samples import DATUM, GRID, OBJECTS, TOPOLOGY, everything, grid, network, replaces, rows, save
+from tests.store.samples import (
+    DATUM,
+    GRID,
+    OBJECTS,
+    TOPOLOGY,
+    add_sources,
+    everything,
+    grid,
+    network,
+    replaces,
+    rows,
+    save,
+)
 
 
 def test_environment_create_describe_and_find(store: Store):
@@ -169,7 +181,7 @@ def test_clone_shares_content_and_has_separate_history(store: Store):
     from app.store.values import Source
 
     save(store, "farm", *replaces(everything()))
-    store.versions.add_sources("farm", 2, [Source("o", 4, digest)])
+    add_sources(store, "farm", 2, Source("o", 4, digest))
     clone = store.environments.create("copy", clone=store.versions.get("farm"), author="ann")
     assert (clone.head, clone.root, clone.datum) == (1, store.versions.get("farm").root, DATUM)
     version = store.versions.get("copy")

@@ -30,6 +30,7 @@ from tests.store.samples import (
     DATUM,
     GRID,
     TOPOLOGY,
+    add_sources,
     assert_same_layers,
     everything,
     grid,
@@ -314,7 +315,7 @@ def test_recover_removes_remains_of_killed_upload(store: Store):
         assert [workspace] == temporary(store)
         assert (workspace / "half").exists()
     assert temporary(store) == []
-    store.versions.add_sources(store.environments.create("farm").name, 0, [Source("z", 70_000, name)])
+    add_sources(store, store.environments.create("farm").name, 0, Source("z", 70_000, name))
     store.garbage.collect(timedelta(days=1))
     assert not list((store.blob_dir / "packs").iterdir()), "the first collection also looks for files without a row"
     assert store.blobs.get(name) == b"z" * 70_000

@@ -22,7 +22,7 @@ from app.store.store import Store
 from app.store.values import Idempotency, Source, Version
 from app.store.versions import insert_sources
 from tests.store.conftest import NOW, Clock
-from tests.store.samples import GRID, TOPOLOGY, grid, network, save
+from tests.store.samples import GRID, TOPOLOGY, add_sources, grid, network, save
 
 RULE = Rule(all_days=30, daily_days=60, last=2)
 STRICT = Rule(all_days=1, daily_days=0, last=1)
@@ -273,8 +273,8 @@ def _grid(seed: int) -> Changes:
 def test_files_of_thinned_versions_go_and_shared_ones_stay(history: Store):
     names = {n: history.blobs.put(bytes([n]) * 3000) for n in (5, 6, 20)}
     for n in (5, 6, 20):
-        history.versions.add_sources("farm", n, [Source(f"{n}.yaml", 3000, names[n], "tmap2", used=True)])
-    history.versions.add_sources("farm", 20, [Source("again.yaml", 3000, names[6], "tmap2")])
+        add_sources(history, "farm", n, Source(f"{n}.yaml", 3000, names[n], "tmap2", used=True))
+    add_sources(history, "farm", 20, Source("again.yaml", 3000, names[6], "tmap2"))
     thin(history)
     history.garbage.collect(timedelta(0))
     with pytest.raises(NotFound):
@@ -311,7 +311,7 @@ def test_old_files_of_kept_versions_go_only_if_layers_have_their_content(history
     assert history.content.load(history.versions.get("farm", 3)).parts, "the version itself is kept"
     # the same file again: it is stored again
     assert history.blobs.put(b"a" * 500) == blobs["a"]
-    again = history.versions.add_sources("farm", 3, sources(("a", "tmap2", True)))
+    again = add_sources(history, "farm", 3, *sources(("a", "tmap2", True)))
     assert [(s.name, s.removed) for s in again.sources][:1] == [("a", None)]
     history.garbage.collect(timedelta(0))
     assert history.blobs.get(blobs["a"]) == b"a" * 500

@@ -29,6 +29,7 @@ from tests.store.samples import (
     GRID,
     OBJECTS,
     TOPOLOGY,
+    add_sources,
     assert_same_layers,
     assert_same_part,
     everything,
@@ -113,7 +114,7 @@ def test_replace_with_same_content_changes_nothing(farm: Store):
     assert same.number == first.number
     assert [(s.name, s.used) for s in same.sources] == [("again.txt", False)]
     assert farm.versions.get("farm").number == first.number
-    assert farm.versions.add_sources("farm", first.number, [Source("again.txt", 5, digest)]).sources == same.sources
+    assert add_sources(farm, "farm", first.number, Source("again.txt", 5, digest)).sources == same.sources
 
 
 def edits(seed: int) -> Callable[[Store], None]:
@@ -569,7 +570,7 @@ def test_version_lists_sources_and_provenance(farm: Store):
     edited = save(farm, "farm", Put(TOPOLOGY, features([("q", None, {})], "local"), Provenance("raw", "edit")))
     assert edited.part(TOPOLOGY).provenance.sources == ("a.yaml",)  # type: ignore[union-attr]
     with pytest.raises(Unavailable, match="send it again"):
-        farm.versions.add_sources("farm", version.number, [Source("lost", 1, "0" * 64)])
+        add_sources(farm, "farm", version.number, Source("lost", 1, "0" * 64))
     with pytest.raises(Invalid, match="NUL"):
         farm.versions.commit("farm", prepared, author="ann", message="a\x00b")
 
@@ -605,7 +606,7 @@ def test_datum_change_moves_no_item(farm: Store):
 def test_garbage_collection_keeps_content_of_versions(farm: Store):
     a = save(farm, "farm", *replaces(everything()))
     digest = farm.blobs.put(b"original")
-    farm.versions.add_sources("farm", a.number, [Source("o", 8, digest)])
+    add_sources(farm, "farm", a.number, Source("o", 8, digest))
     save(farm, "farm", *(Drop(key) for key in everything()))
     farm.versions.prepare(a, Changes((Replace(TOPOLOGY, network(7)),)))
     removed = farm.garbage.collect(timedelta(0))
@@ -621,7 +622,7 @@ def test_garbage_collection_removes_all_unused_content(farm: Store):
     files = [bytes([k]) * 1000 for k in range(20)]
     digests = farm.blobs.put_many([*files, b"x" * 200_000])
     assert farm.garbage.collect(timedelta(hours=1)) == {"chunks": 0, "blobs": 0, "bytes": 0, "temporary": 0}
-    farm.versions.add_sources("farm", 2, [Source("keep", 1000, digests[3])])
+    add_sources(farm, "farm", 2, Source("keep", 1000, digests[3]))
     removed = farm.garbage.collect(timedelta(0))
     assert removed["blobs"] == 20
     assert removed["bytes"] == 19_000 + 200_000

@@ -49,7 +49,6 @@ class Document:
 
 _ITEMS = re.compile(r"<\?items ([0-9]+)\?>")
 _PREFIX = re.compile(r"[<\s]/?([\w.-]+):[\w.-]+(?=[\s=>/])")
-_DECLARED = re.compile(r"xmlns:([\w.-]+)=")
 _ROOT = re.compile(r"<((?:[\w.-]+:)?([\w.-]+))((?:\s[^>]*?)?)(/?)>")
 _TITLE = re.compile(r"<(?:[\w.-]+:)?name>([^<]*)</")
 _XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")

@@ -40,7 +40,6 @@ BINARY_FILE = b"# Octomap OcTree binary file"
 FULL_FILE = b"# Octomap OcTree file"
 COMMENTS = ("# (feel free to add / change comments, but leave the first line as it is!)", "#")
 LEGACY = struct.Struct("<IdI")
-LEGACY_TYPE = 3
 
 OCTREE = "OcTree"
 COLOR_OCTREE = "ColorOcTree"
