@@ -16,6 +16,7 @@ import hashlib
 import logging
 import socket
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -37,6 +38,9 @@ LEASE_SECONDS: Final = 2.0
 
 ROUND_SECONDS: Final = 0.25
 """Interval of a server's heartbeats, and of its attempts to get leads that others have."""
+
+
+POLL_SECONDS: Final = 0.05
 
 
 class LeadLostError(FenceError):
@@ -93,6 +97,16 @@ class Lead(ABC):
     @abstractmethod
     def try_acquire(self) -> bool:
         """Take part in the election; return whether this process has the lead."""
+
+    def acquire(self, seconds: float) -> Term | None:
+        """Wait for the lead, at most so long; return the term, None if another process keeps the lead."""
+        deadline = time.monotonic() + seconds
+        while not self.try_acquire() or (term := self.term) is None:
+            if time.monotonic() > deadline:
+                self.release()
+                return None
+            time.sleep(POLL_SECONDS)
+        return term
 
     @abstractmethod
     def release(self) -> None:

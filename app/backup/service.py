@@ -13,7 +13,7 @@ from typing import Final
 from app.backends.archive_file import ArchiveFiles
 from app.backends.blobs import BlobFiles
 from app.backends.destinations import is_foreign, open_destination, shown
-from app.backends.lead import Lead, LeadLostError, Leads
+from app.backends.lead import LeadLostError, Leads
 from app.backup.check import PlaceCheck, check_place
 from app.backup.create import BackupWriter, KeyBundle
 from app.backup.pace import Pace, current_times
@@ -159,29 +159,28 @@ class BackupService:
     def _content_held(self) -> Iterator[Callable[[], None]]:
         """Hold off garbage collection and other backups; the function raises Unavailable if that was lost."""
         lead = self._leads.lead(CONTENT_LEAD)
-        deadline = time.monotonic() + self._wait_seconds
-        while not lead.try_acquire():
-            if time.monotonic() > deadline:
-                lead.release()
-                raise Conflict("another backup or a garbage collection is running: try again later")
-            time.sleep(0.05)
+        first = lead.acquire(self._wait_seconds)
+        if first is None:
+            raise Conflict("another backup or a garbage collection is running: try again later")
+        term = first
+
+        def guard() -> None:
+            """A backup takes hours, in which the connection may be lost: it goes on if nobody else had the lead."""
+            nonlocal term
+            if term.goes_on:
+                return
+            again = lead.acquire(self._wait_seconds)
+            if again is None or again.number != term.number + 1:
+                raise LeadLostError(
+                    "the connection to the database was lost, and content could have been removed meanwhile: the "
+                    "backup was given up, run it again"
+                )
+            term = again
+
         try:
-            yield _guard_of(lead)
+            yield guard
         finally:
             lead.release()
-
-
-def _guard_of(lead: Lead) -> Callable[[], None]:
-    term = lead.term
-
-    def guard() -> None:
-        if term is None or not term.goes_on:
-            raise LeadLostError(
-                "the connection to the database was lost for seconds, so content could have been removed meanwhile: "
-                "the backup was given up, run it again"
-            )
-
-    return guard
 
 
 def _encrypted_to(recipients: Sequence[str]) -> str:

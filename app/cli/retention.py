@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import replace
 from datetime import timedelta
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from app.store.retention import EnvironmentPlan
     from app.store.retention_rule import Rule
     from app.store.store import Store
+
+ALONE_SECONDS: Final = 3.0
+"""Maximum time until a lead of a server that was killed is free."""
 
 
 def retention(
@@ -108,9 +111,10 @@ def _alone(settings: Settings) -> Iterator[None]:
     from app.store.garbage_collection import CONTENT_LEAD
 
     with closing(open_leads(settings.direct_database, settings.data_dir)) as leads:
-        if not leads.lead("housekeeping").try_acquire():
+        leads.start()
+        if leads.lead("housekeeping").acquire(ALONE_SECONDS) is None:
             raise Conflict("a server uses this data: stop it, or omit --now")
-        if not leads.lead(CONTENT_LEAD).try_acquire():
+        if leads.lead(CONTENT_LEAD).acquire(ALONE_SECONDS) is None:
             raise Conflict("a backup of this data is running: wait until it has ended, or omit --now")
         yield
 

@@ -80,6 +80,17 @@ def test_one_process_has_the_lead(open_process: Callable[[], Leads]) -> None:
     eventually(one.try_acquire)
 
 
+def test_lead_is_waited_for(open_process: Callable[[], Leads]) -> None:
+    one, two = open_process().lead("task"), open_process().lead("task")
+    term = one.acquire(60)
+    assert term is not None
+    assert term.goes_on
+    assert two.acquire(0.6) is None
+    one.release()
+    assert two.acquire(60) is not None, "the first one takes part no more"
+    assert one.acquire(0) is None
+
+
 def test_host_lead_is_independent_of_other_servers(open_process: Callable[[], Leads]) -> None:
     leads = open_process()
     assert leads.host_lead("task").try_acquire()

@@ -17,7 +17,7 @@ import pytest
 
 from app.backends.blob_s3 import S3Files
 from app.backends.documents import FileDocument
-from app.backends.lead import LocalLead, open_leads
+from app.backends.lead import LeadLostError, LocalLead, open_leads
 from app.backup.keys import collect_keys, key_documents
 from app.backup.repository import Snapshot
 from app.backup.retention import parse_rule
@@ -29,6 +29,7 @@ from app.store.blob_rows import BlobRow
 from app.store.garbage_collection import CONTENT_LEAD
 from app.store.store import Store
 from tests.backup.conftest import NewStore, back_up, fill, restore_into, rows_of
+from tests.events.conftest import eventually
 from tests.postgres import Cluster
 from tests.store.samples import GRID, grid, replaces, save
 
@@ -460,9 +461,40 @@ def test_backup_that_lost_its_hold_is_given_up(
         return real()
 
     monkeypatch.setattr(sqlite_store.backup_source, "chunk_names", chunk_names)
-    with pytest.raises(Exception, match="the backup was given up"):
-        back_up(sqlite_store, tmp_path / "backup", tmp_path / "data")
+    with pytest.raises(LeadLostError, match="the backup was given up"):
+        back_up(sqlite_store, tmp_path / "backup", tmp_path / "data", wait=0.1)
     assert not list((tmp_path / "backup").glob("snapshots/*"))
+
+
+@pytest.mark.postgres
+@pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
+@pytest.mark.parametrize("others", [0, 1])
+def test_backup_outlives_a_lost_connection_unless_another_process_led_meanwhile(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, others: int
+) -> None:
+    """As after some seconds in which the process stood still, or a restart of the database."""
+    real = store.backup_source.chunk_names
+
+    def chunk_names() -> Iterator[list[bytes]]:
+        monkeypatch.setattr(store.backup_source, "chunk_names", real)
+        with store._database.write(upkeep=True) as connection:
+            connection.exec_driver_sql("UPDATE lead SET term = term + %s", (others,))
+        with store._database.read() as connection:
+            ended = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = current_database() AND "
+            assert connection.exec_driver_sql(ended + "application_name = 'fleetmap lead'").scalars().all() == [True]
+            query = "SELECT term FROM lead WHERE name = %s"
+            eventually(lambda: connection.exec_driver_sql(query, (CONTENT_LEAD,)).scalar() == 2 + others)
+        return real()
+
+    monkeypatch.setattr(store.backup_source, "chunk_names", chunk_names)
+    if others:
+        with pytest.raises(LeadLostError, match="the backup was given up"):
+            back_up(store, tmp_path / "backup", tmp_path / "data")
+        return
+    result = back_up(store, tmp_path / "backup", tmp_path / "data")
+    assert result.snapshot.damaged == ()
+    with opened_place(str(tmp_path / "backup"), tmp_path, key=lambda _: None) as repository:
+        assert verify_place(repository).problems == ()
 
 
 def test_last_backup_is_recorded(store: Store, tmp_path: Path, empty_store: NewStore) -> None:

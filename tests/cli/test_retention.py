@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,23 @@ def test_dry_run_then_removal(folder: Path, capfd: pytest.CaptureFixture[str]) -
     assert done["environments"][0]["thinned"] == []
     assert done["stored_bytes_after"] == plan["stored_bytes"] - plan["removable_bytes"]
     assert run(["verify", "--data-dir", str(folder)]) == 0
+
+
+@pytest.mark.postgres
+def test_removal_at_once_on_postgresql(postgres_url: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with closing(Store(postgres_url, tmp_path / "blobs")) as store:
+        store.migrate()
+        store.blobs.prepare()
+        store.environments.create("farm")
+    arguments = ("--database-url", postgres_url, "--all-days", "30", "--now")
+    status, done = retention(tmp_path, capfd, *arguments)
+    assert (status, done["environments"][0]["thinned"]) == (0, [])
+    with closing(open_leads(postgres_url, tmp_path)) as leads:
+        leads.start()
+        assert leads.lead("housekeeping").acquire(60) is not None
+        status, body = retention(tmp_path, capfd, *arguments)
+        assert status != 0
+        assert "a server uses this data" in body
 
 
 def test_text_tells_space_before_and_after(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
