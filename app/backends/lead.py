@@ -41,6 +41,7 @@ ROUND_SECONDS: Final = 0.25
 
 
 POLL_SECONDS: Final = 0.05
+"""Interval at which a thread that waits for a lead looks for it."""
 
 
 class LeadLostError(FenceError):

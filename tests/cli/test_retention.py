@@ -8,9 +8,10 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import psycopg
 import pytest
 
-from app.backends.lead import open_leads
+from app.backends.lead import SharedLeads, open_leads
 from app.cli import run
 from app.store.changes import Replace
 from app.store.store import Store
@@ -83,9 +84,9 @@ def test_removal_at_once_on_postgresql(postgres_url: str, tmp_path: Path, capfd:
     arguments = ("--database-url", postgres_url, "--all-days", "30", "--now")
     status, done = retention(tmp_path, capfd, *arguments)
     assert (status, done["environments"][0]["thinned"]) == (0, [])
-    with closing(open_leads(postgres_url, tmp_path)) as leads:
-        leads.start()
-        assert leads.lead("housekeeping").acquire(60) is not None
+    lead = SharedLeads(postgres_url, tmp_path).lead("housekeeping")
+    with psycopg.connect(postgres_url.replace("+psycopg", "")) as server:  # a session that may be silent
+        server.execute("SELECT pg_advisory_lock(%s)", (lead.key,))
         status, body = retention(tmp_path, capfd, *arguments)
         assert status != 0
         assert "a server uses this data" in body
