@@ -361,8 +361,9 @@ def delegate(body: DelegationsBody, services: ServicesDep, principal: MirrorRole
         raise Invalid("invalid public_key", [Problem("must be 32 bytes in base64", where="body.public_key")])
     for name in body.environments:
         principal.require_environment(name)
-    with services.store.audit.changing():  # it has a row in the audit log, like a new key
-        return json_response(_statements(services, public, body.environments))
+    statements = _statements(services, public, body.environments)
+    services.store.audit.record_change()  # like a new key
+    return json_response(statements)
 
 
 def _statements(services: Services, public: bytes, environments: Sequence[str]) -> list[dict[str, Any]]:
