@@ -80,10 +80,13 @@ class Term:
 
 
 class Lead(ABC):
-    """Right to do one task. Thread-safe."""
+    """Right to do one task. Thread-safe.
+
+    unbroken_since: number of the first term of this process after which no other process has led.
+    """
 
     def __init__(self, name: str) -> None:
-        self.name = name
+        self.name, self.unbroken_since = name, 0
 
     @property
     @abstractmethod
@@ -174,6 +177,7 @@ class LocalLead(Lead):
                     handle.close()
                     return False
                 self._elections += 1
+                self.unbroken_since = self._elections
                 self._handle = handle
             return True
 
@@ -222,6 +226,7 @@ class SharedLead(Lead):
         self.key = int.from_bytes(hashlib.sha256(f"fleetmap lead {name}".encode()).digest()[:8], "big", signed=True)
         self.is_wanted = False
         self.won: Term | None = None
+        self._last = -1  # number of the last term; the first of all has 1
 
     @property
     def term(self) -> Term | None:
@@ -241,6 +246,13 @@ class SharedLead(Lead):
         if self.is_wanted:
             self.is_wanted = False
             self._leads.wake()
+
+    def note_election(self, number: int) -> Term:
+        """Note that this process has won an election; return the term. Each election has the next number."""
+        if number != self._last + 1:
+            self.unbroken_since = number
+        self._last = number
+        return Term(self, number)
 
     def check_term(self, connection: Connection, term: Term) -> None:
         """Check that no process has won an election since, and keep elections waiting until the commit."""
@@ -350,7 +362,7 @@ class SharedLeads(Leads):
         number = int(connection.execute(query, (lead.name, self._server))[0][0])
         self._roles[lead.name] = True
         log.info("leads: this server leads (task=%s, term=%d)", lead.name, number)
-        return Term(lead, number)
+        return lead.note_election(number)
 
     def _disconnect(self) -> None:
         self._lease_until = 0.0

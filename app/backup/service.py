@@ -108,7 +108,7 @@ class BackupService:
                 if isinstance(files, ArchiveFiles):
                     files.discard()
                 raise
-            removed, freed = self._remove_outdated(repository, options.keep)
+            removed, freed = self._remove_outdated(repository, options.keep, guard)
         return BackupResult(snapshot, shown(place), removed, freed)
 
     def _repository(self, place: str, files: BlobFiles, options: BackupOptions) -> Repository:
@@ -143,8 +143,10 @@ class BackupService:
             backups.add_place(opened.id, opened.key, opened.age.recipients)
         return opened
 
-    def _remove_outdated(self, repository: Repository, keep: KeepRule | None) -> tuple[tuple[str, ...], int]:
-        """Remove the backups that the rule does not keep, then packs that no backup needs."""
+    def _remove_outdated(
+        self, repository: Repository, keep: KeepRule | None, guard: Callable[[], None]
+    ) -> tuple[tuple[str, ...], int]:
+        """Remove the backups that the rule does not keep, then packs that no backup needs, not even a running one."""
         if isinstance(repository.files, ArchiveFiles):
             return (), 0
         listed = repository.snapshots()
@@ -152,6 +154,7 @@ class BackupService:
         gone = {snapshot.id for snapshot in outdated}
         repository.remove_snapshots(sorted(gone))
         stay = [snapshot for snapshot in listed.intact if snapshot.id not in gone]
+        guard()
         freed = 0 if listed.broken else repository.remove_unused_packs(stay)
         return tuple(sorted(gone)), freed
 
@@ -162,20 +165,16 @@ class BackupService:
         first = lead.acquire(self._wait_seconds)
         if first is None:
             raise Conflict("another backup or a garbage collection is running: try again later")
-        term = first
 
         def guard() -> None:
-            """A backup takes hours, in which the connection may be lost: it goes on if nobody else had the lead."""
-            nonlocal term
-            if term.goes_on:
+            """A backup takes hours, in which its process may stand still: it goes on if nobody else led meanwhile."""
+            if first.goes_on:
                 return
-            again = lead.acquire(self._wait_seconds)
-            if again is None or again.number != term.number + 1:
+            if lead.acquire(self._wait_seconds) is None or lead.unbroken_since > first.number:
                 raise LeadLostError(
                     "the connection to the database was lost, and content could have been removed meanwhile: the "
                     "backup was given up, run it again"
                 )
-            term = again
 
         try:
             yield guard

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from app.store.retention_rule import Rule
     from app.store.store import Store
 
-ALONE_SECONDS: Final = 3.0
-"""Maximum time until a lead of a server that was killed is free."""
+ALONE_SECONDS: Final = 10.0
+"""Maximum time until the database is connected, and leads of a server that was killed are free."""
 
 
 def retention(
@@ -112,11 +112,14 @@ def _alone(settings: Settings) -> Iterator[None]:
 
     with closing(open_leads(settings.direct_database, settings.data_dir)) as leads:
         leads.start()
-        if leads.lead("housekeeping").acquire(ALONE_SECONDS) is None:
+        housekeeping = leads.lead("housekeeping").acquire(ALONE_SECONDS)
+        if housekeeping is None:
             raise Conflict("a server uses this data: stop it, or omit --now")
-        if leads.lead(CONTENT_LEAD).acquire(ALONE_SECONDS) is None:
+        content = leads.lead(CONTENT_LEAD).acquire(ALONE_SECONDS)
+        if content is None:
             raise Conflict("a backup of this data is running: wait until it has ended, or omit --now")
-        yield
+        with housekeeping.fenced(), content.fenced():
+            yield
 
 
 def _apply(store: Store, plan: EnvironmentPlan, rule: Rule) -> dict[str, Any]:

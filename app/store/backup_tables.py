@@ -24,7 +24,8 @@ CONTENT: Final = frozenset({"chunk", "blob"})
 
 LEFT_OUT: Final = frozenset(
     {
-        *("area", "place", "search_item", "robot_tally"),  # made anew from the others
+        *("area", "search_item", "robot_tally"),  # made anew from the others
+        "place",  # not used
         *("made_map", "made_file"),  # maps that can be made again
         *("job", "lead", "presence"),  # what processes do at the moment
         *("session", "sign_in_code", "wrong_token"),  # people sign in again

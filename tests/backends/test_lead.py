@@ -85,7 +85,7 @@ def test_lead_is_waited_for(open_process: Callable[[], Leads]) -> None:
     term = one.acquire(60)
     assert term is not None
     assert term.goes_on
-    assert two.acquire(0.6) is None
+    assert two.acquire(0) is None
     one.release()
     assert two.acquire(60) is not None, "the first one takes part no more"
     assert one.acquire(0) is None
@@ -189,6 +189,35 @@ class TestShared:
             assert not term.goes_on
             with pytest.raises(LeadLostError), term.fenced():
                 pass
+        finally:
+            leads._disconnect()
+
+    def test_process_knows_whether_another_one_led_meanwhile(
+        self, database_url: str, tmp_path: Path, open_process: Callable[[], Leads]
+    ) -> None:
+        leads = SharedLeads(database_url, tmp_path)
+        try:
+            lead = leads.lead("task")
+            lead.try_acquire()
+            leads._hold_elections()
+            first = lead.term
+            assert first is not None
+            leads._lease_until = 0.0
+            assert not first.goes_on
+            leads._hold_elections()
+            assert first.goes_on, "PostgreSQL has not ended the session"
+            for _ in range(2):
+                leads._disconnect()
+                leads._hold_elections()
+            assert lead.term is not None
+            assert lead.term.number == first.number + 2
+            assert lead.unbroken_since == first.number
+            leads._disconnect()
+            successor = open_process().lead("task")
+            assert successor.acquire(60) is not None
+            successor.release()
+            eventually(lambda: leads._hold_elections() or lead.is_held)
+            assert lead.term.number == lead.unbroken_since == first.number + 4
         finally:
             leads._disconnect()
 

@@ -40,7 +40,8 @@ def retention(folder: Path, capfd: pytest.CaptureFixture[str], *arguments: str) 
     return status, json.loads(out) if out else err
 
 
-def test_dry_run_then_removal(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_then_removal(folder: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.cli.retention.ALONE_SECONDS", 0.5)  # file locks need no connection
     status, body = retention(folder, capfd)
     assert status != 0
     assert "there is no rule, so everything stays" in body
@@ -76,17 +77,21 @@ def test_dry_run_then_removal(folder: Path, capfd: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.postgres
-def test_removal_at_once_on_postgresql(postgres_url: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_removal_at_once_on_postgresql(
+    postgres_url: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with closing(Store(postgres_url, tmp_path / "blobs")) as store:
         store.migrate()
         store.blobs.prepare()
         store.environments.create("farm")
     arguments = ("--database-url", postgres_url, "--all-days", "30", "--now")
+    monkeypatch.setattr("app.cli.retention.ALONE_SECONDS", 60)
     status, done = retention(tmp_path, capfd, *arguments)
     assert (status, done["environments"][0]["thinned"]) == (0, [])
     lead = SharedLeads(postgres_url, tmp_path).lead("housekeeping")
     with psycopg.connect(postgres_url.replace("+psycopg", "")) as server:  # a session that may be silent
         server.execute("SELECT pg_advisory_lock(%s)", (lead.key,))
+        monkeypatch.setattr("app.cli.retention.ALONE_SECONDS", 0.5)
         status, body = retention(tmp_path, capfd, *arguments)
         assert status != 0
         assert "a server uses this data" in body

@@ -68,7 +68,7 @@ def copy_rows(source: Path, target: Connection) -> None:
         with origin.read() as connection:
             for table in tables.metadata.sorted_tables:
                 if table.name in ("place", "area", "search_item", "robot_tally") or not present.has_table(table.name):
-                    continue  # the first three are built again, the last by triggers
+                    continue  # not used, built again twice, and filled by triggers
                 columns = {c["name"] for c in inspect(connection).get_columns(table.name)}
                 chosen = [c for c in table.c if c.name in columns and c.computed is None]
                 names = ", ".join(f'"{c.name}"' for c in chosen)

@@ -97,7 +97,7 @@ def test_commit_of_a_stopped_server_blocks_others_for_a_limited_time(
         refused.append(caught.value)
 
     monkeypatch.setattr(versions, "_check_head", stand_still)
-    monkeypatch.setattr("app.store.database.MAX_STANDSTILL_SECONDS", 1)
+    monkeypatch.setattr("app.store.database.MAX_STANDSTILL_SECONDS", 5)
     stopped = threading.Thread(target=commit_late)
     other = threading.Thread(target=save, args=(store, "farm", Replace(TOPOLOGY, network(3))), daemon=True)
     stopped.start()
