@@ -39,7 +39,6 @@ LEASE_SECONDS: Final = 2.0
 ROUND_SECONDS: Final = 0.25
 """Interval of a server's heartbeats, and of its attempts to get leads that others have."""
 
-
 POLL_SECONDS: Final = 0.05
 """Interval at which a thread that waits for a lead looks for it."""
 
@@ -226,7 +225,7 @@ class SharedLead(Lead):
         self.key = int.from_bytes(hashlib.sha256(f"fleetmap lead {name}".encode()).digest()[:8], "big", signed=True)
         self.is_wanted = False
         self.won: Term | None = None
-        self._last = -1  # number of the last term; the first of all has 1
+        self._last = -1  # number of its last term; none yet, and numbers begin with 1
 
     @property
     def term(self) -> Term | None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from app.store.retention_rule import Rule
     from app.store.store import Store
 
-ALONE_SECONDS: Final = 10.0
+ALONE_SECONDS: Final = 5.0
 """Maximum time until the database is connected, and leads of a server that was killed are free."""
 
 

@@ -132,6 +132,11 @@ def _advance(connection: Connection, count: int) -> int:
     return int(connection.execute(advanced.returning(tables.log.c.position, limit)).one().position)
 
 
+def lock_log(connection: Connection) -> int:
+    """Lock the log until the transaction ends; return its last position. Later commits have higher ones."""
+    return _advance(connection, 0)
+
+
 def as_event(row: Row[Any]) -> Event:
     """Convert a row into a value."""
     return Event(row.sequence, row.environment, row.body, row.time, row.position, row.environment_id)

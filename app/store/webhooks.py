@@ -21,7 +21,7 @@ from app.store import tables
 from app.store.audit import set_audit_target
 from app.store.base import checked_text, upsert
 from app.store.database import Database
-from app.store.outbox import as_event
+from app.store.outbox import as_event, lock_log
 from app.store.values import Event
 
 MAX_WEBHOOKS: Final = 32
@@ -118,8 +118,7 @@ class Webhooks:
         set_audit_target(target=f"webhook {key}")
         with self._database.write() as connection:
             # The log's row is locked: an event that is committed later is delivered, one before is not.
-            query = select(tables.log.c.position).where(tables.log.c.id == 1).with_for_update()
-            position = connection.execute(query).scalar_one()
+            position = lock_log(connection)
             if connection.execute(select(func.count()).select_from(table)).scalar_one() >= MAX_WEBHOOKS:
                 raise Conflict(f"there are {MAX_WEBHOOKS} webhooks, the maximum: delete one first")
             values = {
