@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Connection
 
-from app.backends.lead import LEASE_SECONDS, Lead, LeadLostError, Leads, SharedLead, SharedLeads
+from app.backends.lead import LEASE_SECONDS, Lead, LeadLostError, Leads, SharedLead, SharedLeads, Term
 from app.errors import Unavailable
 from app.store.store import Store
 from tests.events.conftest import eventually
@@ -47,6 +47,19 @@ def other_process(url: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     finally:
         process.kill()
         process.communicate()
+
+
+@contextlib.contextmanager
+def leading(leads: SharedLeads) -> Iterator[tuple[SharedLead, Term]]:
+    """The lead ``task`` and its term, without the thread that holds elections."""
+    try:
+        lead = leads.lead("task")
+        lead.try_acquire()
+        leads._hold_elections()
+        assert lead.term is not None
+        yield lead, lead.term
+    finally:
+        leads._disconnect()
 
 
 def write_after_release(store: Store, lead: Lead) -> None:
@@ -177,31 +190,18 @@ class TestShared:
     def test_lease_ends_while_the_host_is_suspended(self, database_url: str, tmp_path: Path) -> None:
         """A leader that wakes up asks the database first: the clock jumps, and its thread has not run again yet."""
         clock = [1000.0]
-        leads = SharedLeads(database_url, tmp_path, lambda: clock[0])
-        try:
-            lead = leads.lead("task")
-            lead.try_acquire()
-            leads._hold_elections()
-            term = lead.term
-            assert term is not None
+        with leading(SharedLeads(database_url, tmp_path, lambda: clock[0])) as (lead, term):
             clock[0] += LEASE_SECONDS
             assert not lead.is_held
             assert not term.goes_on
             with pytest.raises(LeadLostError), term.fenced():
                 pass
-        finally:
-            leads._disconnect()
 
     def test_process_knows_whether_another_one_led_meanwhile(
         self, database_url: str, tmp_path: Path, open_process: Callable[[], Leads]
     ) -> None:
         leads = SharedLeads(database_url, tmp_path)
-        try:
-            lead = leads.lead("task")
-            lead.try_acquire()
-            leads._hold_elections()
-            first = lead.term
-            assert first is not None
+        with leading(leads) as (lead, first):
             leads._lease_until = 0.0
             assert not first.goes_on
             leads._hold_elections()
@@ -218,8 +218,6 @@ class TestShared:
             successor.release()
             eventually(lambda: leads._hold_elections() or lead.is_held)
             assert lead.term.number == lead.unbroken_since == first.number + 4
-        finally:
-            leads._disconnect()
 
     def test_stopped_process_loses_the_lead(
         self, database_url: str, tmp_path: Path, open_process: Callable[[], Leads]
