@@ -39,7 +39,7 @@ def retention(
         int | None, typer.Option("--source-days", help="Days after which uploads that the layers contain go.")
     ] = None,
     now: Annotated[
-        bool, typer.Option("--now", help="Remove the content at once, not after 6 hours; no server may run.")
+        bool, typer.Option("--now", help="Remove the content at once, not after 6 hours; no server or worker may run.")
     ] = False,
     database_url: DatabaseUrl = None,
     data_dir: DataDir = None,
