@@ -169,10 +169,10 @@ CASES: Mapping[str, tuple[int, Series, Series]] = {
         {server("fleetmap_queue_oldest_seconds"): "130+60x9"},
         {server("fleetmap_queue_oldest_seconds"): "100x9"},
     ),
-    "FleetmapWorkersMissing critical": (
+    "FleetmapWorkersMissing warning": (
         5,
+        {server("fleetmap_queue_workers"): "2 0x9", server("fleetmap_queue_workers", instance="b"): "2 0x9"},
         {server("fleetmap_queue_workers"): "0x9", server("fleetmap_queue_workers", instance="b"): "0x9"},
-        {server("fleetmap_queue_workers"): "0x9", server("fleetmap_queue_workers", instance="b"): "2x9"},
     ),
     "FleetmapCertificateEnds critical": (
         7,
@@ -191,8 +191,8 @@ CASES: Mapping[str, tuple[int, Series, Series]] = {
     ),
     "FleetmapMirrorEnds critical": (
         8,
-        {server("fleetmap_mirror_left_seconds"): constant(DAY, 9)},
-        {server("fleetmap_mirror_left_seconds"): constant(6 * DAY, 9)},
+        {server("fleetmap_mirror_permission_seconds"): constant(DAY, 9)},
+        {server("fleetmap_mirror_permission_seconds"): constant(6 * DAY, 9)},
     ),
 }
 """By alert and severity: the minute to look at, series with which it fires then, series with which it does not."""

@@ -212,5 +212,7 @@ class QueueCollector(Collector):
         oldest = "Seconds that the longest waiting task has waited."
         yield GaugeMetricFamily("fleetmap_queue_oldest_seconds", oldest, figures.oldest)
         yield GaugeMetricFamily(
-            "fleetmap_queue_workers", "Number of live workers, or of threads without workers.", figures.workers
+            "fleetmap_queue_workers",
+            "Number of live workers; of tasks that a server without a shared queue does at a time.",
+            figures.workers,
         )

@@ -95,13 +95,6 @@ CERTIFICATE = Gauge(
     ("certificate",),
 )
 CLOCK = Gauge("fleetmap_clock_offset_seconds", "Seconds by which PostgreSQL's clock is ahead of this server's.")
-MIRROR_CONTACT = Gauge(
-    "fleetmap_mirror_contact_age_seconds", "On a mirror: seconds since the last contact with the server it follows."
-)
-MIRROR_LEFT = Gauge(
-    "fleetmap_mirror_left_seconds",
-    "On a mirror: seconds for which robots accept its manifests without contact with the server it follows.",
-)
 
 GAUGES: Final = tuple(value for value in list(globals().values()) if isinstance(value, Gauge))
 """All gauges of a server."""
@@ -167,16 +160,6 @@ class FleetSource:
         offset = self.store.clock_offset()
         if offset is not None:
             yield CLOCK, (), offset
-        yield from self._mirror(now)
-
-    def _mirror(self, now: datetime) -> Iterator[Sample]:
-        mirror = self.store.mirrors.describe()
-        if mirror is None:
-            return
-        if mirror["contact"] is not None:
-            yield MIRROR_CONTACT, (), (now - datetime.fromisoformat(mirror["contact"])).total_seconds()
-        if mirror["serves_until"] is not None:
-            yield MIRROR_LEFT, (), (datetime.fromisoformat(mirror["serves_until"]) - now).total_seconds()
 
 
 @dataclass(frozen=True, slots=True)
