@@ -159,6 +159,18 @@ def test_override_example_changes_existing_services(compose: dict[str, Any]) -> 
     assert override["services"]["server"]["environment"].keys() <= settings
 
 
+def test_documented_backup_service_extends_a_service_and_runs_a_command(compose: dict[str, Any]) -> None:
+    page = (TOP / "docs" / "how-to" / "back-up.md").read_text()
+    backup = yaml.safe_load(page.partition("```yaml\n")[2].partition("```")[0])["services"]["backup"]
+    assert backup["extends"]["file"] == COMPOSE.name, "without it, only services of the override file are found"
+    assert backup["extends"]["service"] in compose["services"]
+    entrypoint = re.search(r'^ENTRYPOINT \["(.+)"\]$', DOCKERFILE.read_text(), re.MULTILINE)
+    assert entrypoint is not None
+    done = tool(entrypoint[1], *backup["command"][:1], "--help")
+    assert done.returncode == 0, done.stderr
+    assert set(re.findall(r"--[a-z-]+", " ".join(backup["command"]))) <= set(re.findall(r"--[a-z-]+", done.stdout))
+
+
 def test_used_secrets_and_volumes_are_declared_and_created(compose: dict[str, Any], secrets: Path) -> None:
     used = {secret for service in compose["services"].values() for secret in service.get("secrets", ())}
     assert used == set(compose["secrets"])

@@ -64,7 +64,7 @@ class Service:
         (command,) = self.unit["ExecStart"]
         command = re.sub(r"\$\{(\w+)\}", lambda match: self.environment[match[1]], command)
         program, *self.arguments = shlex.split(command)
-        assert Path(program).name == "fleetmap"
+        assert program == "/opt/fleetmap/current/bin/fleetmap", "where install.sh puts it by default"
         self.state, self.log = state, folder / "log"
 
     def start(self) -> PreloadedProcess:
