@@ -55,7 +55,7 @@ class MirrorSource:
     def __init__(self, database: Database, chunks: Chunks) -> None:
         self._database, self._chunks = database, chunks
         self._lock = threading.Lock()
-        self._contents: OrderedDict[tuple[str, int, int, str], Content] = OrderedDict()
+        self._contents: OrderedDict[tuple[str, int, int, str, datetime], Content] = OrderedDict()
 
     def listing(self, allowed: str | None, since: int = 0) -> dict[str, Any]:
         """List the environments that a name pattern allows, also deleted ones, with the position of the log.
@@ -136,7 +136,7 @@ class MirrorSource:
         """
         with self._database.snapshot() as connection:
             row = environment_row(connection, name, deleted=True)
-            key = (str(row.id), after, last, str(row.root))
+            key = (str(row.id), after, last, str(row.root), row.updated)  # thinning changes the latter alone
             with self._lock:
                 if (cached := self._contents.get(key)) is not None:
                     return cached

@@ -73,6 +73,17 @@ def test_new_mirror_takes_over_thinned_history(centre: Api, farm: str, alone: Ma
         edge.store.tags.add(farm, 4, "mine", author="ann")
 
 
+def test_new_mirror_after_thinning_gets_what_is_left(centre: Api, farm: str, alone: Make):
+    """Though the centre has named the content of the same versions before, to another mirror."""
+    alone(farm, folder="first").follow()
+    assert thin(store_of(centre), farm) == [1, 2, 3, 4, 5, 6]
+    store_of(centre).garbage.collect(timedelta(0))
+    second = alone(farm, folder="second")
+    second.follow()
+    assert rows(second.store, farm) == rows(store_of(centre), farm)
+    assert second.store.verifier().run().findings == []
+
+
 def test_mirror_thins_what_its_centre_has_thinned_since(centre: Api, farm: str, alone: Make):
     edge = alone(farm)
     edge.follow()
