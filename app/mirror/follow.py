@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -45,6 +46,15 @@ log = logging.getLogger(__name__)
 REPORTS: Final = 500
 """Maximum number of reports or changes in one request."""
 
+OVERLAP: Final = timedelta(seconds=10)
+"""Statuses are read again for this long: a process may store one after others that were received later."""
+
+OVERLAP_ROWS: Final = 1000
+"""Maximum number of rows of the history that are read again."""
+
+HAND_ON_SECONDS: Final = 10.0
+"""Time of a pass for statuses. Others wait for the next one, so that changes of the centre arrive all the same."""
+
 DELEGATIONS: Final = 500
 """Maximum number of environments in one request for permissions."""
 
@@ -78,6 +88,8 @@ class Mirror:
         self._fetcher = Fetcher(store, centre)
         self.position = 0
         self._complete: tuple[datetime, int] | None = None
+        self._handed_rows: set[int] = set()
+        self._handed_reports: dict[tuple[str, str], datetime] = {}
         self._counted = (0, 0)
 
     def run_once(self) -> MirrorState:
@@ -246,21 +258,39 @@ class Mirror:
         """Hand on changes of overlays, then reports of robots, in their order; returns whether there were changes."""
         waiting = self._store.edge_changes.waiting(REPORTS)
         for environment, group in groupby(waiting, key=lambda change: change.environment):
-            with _NotedFailure(failures, environment):
+            with _NotedFailure(failures, environment, goes_on=True):
                 self._hand_on_changes(environment, list(group))
+        self._hand_on_statuses(state)
+        return bool(waiting)
+
+    def _hand_on_statuses(self, state: MirrorState) -> None:
+        """Hand on statuses in the order in which they were stored, then the robots' present ones with their places."""
+        reports, start, recent = self._store.edge_changes, time.monotonic(), self._store.now() - OVERLAP
         skipped = {name: dict(one) for name, one in (state.skipped or {}).items()}
         if skipped:
             mirrored = {one.name for one in self._store.mirror_target.environments().values() if one.centre}
             skipped = {name: one for name, one in skipped.items() if name in mirrored}
-        while reports := self._store.edge_changes.reports_after(state.reported, REPORTS):
-            self._hand_on_reports([report for _, report in reports], skipped, counted=True)
-            state = replace(state, reported=reports[-1][0])
-            self._store.mirrors.save(reported=state.reported, skipped=skipped)
-        while current := self._store.edge_changes.current_reports(state.seen, REPORTS):
-            self._hand_on_reports(current, skipped, counted=False)
-            state = replace(state, seen=current[-1].time)
-            self._store.mirrors.save(seen=state.seen, skipped=skipped)
-        return bool(waiting)
+        row = state.reported - OVERLAP_ROWS
+        while rows := reports.reports_after(row, REPORTS, handed=state.reported, since=recent):
+            row = rows[-1][0]
+            if new := [report for number, report in rows if number not in self._handed_rows]:
+                self._hand_on_reports(new, skipped, counted=True)
+                self._handed_rows.update(number for number, _ in rows)
+                self._store.mirrors.save(reported=max(row, state.reported), skipped=skipped)
+            if time.monotonic() - start > HAND_ON_SECONDS:
+                break
+        self._handed_rows = {number for number in self._handed_rows if number > row - 2 * OVERLAP_ROWS}
+        seen = None if state.seen is None else state.seen - OVERLAP
+        while current := reports.current_reports(seen, REPORTS):
+            seen = current[-1].time
+            if new := [one for one in current if self._handed_reports.get((one.environment, one.robot)) != one.time]:
+                self._hand_on_reports(new, skipped, counted=False)
+                self._handed_reports.update({(one.environment, one.robot): one.time for one in current})
+                self._store.mirrors.save(seen=max(seen, state.seen or seen), skipped=skipped)
+            if time.monotonic() - start > HAND_ON_SECONDS:
+                break
+        if seen is not None:
+            self._handed_reports = {key: at for key, at in self._handed_reports.items() if at > seen - 2 * OVERLAP}
 
     def _hand_on_changes(self, environment: str, changes: Sequence[QueuedChange]) -> None:
         outcome = self._centre.report(environment, changes=[_change_as_json(change.body) for change in changes])

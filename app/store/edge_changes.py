@@ -151,8 +151,11 @@ class EdgeChanges:
                     update(owner).where(owner.c.id == row.id).values(edge_sequence=owner.c.edge_sequence + 1)
                 )
 
-    def reports_after(self, id: int, limit: int) -> list[tuple[int, ReceivedReport]]:
-        """List reports of robots in mirrored environments after a row of the history, in order, each with its row."""
+    def reports_after(self, id: int, limit: int, *, handed: int, since: datetime) -> list[tuple[int, ReceivedReport]]:
+        """List reports of robots in mirrored environments after a row of the history, in order, each with its row.
+
+        handed: up to this row, only those received after ``since``.
+        """
         table, owner = tables.robot_history, tables.environment
         query = (
             select(table, owner.c.name.label("environment"), tables.robot.c.vouched)
@@ -161,7 +164,8 @@ class EdgeChanges:
                 tables.robot,
                 (tables.robot.c.environment_id == table.c.environment_id) & (tables.robot.c.robot == table.c.robot),
             )
-            .where(owner.c.centre.is_not(None), owner.c.deleted.is_(None), table.c.id > id)
+            .where(owner.c.centre.is_not(None), owner.c.deleted.is_(None))
+            .where(table.c.id > id, (table.c.id > handed) | (table.c.time > since))
             .order_by(table.c.id)
             .limit(limit)
         )
