@@ -20,7 +20,10 @@ ROLES = ("viewer", "robot", "mirror", "editor", "admin")
 def create(
     name: Annotated[str, typer.Argument(help="Name of the owner, shown as author in the history.")],
     role: Annotated[
-        str, typer.Option("--role", "-r", help="viewer, robot, mirror, editor or admin.", autocompletion=lambda: list(ROLES))
+        str,
+        typer.Option(
+            "--role", "-r", help="viewer, robot, mirror, editor or admin.", autocompletion=lambda: list(ROLES)
+        ),
     ] = "viewer",
     environments: Annotated[
         str | None,
