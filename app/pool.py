@@ -150,11 +150,15 @@ class Pool:
         return self._idle.empty()
 
     def start(self) -> None:
-        """Start all workers now, so that the first job does not wait for their imports; blocks until they run.
+        """Start all idle workers now, so that the first job does not wait for their imports; blocks until they run.
 
         A worker that cannot be started is tried again when it is needed.
         """
-        for taken in [self._idle.get() for _ in range(self._count)]:
+        idle: list[_Worker | None] = []
+        with contextlib.suppress(queue.Empty):
+            while len(idle) < self._count:
+                idle.append(self._idle.get_nowait())
+        for taken in idle:
             worker = taken
             try:
                 worker = taken or self._start_worker()
@@ -178,6 +182,9 @@ class Pool:
             try:
                 if self._closed:
                     raise Unavailable("the server is stopping")
+                if worker is not None and not worker.process.is_alive():  # ended by others, for example for its memory
+                    self._stop_worker(worker)
+                    worker = None
                 worker = worker or self._start_worker()
                 if stop is not None:
                     stop.attach(worker.process)

@@ -124,9 +124,26 @@ def test_ended_worker_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch)
     os.kill(worker.process.pid, signal.SIGKILL)
     worker.process.join(60)
     stop()
-    with pytest.raises(WorkerDied):
-        pool.run(work_double, 1)
+    assert pool.run(work_double, 1) == 2, "the next job gets a new worker"
     assert killed == []
+
+
+def test_start_does_not_wait_for_busy_workers() -> None:
+    """Nor does it keep the others from jobs meanwhile."""
+    pool = Pool(2, seconds=60.0)
+    try:
+        with ThreadPoolExecutor(1) as thread:
+            stop = CancelHandle()
+            job = thread.submit(pool.run, work_sleep, 60.0, stop=stop)
+            while not pool._workers:
+                time.sleep(0.01)
+            pool.start()
+            assert not job.done()
+            assert pool.run(work_double, 1) == 2
+            stop()
+            assert isinstance(job.exception(60), Cancelled)
+    finally:
+        pool.close()
 
 
 def test_timeout_kills_the_job_and_worker_is_replaced(pool: Pool) -> None:
