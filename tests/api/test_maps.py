@@ -8,6 +8,7 @@ import json
 import threading
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -379,8 +380,11 @@ def test_long_conversion_becomes_a_job(tmp_path: Path, monkeypatch: pytest.Monke
     with running(settings_for(tmp_path, job_seconds=0.2)) as api:
         api.post("environments", {"name": "farm"})
         api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
-        answer = api.get("/maps/farm/tmap2?", 202)
+        with ThreadPoolExecutor(4) as threads:
+            answers = list(threads.map(lambda _: api.get("/maps/farm/tmap2?", 202), range(4)))
+        answer = answers[0]
         location = answer.headers["location"]
+        assert {one.headers["location"] for one in answers} == {location}, "so do those at once"
         job = answer.json()
         assert location == f"/api/v1/jobs/{job['id']}"
         assert job["state"] == "running"

@@ -53,7 +53,7 @@ class JobStarted:
 
 @dataclass(slots=True)
 class _RunningConversion:
-    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id.
+    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id, of which naming locks.
 
     shared: job that waits for a worker of all servers, if one makes the map. noted: the progress that its jobs show.
     """
@@ -65,6 +65,7 @@ class _RunningConversion:
     stop: CancelHandle = field(default_factory=CancelHandle)
     waiters: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
+    naming: asyncio.Lock = field(default_factory=asyncio.Lock)
     shared: Job | None = None
     noted: Progress = field(default_factory=Progress)
 
@@ -117,11 +118,12 @@ class ConversionJobs:
             done, _ = await asyncio.wait({running.future}, timeout=self._seconds)
             if done:
                 return running.future.result()
-            job_id = running.jobs.get(principal.id)
-            if job_id is not None:
-                return JobStarted(await run_in_threadpool(self._store.jobs.get, job_id))
             try:
-                return JobStarted(await self._as_job(recipe, running, principal, address))
+                async with running.naming:  # requests of one principal share a job
+                    job_id = running.jobs.get(principal.id)
+                    if job_id is not None:
+                        return JobStarted(await run_in_threadpool(self._store.jobs.get, job_id))
+                    return JobStarted(await self._as_job(recipe, running, principal, address))
             except NoRoom:  # a job cannot be stored: wait for the map
                 return await asyncio.shield(running.future)
         finally:
