@@ -244,6 +244,33 @@ def test_reports_are_stored_by_the_leader_only_and_by_its_successor(api: Api, le
         successor.release()
 
 
+def test_successor_stores_what_waits_in_short_transactions(
+    api: Api, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.fleet.report_queue.BATCH", 4)
+    store: Store = api.app.state.services.store
+    store.environments.create("farm")
+    leader, successor = (LocalLead(tmp_path, "successor") for _ in range(2))
+    assert leader.try_acquire()
+    note, sizes = store.robots.note_reports, []
+    monkeypatch.setattr(store.robots, "note_reports", lambda batch: (sizes.append(len(batch)), note(batch))[1])
+    intake = ReportQueue(store, successor)
+    intake.start()
+    try:
+        for number in range(10):
+            intake.enqueue_status("farm", "r1", status_payload(number))
+        eventually(lambda: len(intake._standby) == 10)
+        leader.release()
+        assert successor.try_acquire()
+        intake.enqueue_status("farm", "r1", status_payload(10))
+        eventually(lambda: len(store.robots.history("farm", "r1")) == 11)
+    finally:
+        intake.close()
+        successor.release()
+    assert max(sizes) <= 4
+    assert [report.version for _, report in store.robots.history("farm", "r1")] == list(range(10, -1, -1))
+
+
 def test_presence_is_written_when_it_changes_and_by_the_leader(
     api: Api, lead: LocalLead, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
