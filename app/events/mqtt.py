@@ -134,8 +134,10 @@ class MqttBroker:
         properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
         properties.ContentType = messages.JSON
         sent = self._client.publish(topic, messages.dumps(body), qos=1, retain=True, properties=properties)
-        if sent.rc not in (MQTTErrorCode.MQTT_ERR_SUCCESS, MQTTErrorCode.MQTT_ERR_NO_CONN):
-            raise Unavailable(f"could not publish to {self._address}: {sent.rc.name}")
+        if sent.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
+            raise Unavailable(
+                f"could not publish to {self._address}: {sent.rc.name}" if self.connected else self._problem
+            )
         self._accepting.append(sent)
 
     def flush(self) -> None:

@@ -269,6 +269,8 @@ class Courier:
                         return self._stop_catching_up(lag, attempt)
                     self._delivered = _now()
                 lag = Lag(lag.environment_id, lag.environment, event.position, Attempts())
+            if len(events) < PAGE:
+                break  # these were the last
             self._store.webhooks.put_lag(self._id, self._position, lag)
         # It waits for at least one event: if there is none any more, it was removed with its environment.
         if lag.position == start and not self._send_resync(lag.environment, lag.position + 1, self._position):

@@ -159,6 +159,20 @@ def test_refused_events_are_reported(tmp_path: Path) -> None:
         broker.kill()
 
 
+def test_broker_that_is_lost_between_two_events_is_unavailable(tmp_path: Path) -> None:
+    broker = Broker(tmp_path / "broker")
+    connection = MqttBroker(options(broker))
+    try:
+        assert connection.ensure_connected()
+        broker.kill()
+        eventually(lambda: not connection.connected)
+        with pytest.raises(Unavailable, match="lost "):
+            connection.publish("farm", {"sequence": 1})
+        connection.flush()
+    finally:
+        connection.close()
+
+
 @pytest.mark.filterwarnings("ignore:.*SSLSocket:pytest.PytestUnraisableExceptionWarning")  # paho drops it unclosed
 def test_failed_logins_are_reported(secured: Broker, tmp_path: Path) -> None:
     assert secured.authority is not None

@@ -14,13 +14,13 @@ import pytest
 from sqlalchemy import delete
 
 from app.backends.lead import LocalLeads, SharedLeads
-from app.errors import Invalid, NoRoom
+from app.errors import Invalid, NoRoom, Unavailable
 from app.events import outgoing
 from app.events.outgoing import OutgoingClient, OutgoingRules, RequestError, check_url
 from app.events.webhooks import Attempt, Attempts, WebhookSender, next_attempts
 from app.store import tables
 from app.store.store import Store
-from app.store.webhooks import Webhook
+from app.store.webhooks import Lag, Webhook
 from tests.api.conftest import empty_database
 from tests.certificates import Authority
 from tests.events.conftest import eventually
@@ -283,6 +283,30 @@ def test_full_disk_does_not_repeat_deliveries(
     eventually(lambda: store.webhooks.get(webhook.id).position == 4)
     assert receiver.sequences("farm") == [1, 2, 3, 4], "each once"
     assert "progress could not be stored" in caplog.text
+
+
+def test_interrupted_end_of_a_wait_tells_of_no_removed_events(
+    store: Store, receiver: Receiver, start: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server ends right after it has stored that all was delivered."""
+    monkeypatch.setattr("app.events.webhooks.PAUSE_SECONDS", 0.01)
+    end, ended = store.webhooks.end_lag, []
+
+    def interrupted(*args: Any) -> None:
+        ended.append(1)
+        if len(ended) == 1:
+            raise Unavailable("the database is away")
+        end(*args)
+
+    monkeypatch.setattr(store.webhooks, "end_lag", interrupted)
+    webhook = hook(store, receiver)
+    store.environments.create("farm")
+    lag = Lag(store.environments.get("farm").id, "farm", 0, Attempts())
+    store.webhooks.put_lag(webhook.id, 1, lag)
+    start()
+    promote(store, "farm", 1)
+    eventually(lambda: len(ended) > 1 and len(set(receiver.sequences("farm"))) == 2)
+    assert [e["type"] for e in receiver.events if e["type"] == "resync"] == []
 
 
 def test_removed_events_are_told(store: Store, receiver: Receiver, start: Any) -> None:
