@@ -41,6 +41,9 @@ SEARCH_BATCH = 100
 """Maximum number of environments whose names are brought up to date in one run."""
 
 COLLECT_EVERY = timedelta(hours=24)
+COLLECT_PAUSE = timedelta(hours=1)
+"""Time before the first daily run of a process, so that restarts every day leave one, and after a failure."""
+
 MAX_PAUSE = timedelta(days=3)
 """Maximum time between two daily runs; if it was longer, the clock may be wrong, and retention waits for the next."""
 
@@ -71,7 +74,7 @@ class _Housekeeping:
         self._lead = services.leads.lead(NAME)
         self._content = services.leads.lead(CONTENT_LEAD)
         self._newest = datetime.now(UTC)
-        self._collect_at = self._newest + COLLECT_EVERY
+        self._collect_at = self._newest + COLLECT_PAUSE
         self._thinning: Iterator[None] = iter(())
         self._release_at = time.monotonic() + RELEASE_SECONDS
         self._collect_garbage_at = time.monotonic() + GARBAGE_SECONDS
@@ -131,18 +134,22 @@ class _Housekeeping:
                 store.drafts.remove_expired()
                 store.sessions.sweep()
                 self._services.jobs.sweep()
-            if datetime.now(UTC) >= self._collect_at and self._content.try_acquire():
-                self._collect()
+            if datetime.now(UTC) >= self._collect_at:
+                self._collect_daily()
             self._continue_thinning()
 
-    def _collect(self) -> None:
-        """Collect garbage, while no backup runs."""
-        store = self._services.store
-        self._collect_at = datetime.now(UTC) + COLLECT_EVERY
+    def _collect_daily(self) -> None:
+        """Collect garbage, while no backup runs, unless a process has done so within a day."""
+        store, last = self._services.store, self._services.store.garbage.last_run()
+        if last is not None and timedelta(0) <= store.now() - last < COLLECT_EVERY:
+            self._collect_at = last + COLLECT_EVERY
+            return
+        if not self._content.try_acquire():
+            return
+        self._collect_at = datetime.now(UTC) + COLLECT_PAUSE
         try:
             store.wrong_tokens.sweep(timedelta(seconds=WINDOW_SECONDS))
             with self._content.fenced():
-                last = store.garbage.last_run()
                 store.garbage.collect(COLLECT_GRACE)
                 self._thinning = self._thin(last)
                 store.search_index.merge()
@@ -163,10 +170,15 @@ class _Housekeeping:
             return
         for plan in store.retention.plan(rule, writable_formats()):
             versions = files = 0
-            for removed in store.retention.apply(plan, rule):
-                versions += len(removed.versions)
-                files += removed.files
-                yield
+            try:
+                for removed in store.retention.apply(plan, rule):
+                    versions += len(removed.versions)
+                    files += removed.files
+                    yield
+            except LeadLostError:
+                raise
+            except FleetMapError as error:
+                log.warning("retention: failed, will retry (environment=%s): %s", plan.environment, error.detail)
             if versions or files:
                 log.info("retention: environment=%s versions=%d files=%d", plan.environment, versions, files)
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 from sqlalchemy import text
 
+from app.errors import Unavailable
 from app.housekeeping import _Housekeeping
 from app.store.retention_rule import Rule
 from app.store.store import Store
@@ -35,6 +36,35 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
 def store_of(api: Api) -> Store:
     store: Store = api.app.state.services.store
     return store
+
+
+def test_daily_run_is_due_a_day_after_the_last_one_of_any_process(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it also happens on a server that is restarted every day."""
+    housekeeping, store = _Housekeeping(api.app.state.services), store_of(api)
+    now, last, runs, fails = store.now(), [store.now()], [], [True]
+    assert housekeeping._collect_at - now <= timedelta(hours=1, minutes=1)
+    monkeypatch.setattr(store.garbage, "last_run", lambda: last[0])
+
+    def collect(grace: timedelta) -> None:
+        if fails:
+            raise Unavailable("the database is away")
+        runs.append(grace)
+
+    monkeypatch.setattr(store.garbage, "collect", collect)
+    last[0] = now - timedelta(hours=20)
+    housekeeping._collect_daily()
+    assert (runs, housekeeping._collect_at) == ([], now + timedelta(hours=4))
+    last[0] = now - timedelta(hours=25)
+    with pytest.raises(Unavailable):
+        housekeeping._collect_daily()
+    assert timedelta(minutes=50) < housekeeping._collect_at - now < timedelta(hours=2), "it is tried again soon"
+    fails.clear()
+    housekeeping._collect_daily()
+    assert len(runs) == 1
+    for strange in (None, now + timedelta(days=9)):
+        last[0] = strange
+        housekeeping._collect_daily()
+    assert len(runs) == 3, "without a run before, or after a leap of the clock"
 
 
 def test_thinning_over_http(api: Api) -> None:
