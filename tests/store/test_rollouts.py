@@ -18,7 +18,7 @@ from tests.store.samples import GRID, grid, save
 
 
 class Fleet:
-    """Robots of the channel production, which points to version 1 and is to move to version 2."""
+    """Robots of the channel production, which points to version 1 and is to move to version 2; the clock stands."""
 
     def __init__(self, store: Store) -> None:
         self.store = store
@@ -59,8 +59,10 @@ class Fleet:
 
 
 @pytest.fixture
-def fleet(store: Store) -> Fleet:
-    return Fleet(store)
+def fleet(store: Store, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    fleet = Fleet(store)
+    monkeypatch.setattr(store._database, "now", lambda: fleet.start)
+    return fleet
 
 
 def test_unvouched_robots_neither_move_nor_stop_rollout(fleet: Fleet):
