@@ -24,6 +24,7 @@ from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
 from app.store.fleet_values import ReceivedReport, RobotReport
+from app.store.robots import MAX_PRESENT
 from app.store.store import Store
 
 log = logging.getLogger(__name__)
@@ -49,7 +50,6 @@ STAND_BY_SECONDS = 10.0
 MAX_STAND_BY = 5_000
 RETRY_SECONDS = 1.0
 WARN_SECONDS = 20.0
-MAX_PRESENT = 100_000
 
 
 def report_from_status(status: RobotStatus) -> RobotReport:

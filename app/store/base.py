@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -53,6 +54,11 @@ def clean_problem(problem: Problem) -> Problem:
         problem.line,
         None if problem.where is None else storable_text(problem.where),
     )
+
+
+def hash_secret(secret: str) -> str:
+    """Return what is stored of a token or a session's secret."""
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def check_environment_name(name: str) -> str:

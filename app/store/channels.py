@@ -30,15 +30,17 @@ from app.store.rollout_robots import OnlineCache, RolloutRobots
 from app.store.values import LATEST, Position, Version, rfc3339
 
 _channel, _owner = tables.channel, tables.environment
-_DUE_MOVES: Final = (
-    select(_owner.c.name.label("environment"), _channel.c.name)
+DUE_MOVES: Final = (
+    select(_owner.c.name.label("environment"), _channel.c.name, _channel.c.planned_at)
     .join(_owner, _owner.c.id == _channel.c.environment_id)
     .where(_channel.c.planned_at <= bindparam("now"), _channel.c.rollout_state.is_distinct_from("waiting"))
     .where(_owner.c.deleted.is_(None))
     .where(_owner.c.centre.is_(None) | _channel.c.rollout_state.is_(None))
     .order_by(_channel.c.planned_at, _owner.c.name, _channel.c.name)
 )
-_IN_ROLLOUT: Final = (
+"""Planned moves whose time has come, the most overdue first, that wait for nothing else."""
+
+OPEN_ROLLOUT_ROWS: Final = (
     select(_channel, _owner.c.name.label("environment"))
     .join(_owner, _owner.c.id == _channel.c.environment_id)
     .where(_channel.c.rollout_state.in_(OPEN_ROLLOUTS), _owner.c.deleted.is_(None), _owner.c.centre.is_(None))
@@ -201,9 +203,9 @@ class Channels:
         A mirror carries out the moves that wait for nothing but their time, since it may be cut off from its centre.
         """
         with self._database.read() as connection:
-            due = connection.execute(_DUE_MOVES, {"now": now}).all()
+            due = connection.execute(DUE_MOVES, {"now": now}).all()
         out = []
-        for environment, name in due:
+        for environment, name, _ in due:
             with self._database.write() as connection:
                 row = environment_row(connection, environment, lock=True, mirrored=True)
                 write = _ChannelWrite(connection, row, name, now)
@@ -223,7 +225,7 @@ class Channels:
         transaction, so that it decides on the current state; before, counts of large channels may be some seconds old.
         """
         with self._database.read() as connection:
-            rows = connection.execute(_IN_ROLLOUT).all()
+            rows = connection.execute(OPEN_ROLLOUT_ROWS).all()
             due = [r for r in rows if _next(connection, r, now, decide, self._online) is not None]
         out = []
         for due_row in due:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, delete, func, insert, select, update
+from sqlalchemy import Connection, Row, delete, func, select, update
 
 from app.errors import Conflict, Invalid
 from app.event_types import EventType, RobotPlace
@@ -25,6 +25,7 @@ from app.store.overlays import (
     MAX_PENDING,
     append_overlay_event,
     as_overlay,
+    insert_overlay,
     read_closures_anew,
     require_room,
 )
@@ -196,26 +197,7 @@ def _insert(connection: Connection, row: Row[Any], overlay: Overlay) -> None:
     )
     if overlay.state == "pending" and connection.execute(waiting).scalar_one() >= MAX_PENDING:
         raise Conflict(f"{row.name} has {MAX_PENDING} pending overlays: accept or reject some")
-    for text, label in ((overlay.detail or "", "a detail"), (overlay.reporter, "a reporter")):
-        checked_text(text, label)
-    connection.execute(
-        insert(table).values(
-            id=overlay.id,
-            environment_id=row.id,
-            kind=overlay.kind,
-            state=overlay.state,
-            level=overlay.level,
-            polygon=overlay.polygon,
-            edge=overlay.edge,
-            crs=overlay.crs,
-            detail=overlay.detail,
-            reporter=overlay.reporter,
-            created=overlay.created,
-            expires=overlay.expires,
-            decided_by=overlay.decided_by,
-            decided=overlay.decided,
-        )
-    )
+    insert_overlay(connection, row.id, overlay)
 
 
 def _update(connection: Connection, row: Row[Any], stored: Row[Any], change: OverlayChange) -> bool:

@@ -19,9 +19,10 @@ from sqlalchemy import ColumnElement, Connection, Row, Select, bindparam, case, 
 
 from app.model.closures import NO_CLOSURES
 from app.store import tables
+from app.store.channels import DUE_MOVES, OPEN_ROLLOUT_ROWS
 from app.store.column_types import UtcDateTime
 from app.store.database import Database
-from app.store.fleet_values import OPEN_ROLLOUTS, RobotGroup, Rollout
+from app.store.fleet_values import RobotGroup, Rollout
 from app.store.overlays import read_closures
 from app.store.robot_counts import is_online
 from app.store.values import LATEST
@@ -143,15 +144,8 @@ class FleetFigures:
 
     def rollouts(self) -> list[OpenRollout]:
         """List the open rollouts."""
-        table, owner = tables.channel, tables.environment
-        query = (
-            select(table.c.name, table.c.rollout, owner.c.name.label("environment"))
-            .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.rollout_state.in_(OPEN_ROLLOUTS), owner.c.deleted.is_(None), owner.c.centre.is_(None))
-            .order_by(owner.c.name, table.c.name)
-        )
         with self._database.read() as connection:
-            rows = connection.execute(query.limit(MAX_ROWS)).all()
+            rows = connection.execute(OPEN_ROLLOUT_ROWS.limit(MAX_ROWS)).all()
         now = self._database.now()
         out = []
         for row in rows:
@@ -161,22 +155,11 @@ class FleetFigures:
         return out
 
     def overdue_moves(self) -> float:
-        """Return by how many seconds the planned move of a channel that is the most overdue is late; 0 without one.
-
-        Only moves that wait for nothing but their time.
-        """
-        table, owner = tables.channel, tables.environment
+        """Return by how many seconds the planned move of a channel that is the most overdue is late; 0 without one."""
         now = self._database.now()
-        query = (
-            select(func.min(table.c.planned_at, type_=UtcDateTime))
-            .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.planned_at <= now, table.c.rollout_state.is_distinct_from("waiting"))
-            .where(owner.c.deleted.is_(None))
-            .where(owner.c.centre.is_(None) | table.c.rollout_state.is_(None))
-        )
         with self._database.read() as connection:
-            first = connection.execute(query).scalar()
-        return 0.0 if first is None else (now - first).total_seconds()
+            first = connection.execute(DUE_MOVES.limit(1), {"now": now}).first()
+        return 0.0 if first is None else (now - first.planned_at).total_seconds()
 
     def overlays(self) -> list[OverlayCounts]:
         """Count the overlays of environments that have some pending or in force."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final
 
-from sqlalchemy import func, select, update
+from sqlalchemy import Row, func, select, update
 
 from app.store import tables
 from app.store.base import upsert
@@ -116,12 +116,7 @@ class Mirrors:
         """List all statements."""
         with self._database.read() as connection:
             rows = connection.execute(select(tables.delegation)).all()
-        return [
-            StoredDelegation(
-                r.environment_id, bytes(r.statement), r.signed_by, bytes(r.signature), bytes(r.key), r.expires
-            )
-            for r in rows
-        ]
+        return [_as_delegation(r) for r in rows]
 
     def delegation(self, environment: str) -> StoredDelegation | None:
         """Read the statement about an environment, by its name."""
@@ -129,11 +124,7 @@ class Mirrors:
         query = select(table).join(owner, owner.c.id == table.c.environment_id).where(owner.c.name == environment)
         with self._database.read() as connection:
             r = connection.execute(query).one_or_none()
-        if r is None:
-            return None
-        return StoredDelegation(
-            r.environment_id, bytes(r.statement), r.signed_by, bytes(r.signature), bytes(r.key), r.expires
-        )
+        return None if r is None else _as_delegation(r)
 
     def store_delegations(self, delegations: Sequence[StoredDelegation]) -> None:
         """Replace the statements about some environments; those that were purged meanwhile are skipped."""
@@ -194,3 +185,9 @@ class Mirrors:
             "environments": environments,
             **({"skipped": skipped} if skipped else {}),
         }
+
+
+def _as_delegation(row: Row[Any]) -> StoredDelegation:
+    return StoredDelegation(
+        row.environment_id, bytes(row.statement), row.signed_by, bytes(row.signature), bytes(row.key), row.expires
+    )

@@ -12,6 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from typing import Any, Final
 
@@ -90,24 +91,7 @@ class Overlays:
                     _queue_for_centre(connection, row, renewed, "overlay.created", *created)
                 return renewed, False
             overlay_id = secrets.token_hex(8)
-            connection.execute(
-                insert(table).values(
-                    id=overlay_id,
-                    environment_id=row.id,
-                    kind=overlay.kind,
-                    state=overlay.state,
-                    level=overlay.level,
-                    polygon=overlay.polygon,
-                    edge=overlay.edge,
-                    crs=overlay.crs,
-                    detail=None if overlay.detail is None else checked_text(overlay.detail, "a detail"),
-                    reporter=checked_text(overlay.reporter, "a reporter"),
-                    created=overlay.created,
-                    expires=overlay.expires,
-                    decided_by=overlay.decided_by,
-                    decided=overlay.decided,
-                )
-            )
+            insert_overlay(connection, row.id, replace(overlay, id=overlay_id))
             stored = _read(connection, row, overlay_id)
             event: EventType = "overlay.accepted" if accepted else "overlay.created"
             append_overlay_event(connection, row, stored, event, stored.reporter, stored.created)
@@ -245,6 +229,28 @@ def require_room(connection: Connection, environment: Row[Any], overlay: Overlay
             f"{environment.name} has reached the limit of {reason} in force: end or keep some first, or "
             "simplify the polygon"
         )
+
+
+def insert_overlay(connection: Connection, environment_id: str, overlay: Overlay) -> None:
+    """Store a new overlay, under its id. Raises Invalid for a text that cannot be stored."""
+    connection.execute(
+        insert(tables.overlay).values(
+            id=overlay.id,
+            environment_id=environment_id,
+            kind=overlay.kind,
+            state=overlay.state,
+            level=overlay.level,
+            polygon=overlay.polygon,
+            edge=overlay.edge,
+            crs=overlay.crs,
+            detail=None if overlay.detail is None else checked_text(overlay.detail, "a detail"),
+            reporter=checked_text(overlay.reporter, "a reporter"),
+            created=overlay.created,
+            expires=overlay.expires,
+            decided_by=overlay.decided_by,
+            decided=overlay.decided,
+        )
+    )
 
 
 def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overlay) -> str | None:

@@ -23,6 +23,7 @@ MAX_ROBOTS: Final = 10_000
 """Default of the number of robots that an environment may have: on a router without users anyone can invent names."""
 
 MAX_PRESENT: Final = 100_000
+"""Maximum number of robots whose presence on the bus is known."""
 
 LAST_SEEN: Final = timedelta(seconds=60)
 """Minimum time between two stored times of a robot whose reports do not change."""

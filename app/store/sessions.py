@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import secrets
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -12,6 +11,7 @@ from sqlalchemy import Connection, Row, delete, insert, select
 
 from app.errors import Conflict, NotFound
 from app.store import tables
+from app.store.base import hash_secret
 from app.store.database import Database
 from app.store.tokens import Tokens
 from app.store.uses import Uses
@@ -61,7 +61,7 @@ class Sessions:
         with self._database.write(notify=False) as connection:
             if self._tokens.check_row(self._lock_token(connection, token_id), store_end=False) is None:
                 raise Conflict(f"token {token_id[:80]!r} has expired: create another one")
-            values = {"hash": _hash(code), "token_id": token_id, "expires": expires}
+            values = {"hash": hash_secret(code), "token_id": token_id, "expires": expires}
             connection.execute(insert(tables.sign_in_code).values(values))
         return code, expires
 
@@ -70,7 +70,7 @@ class Sessions:
         if len(code) > MAX_SECRET:
             return None
         table = tables.sign_in_code
-        condition = table.c.hash == _hash(code)
+        condition = table.c.hash == hash_secret(code)
         with self._database.read() as connection:  # a wrong code does not wait for writers
             if connection.execute(select(table.c.hash).where(condition)).first() is None:
                 return None
@@ -88,7 +88,7 @@ class Sessions:
         """Find a session by its secret, and note its use; None if it or its token has ended."""
         if len(secret) > MAX_SECRET:
             return None
-        table, owner, digest = tables.session, tables.token, _hash(secret)
+        table, owner, digest = tables.session, tables.token, hash_secret(secret)
         query = (
             select(owner, table.c.used.label("session_used"))
             .join(table, table.c.token_id == owner.c.id)
@@ -108,7 +108,7 @@ class Sessions:
         if len(secret) > MAX_SECRET:
             return False
         table = tables.session
-        condition = table.c.hash == _hash(secret)
+        condition = table.c.hash == hash_secret(secret)
         with self._database.read() as connection:
             if connection.execute(select(table.c.hash).where(condition)).first() is None:
                 return False
@@ -143,7 +143,7 @@ class Sessions:
         newest = select(table.c.hash).where(table.c.token_id == token_id).order_by(table.c.used.desc(), table.c.hash)
         kept = connection.execute(newest.limit(MAX_SESSIONS - 1)).scalars().all()
         connection.execute(delete(table).where(table.c.token_id == token_id, table.c.hash.not_in(kept)))
-        values = {"hash": _hash(secret), "token_id": token_id, "created": now, "used": now}
+        values = {"hash": hash_secret(secret), "token_id": token_id, "created": now, "used": now}
         connection.execute(insert(table).values(values))
         return Session(token, now + IDLE), secret
 
@@ -154,7 +154,3 @@ class Sessions:
         if row is None:
             raise NotFound(f"unknown token {token_id[:80]!r}")
         return row
-
-
-def _hash(secret: str) -> str:
-    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()

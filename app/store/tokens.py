@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import logging
 import secrets
@@ -15,7 +14,7 @@ from sqlalchemy.exc import IntegrityError
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
 from app.store.audit import set_audit_target
-from app.store.base import checked_text
+from app.store.base import checked_text, hash_secret
 from app.store.database import Database
 from app.store.uses import Uses
 from app.store.values import Role, Token, rfc3339
@@ -73,7 +72,7 @@ class Tokens:
         set_audit_target(target=f"token {values['id']}")
         try:
             with self._database.write() as connection:
-                connection.execute(insert(tables.token).values(hash=_hash(secret), **values))
+                connection.execute(insert(tables.token).values(hash=hash_secret(secret), **values))
         except IntegrityError as error:
             raise Conflict("this token exists already") from error
         return Token(**values), secret
@@ -92,7 +91,7 @@ class Tokens:
             secret = secrets.token_urlsafe(SECRET_BYTES)
             created = self._database.now()
             values = {"id": secrets.token_hex(8), "name": "administrator", "role": "admin", "created": created}
-            connection.execute(insert(table).values(hash=_hash(secret), **values))
+            connection.execute(insert(table).values(hash=hash_secret(secret), **values))
         return secret
 
     def all(self) -> list[Token]:
@@ -112,7 +111,7 @@ class Tokens:
         """Find the token with this secret, and note its use; None if it is unknown or expired."""
         if len(text) > 4096:
             return None
-        digest = _hash(text)
+        digest = hash_secret(text)
         with self._database.read() as connection:
             row = connection.execute(select(tables.token).where(tables.token.c.hash == digest)).one_or_none()
         if row is None or not hmac.compare_digest(row.hash, digest):
@@ -156,10 +155,6 @@ class Tokens:
             count = int(connection.execute(ending, {"now": now}).rowcount)
         log.info("tokens: expired (count=%d, time=%s)", count, rfc3339(now))
         return count
-
-
-def _hash(secret: str) -> str:
-    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _as_token(row: Row[Any]) -> Token:
