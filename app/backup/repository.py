@@ -197,12 +197,17 @@ class Repository:
         return content
 
     def load_index(self) -> ObjectIndex:
-        """Read which objects the place has, in packs that are complete."""
+        """Read which objects the place has, in packs that are complete.
+
+        Of an object in several packs, that of the newest backup counts: it had left the others.
+        """
+        intact = self.snapshots().intact
+        newest = {pack.name for pack in intact[-1].packs} if intact else set()
         sizes = {file.key.rpartition("/")[2]: file.size for file in self.files.list("packs/")}
         packs: list[PackReference] = []
         entries: list[bytes] = []
-        for file in self.files.list("index/"):
-            name = file.key.rpartition("/")[2]
+        indexes = {file.key.rpartition("/")[2]: file for file in self.files.list("index/")}
+        for name, file in sorted(indexes.items(), key=lambda item: (item[0] not in newest, item[0])):
             content = self._bytes(file.key, file.size)
             index = None if content is None else read_index(name, content, self.key)
             if index is not None and sizes.get(name) == index[0]:

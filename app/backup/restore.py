@@ -136,6 +136,8 @@ class Restorer:
         if count == 1:
             self._pending.files[file] = data
             return
+        if file in self._present:  # another pack has parts of it as well: alone they would replace the whole file
+            return
         path = self._scratch / file.replace("/", "-")
         with path.open("r+b" if path.exists() else "w+b") as out:
             out.seek(number * PART_BYTES)

@@ -19,6 +19,7 @@ from app.backends.blob_s3 import S3Files
 from app.backends.documents import FileDocument
 from app.backends.lead import LeadLostError, LocalLead, open_leads
 from app.backup.keys import collect_keys, key_documents
+from app.backup.packs import Kind
 from app.backup.repository import Snapshot
 from app.backup.retention import parse_rule
 from app.backup.service import opened_place, verify_place
@@ -431,6 +432,42 @@ def test_many_small_packs_are_joined(
     target = empty_store()
     restore_into(target, place, tmp_path / "other")
     assert rows_of(target) == rows_of(sqlite_store)
+
+
+def test_objects_of_packs_that_were_left_are_written_once(
+    sqlite_store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Older backups keep the packs, so that the place has these objects twice."""
+    monkeypatch.setattr("app.backup.create.MANY_PACKS", 4)
+    place, data = tmp_path / "backup", tmp_path / "data"
+    for seed in range(20, 25):
+        save(sqlite_store, "farm", *replaces({GRID: grid(seed=seed)}))
+        back_up(sqlite_store, place, data)
+    joined = back_up(sqlite_store, place, data).snapshot
+    assert len(joined.packs) <= 4
+    for _ in range(4):
+        again = back_up(sqlite_store, place, data).snapshot
+        assert (again.written, set(again.packs)) == (0, set(joined.packs))
+
+
+def test_file_whose_parts_are_in_several_packs_is_restored_whole(
+    sqlite_store: Store, tmp_path: Path, empty_store: NewStore
+) -> None:
+    content = os.urandom(5 * PART_BYTES // 2)
+    name = sqlite_store.blobs.put(content)
+    place = tmp_path / "backup"
+    snapshot = back_up(sqlite_store, place, tmp_path / "data").snapshot
+    with opened_place(str(place), tmp_path, key=lambda _: None) as repository:
+        parts = [e for pack in snapshot.packs for e in repository.read_pack(pack) if e.kind is Kind.PART]
+        large = [e for e in parts if e.data[:4] == (3).to_bytes(4, "big")]
+        writer = repository.writer()
+        for entry in large[:2]:
+            writer.add(entry.kind, entry.name, entry.data)
+        writer.flush()
+        repository.write_snapshot(dataclasses.replace(snapshot, packs=(*snapshot.packs, *writer.packs)))
+    target = empty_store()
+    restore_into(target, place, tmp_path / "other")
+    assert target.blobs.get(name) == content
 
 
 # --- one at a time, and records ---
