@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import json
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -17,43 +16,29 @@ from fnmatch import fnmatchcase
 from itertools import groupby
 from typing import Any, Final
 
-from app.backends.lead import LeadLostError
 from app.errors import (
-    Conflict,
-    DatabaseDamaged,
     Denied,
     FleetMapError,
-    NoRoom,
     NotFound,
-    Unauthenticated,
     Unavailable,
     Untrusted,
 )
-from app.mirror.centre import Centre, CentreUnreachable
+from app.mirror.centre import Centre
 from app.mirror.content import Fetcher
+from app.mirror.failures import NotedFailure
+from app.mirror.statuses import Statuses
 from app.signing import SigningKeys
 from app.store.base import utcnow
 from app.store.edge_changes import QueuedChange
-from app.store.fleet_values import ReceivedReport
 from app.store.mirror_source import FORM
 from app.store.mirror_state import MirrorState, StoredDelegation
 from app.store.mirror_target import MirroredEnvironment, MirrorPage, parse_page, read_time
 from app.store.store import Store
-from app.store.values import rfc3339
 
 log = logging.getLogger(__name__)
 
 REPORTS: Final = 500
 """Maximum number of reports or changes in one request."""
-
-OVERLAP: Final = timedelta(seconds=10)
-"""Statuses are read again for this long: a process may store one after others that were received later."""
-
-OVERLAP_ROWS: Final = 1000
-"""Maximum number of rows of the history that are read again."""
-
-HAND_ON_SECONDS: Final = 10.0
-"""Time of a pass for statuses. Others wait for the next one, so that changes of the centre arrive all the same."""
 
 DELEGATIONS: Final = 500
 """Maximum number of environments in one request for permissions."""
@@ -69,7 +54,9 @@ FULL_PASS: Final = timedelta(minutes=10)
 
 
 class Mirror:
-    """Follows a centre. Not thread-safe. position: of the centre's log, as of the last pass.
+    """Follows a centre. Not thread-safe.
+
+    position: of the centre's log, as of the last pass. left: number of changes that the last pass could not hand on.
 
     Args:
         keys: keys of this server, which the centre permits to sign.
@@ -86,10 +73,9 @@ class Mirror:
     ) -> None:
         self._store, self._keys, self._centre, self._names, self._clock = store, keys, centre, tuple(names), clock
         self._fetcher = Fetcher(store, centre)
-        self.position = 0
+        self.position = self.left = 0
         self._complete: tuple[datetime, int] | None = None
-        self._handed_rows: set[int] = set()
-        self._handed_reports: dict[tuple[str, str], datetime] = {}
+        self._statuses = Statuses(store, centre)
         self._counted = (0, 0)
 
     def run_once(self) -> MirrorState:
@@ -141,7 +127,7 @@ class Mirror:
         local = self._store.mirror_target.environments()
         for item in listing["environments"]:
             if self._is_chosen(str(item["name"])):
-                with _NotedFailure(failures, str(item["name"]), goes_on=True):
+                with NotedFailure(failures, str(item["name"]), goes_on=True):
                     self._sync(item, local.get(str(item["id"])), int(listing["epoch"]))
 
     def _note_problem(self, error: FleetMapError) -> None:
@@ -258,39 +244,11 @@ class Mirror:
         """Hand on changes of overlays, then reports of robots, in their order; returns whether there were changes."""
         waiting = self._store.edge_changes.waiting(REPORTS)
         for environment, group in groupby(waiting, key=lambda change: change.environment):
-            with _NotedFailure(failures, environment, goes_on=True):
+            with NotedFailure(failures, environment, goes_on=True):
                 self._hand_on_changes(environment, list(group))
-        self._hand_on_statuses(state)
+        self.left = self._store.edge_changes.count_waiting() if failures else 0
+        self._statuses.hand_on(state)
         return bool(waiting)
-
-    def _hand_on_statuses(self, state: MirrorState) -> None:
-        """Hand on statuses in the order in which they were stored, then the robots' present ones with their places."""
-        reports, start, recent = self._store.edge_changes, time.monotonic(), self._store.now() - OVERLAP
-        skipped = {name: dict(one) for name, one in (state.skipped or {}).items()}
-        if skipped:
-            mirrored = {one.name for one in self._store.mirror_target.environments().values() if one.centre}
-            skipped = {name: one for name, one in skipped.items() if name in mirrored}
-        row = state.reported - OVERLAP_ROWS
-        while rows := reports.reports_after(row, REPORTS, handed=state.reported, since=recent):
-            row = rows[-1][0]
-            if new := [report for number, report in rows if number not in self._handed_rows]:
-                self._hand_on_reports(new, skipped, counted=True)
-                self._handed_rows.update(number for number, _ in rows)
-                self._store.mirrors.save(reported=max(row, state.reported), skipped=skipped)
-            if time.monotonic() - start > HAND_ON_SECONDS:
-                break
-        self._handed_rows = {number for number in self._handed_rows if number > row - 2 * OVERLAP_ROWS}
-        seen = None if state.seen is None else state.seen - OVERLAP
-        while current := reports.current_reports(seen, REPORTS):
-            seen = current[-1].time
-            if new := [one for one in current if self._handed_reports.get((one.environment, one.robot)) != one.time]:
-                self._hand_on_reports(new, skipped, counted=False)
-                self._handed_reports.update({(one.environment, one.robot): one.time for one in current})
-                self._store.mirrors.save(seen=max(seen, state.seen or seen), skipped=skipped)
-            if time.monotonic() - start > HAND_ON_SECONDS:
-                break
-        if seen is not None:
-            self._handed_reports = {key: at for key, at in self._handed_reports.items() if at > seen - 2 * OVERLAP}
 
     def _hand_on_changes(self, environment: str, changes: Sequence[QueuedChange]) -> None:
         outcome = self._centre.report(environment, changes=[_change_as_json(change.body) for change in changes])
@@ -298,29 +256,6 @@ class Mirror:
             if result["problem"] is not None:
                 log.warning("mirror: refused by the centre (environment=%s): %s", environment, result["problem"])
             self._store.edge_changes.settle(change, result["problem"], result["overlay"])
-
-    def _hand_on_reports(
-        self, reports: Sequence[ReceivedReport], skipped: dict[str, dict[str, Any]], *, counted: bool
-    ) -> None:
-        """Hand on statuses of robots. Those that the centre refuses are skipped, which ``skipped`` says.
-
-        counted: whether these are changed statuses; the present ones, which follow them, count once.
-        """
-        ordered = sorted(reports, key=lambda report: report.environment)  # stable: each robot's order stays
-        for environment, group in groupby(ordered, key=lambda report: report.environment):
-            statuses = [_report_as_json(report) for report in group]
-            refusals: dict[str, str] = {}
-            with _NotedFailure(refusals, environment):
-                self._centre.report(environment, statuses=statuses)
-            if not refusals:
-                if skipped.pop(environment, None) is not None:
-                    log.info("mirror: the centre accepts statuses again (environment=%s)", environment)
-                continue
-            problem = refusals[environment]
-            if environment not in skipped:
-                log.warning("mirror: statuses of robots are skipped (environment=%s): %s", environment, problem)
-            before = skipped.get(environment, {"statuses": 0})["statuses"]
-            skipped[environment] = {"statuses": before + (len(statuses) if counted else 0), "problem": problem}
 
     # --- permissions ---
 
@@ -340,7 +275,7 @@ class Mirror:
                 self._request_permissions(some, public)
             except (NotFound, Denied):  # one of them: find out which
                 for one in some:
-                    with _NotedFailure(failures, one.name):
+                    with NotedFailure(failures, one.name):
                         self._request_permissions([one], public)
 
     def _request_permissions(self, environments: Sequence[MirroredEnvironment], public: bytes) -> None:
@@ -364,33 +299,6 @@ class Mirror:
         self._store.mirrors.store_delegations(stored)
 
 
-class _NotedFailure:
-    """Context that notes an environment's failure and goes on; failures of the whole centre pass.
-
-    goes_on: note also that something is unavailable, such as damaged content at the centre, as long as the centre can
-    be reached: so no environment keeps the others from being mirrored.
-    """
-
-    def __init__(self, failures: dict[str, str], environment: str, *, goes_on: bool = False) -> None:
-        self._failures, self._environment, self._goes_on = failures, environment, goes_on
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        is_own = isinstance(error, NotFound | Conflict | Untrusted | Denied) and not isinstance(error, Unauthenticated)
-        is_own = is_own or (self._goes_on and isinstance(error, Unavailable) and not _is_general(error))
-        if not is_own or not isinstance(error, FleetMapError):
-            return False
-        self._failures[self._environment] = error.detail
-        return True
-
-
-def _is_general(error: Unavailable) -> bool:
-    """Return whether no environment can be mirrored now: no connection, no lead, no disk space."""
-    return isinstance(error, CentreUnreachable | LeadLostError | NoRoom | DatabaseDamaged)
-
-
 def _has_diverged(page: MirrorPage, local: MirroredEnvironment) -> bool:
     """Return whether the centre's history is another one than that of the mirror."""
     if page.upto < local.sequence:
@@ -409,26 +317,3 @@ def _change_as_json(body: Mapping[str, Any]) -> dict[str, Any]:
         name: value for name, value in body["overlay"].items() if name not in ("environment", "state", "version")
     }
     return {**body, "overlay": overlay}
-
-
-def _report_as_json(received: ReceivedReport) -> dict[str, Any]:
-    report = received.report
-    members: dict[str, Any] = {
-        "channel": report.channel,
-        "version": report.version,
-        "root": report.root,
-        "state": report.state,
-        "detail": report.detail,
-        "time": None if report.reported_at is None else rfc3339(report.reported_at),
-        "sequence": report.sequence,
-        "overlays": report.overlays,
-        "holds": None if report.holds is None else {"version": report.holds[0], "root": report.holds[1]},
-        **({} if report.place is None else report.place.as_dict()),
-    }
-    status = {name: value for name, value in members.items() if value is not None}
-    return {
-        "robot": received.robot,
-        "status": status,
-        "received": rfc3339(received.time),
-        "vouched": received.vouched,
-    }

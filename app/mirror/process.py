@@ -43,7 +43,7 @@ def run(store: Store, centre: Centre, mirror: Mirror, lead: Lead, stop: threadin
         if _attempt(mirror, lead, first=failures == 0):
             failures = 0
             news.clear()  # what happened during the pass is after its position: the watcher finds it
-            _wait(store, generation, news, stop)
+            _wait(store, generation, mirror.left, news, stop)
         else:
             failures += 1
             pause = min(MAX_PAUSE_SECONDS, 0.5 * 2 ** min(failures, 10))
@@ -67,14 +67,14 @@ def _attempt(mirror: Mirror, lead: Lead, *, first: bool) -> bool:
     return True
 
 
-def _wait(store: Store, generation: int, news: threading.Event, stop: threading.Event) -> None:
-    """Wait until the centre has news, this server has something to hand on, or PASS_SECONDS have passed."""
+def _wait(store: Store, generation: int, left: int, news: threading.Event, stop: threading.Event) -> None:
+    """Wait until the centre has news, this server has more to hand on than was left, or PASS_SECONDS have passed."""
     end = time.monotonic() + PASS_SECONDS
     while time.monotonic() < end and not news.is_set() and not stop.wait(POLL_SECONDS):
         if store.generation() != generation:
             generation = store.generation()
             try:
-                if store.edge_changes.count_waiting():
+                if store.edge_changes.count_waiting() > left:
                     return
             except FleetMapError:
                 return

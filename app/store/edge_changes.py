@@ -152,6 +152,11 @@ class EdgeChanges:
                     update(owner).where(owner.c.id == row.id).values(edge_sequence=owner.c.edge_sequence + 1)
                 )
 
+    def newest_report(self) -> int:
+        """Return the number of the newest row of the history of robots' reports, 0 without any."""
+        with self._database.read() as connection:
+            return int(connection.execute(select(func.max(tables.robot_history.c.id))).scalar() or 0)
+
     def reports_after(self, id: int, limit: int, *, handed: int, since: datetime) -> list[tuple[int, ReceivedReport]]:
         """List reports of robots in mirrored environments after a row of the history, in order, each with its row.
 

@@ -15,6 +15,7 @@ from sqlalchemy import delete, insert, select
 from app.errors import Unavailable
 from app.events import messages
 from app.mirror.follow import FULL_PASS
+from app.mirror.process import PASS_SECONDS
 from app.store import tables
 from tests.api.conftest import Api, create_farm
 from tests.events.conftest import Listener, client_config, eventually
@@ -169,7 +170,9 @@ def test_late_status_is_history(centre: Api, site: Api, farm: str, follower: Mak
     assert sorted(line["version"] for line in there["history"]) == [1, 3]
 
 
-def test_statuses_that_are_stored_late_reach_the_centre(centre: Api, site: Api, farm: str, follower: Make) -> None:
+def test_statuses_that_are_stored_late_reach_the_centre(
+    centre: Api, site: Api, farm: str, follower: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of two processes that store reports at once, the first one to read its clock and its row may commit last."""
     edge, database = follower(farm), site.app.state.services.store._database
     edge.follow()
@@ -186,7 +189,8 @@ def test_statuses_that_are_stored_late_reach_the_centre(centre: Api, site: Api, 
     with database.write() as connection:
         for table, values in rows.items():
             connection.execute(insert(table).values(values))
-    edge.wire.paths.clear()
+    later = database.now() + timedelta(seconds=PASS_SECONDS)
+    monkeypatch.setattr(database, "now", lambda: later)
     edge.follow()
     there = centre.get(f"robots/mower-4?environment={farm}").json()
     assert (there["version"], len(there["history"])) == (1, 1)
@@ -199,7 +203,7 @@ def test_statuses_that_are_stored_late_reach_the_centre(centre: Api, site: Api, 
 def test_pass_ends_while_robots_report(
     centre: Api, site: Api, farm: str, follower: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.mirror.follow.HAND_ON_SECONDS", 0.0)
+    monkeypatch.setattr("app.mirror.statuses.PASS_SECONDS", 0.0)
     edge, arrivals = follower(farm), itertools.count()
     edge.follow()
 
