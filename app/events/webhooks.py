@@ -249,7 +249,8 @@ class Courier:
                 self._fail(attempt)
                 return False
             if attempt.outcome == "refused":
-                self._put_lag(Lag(event.environment_id, event.environment, event.position - 1, Attempts()), attempt)
+                lag = Lag(event.environment_id, event.environment, event.position - 1, Attempts())
+                self._put_lag(lag, attempt, event.position)
             else:
                 self._delivered = _now()
         self._position = event.position
@@ -259,6 +260,8 @@ class Courier:
         """Deliver the events of an environment that waits; return False to stop, since the receiver is not reached."""
         start = lag.position
         while events := self._store.webhooks.lagging_events(lag, self._position, PAGE):
+            if lag.position != start:  # else, or if these were the last, the next process would find none to deliver
+                self._store.webhooks.put_lag(self._id, self._position, lag)
             for event in events:
                 if self._is_ending():
                     self._store.webhooks.put_lag(self._id, self._position, lag)
@@ -269,9 +272,6 @@ class Courier:
                         return self._stop_catching_up(lag, attempt)
                     self._delivered = _now()
                 lag = Lag(lag.environment_id, lag.environment, event.position, Attempts())
-            if len(events) < PAGE:
-                break  # these were the last
-            self._store.webhooks.put_lag(self._id, self._position, lag)
         # It waits for at least one event: if there is none any more, it was removed with its environment.
         if lag.position == start and not self._send_resync(lag.environment, lag.position + 1, self._position):
             return False
@@ -283,7 +283,7 @@ class Courier:
     def _stop_catching_up(self, lag: Lag, attempt: Attempt) -> bool:
         """Store how far an environment is; return False if the receiver is not reached."""
         if attempt.outcome == "refused":
-            self._put_lag(lag, attempt)
+            self._put_lag(lag, attempt, self._position)
             return True
         self._store.webhooks.put_lag(self._id, self._position, lag)
         self._fail(attempt)
@@ -302,10 +302,11 @@ class Courier:
         self._delivered = _now()
         return True
 
-    def _put_lag(self, lag: Lag, attempt: Attempt) -> None:
+    def _put_lag(self, lag: Lag, attempt: Attempt, position: int) -> None:
+        """Store that an environment has to wait. position: up to which the others' events were delivered."""
         attempts = next_attempts(lag.attempts, attempt)
         waiting = Lag(lag.environment_id, lag.environment, lag.position, attempts)
-        self._store.webhooks.put_lag(self._id, self._position, waiting)
+        self._store.webhooks.put_lag(self._id, position, waiting)
         self._lags[lag.environment_id] = waiting
         if attempts.failures == 1:
             log.warning("webhooks: refused (webhook=%s, environment=%s): %s", self._id, lag.environment, attempt.detail)

@@ -288,8 +288,9 @@ def test_full_disk_does_not_repeat_deliveries(
 def test_interrupted_end_of_a_wait_tells_of_no_removed_events(
     store: Store, receiver: Receiver, start: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The server ends right after it has stored that all was delivered."""
+    """The server ends right after it has delivered all, of which there were two full pages."""
     monkeypatch.setattr("app.events.webhooks.PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr("app.events.webhooks.PAGE", 2)
     end, ended = store.webhooks.end_lag, []
 
     def interrupted(*args: Any) -> None:
@@ -301,11 +302,27 @@ def test_interrupted_end_of_a_wait_tells_of_no_removed_events(
     monkeypatch.setattr(store.webhooks, "end_lag", interrupted)
     webhook = hook(store, receiver)
     store.environments.create("farm")
+    promote(store, "farm", 3)
     lag = Lag(store.environments.get("farm").id, "farm", 0, Attempts())
-    store.webhooks.put_lag(webhook.id, 1, lag)
+    store.webhooks.put_lag(webhook.id, 4, lag)
     start()
-    promote(store, "farm", 1)
-    eventually(lambda: len(ended) > 1 and len(set(receiver.sequences("farm"))) == 2)
+    eventually(lambda: len(ended) > 1)
+    assert set(receiver.sequences("farm")) == {1, 2, 3, 4}
+    assert [e["type"] for e in receiver.events if e["type"] == "resync"] == []
+
+
+def test_server_that_takes_over_a_wait_tells_of_no_removed_events(store: Store, receiver: Receiver, start: Any) -> None:
+    receiver.answer = lambda _, __: 422
+    webhook = hook(store, receiver)
+    first = start()
+    store.environments.create("farm")
+    eventually(lambda: store.webhooks.lags(webhook.id))
+    first.close()
+    receiver.answer = lambda _, __: 204
+    store.webhooks.retry_now(webhook.id)
+    start()
+    eventually(lambda: not store.webhooks.lags(webhook.id))
+    assert receiver.sequences("farm") == [1]
     assert [e["type"] for e in receiver.events if e["type"] == "resync"] == []
 
 
