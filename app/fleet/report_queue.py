@@ -234,13 +234,16 @@ class ReportQueue:
         return out
 
     def _write(self, batch: list[_QueuedReport]) -> None:
-        """Store reports. Raises LeadLostError for those from Zenoh if another server has taken over."""
+        """Store reports, and take them out of the list.
+
+        Raises LeadLostError for those from Zenoh if another server has taken over.
+        """
         self._write_batch([queued for queued in batch if queued.result is not None])
-        from_bus = [queued for queued in batch if queued.result is None]
-        if self._term is not None:
-            for start in range(0, len(from_bus), BATCH):  # after a takeover there are up to MAX_STAND_BY
-                with self._term.fenced():
-                    self._write_batch(from_bus[start : start + BATCH])
+        batch[:] = [queued for queued in batch if queued.result is None]
+        while batch and self._term is not None:  # after a takeover there are up to MAX_STAND_BY
+            with self._term.fenced():
+                self._write_batch(batch[:BATCH])
+            del batch[:BATCH]
 
     def _write_batch(self, batch: list[_QueuedReport]) -> None:
         if not batch:
