@@ -172,7 +172,11 @@ CASES: Mapping[str, tuple[int, Series, Series]] = {
     "FleetmapWorkersMissing warning": (
         5,
         {server("fleetmap_queue_workers"): "2 0x9", server("fleetmap_queue_workers", instance="b"): "2 0x9"},
-        {server("fleetmap_queue_workers"): "0x9", server("fleetmap_queue_workers", instance="b"): "0x9"},
+        {
+            server("fleetmap_queue_workers"): "2 0x9",
+            server("fleetmap_queue_workers", instance="b"): "2x9",
+            server("fleetmap_queue_workers", job="without-workers"): "0x9",
+        },
     ),
     "FleetmapCertificateEnds critical": (
         7,
