@@ -53,7 +53,7 @@ class JobStarted:
 
 @dataclass(slots=True)
 class _RunningConversion:
-    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id, of which naming locks.
+    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id.
 
     shared: job that waits for a worker of all servers, if one makes the map. noted: the progress that its jobs show.
     """
@@ -65,7 +65,7 @@ class _RunningConversion:
     stop: CancelHandle = field(default_factory=CancelHandle)
     waiters: int = 0
     jobs: dict[str, str] = field(default_factory=dict)
-    naming: asyncio.Lock = field(default_factory=asyncio.Lock)
+    creating: dict[str, asyncio.Lock] = field(default_factory=dict)
     shared: Job | None = None
     noted: Progress = field(default_factory=Progress)
 
@@ -119,7 +119,7 @@ class ConversionJobs:
             if done:
                 return running.future.result()
             try:
-                async with running.naming:  # requests of one principal share a job
+                async with running.creating.setdefault(principal.id, asyncio.Lock()):  # one job for all its requests
                     job_id = running.jobs.get(principal.id)
                     if job_id is not None:
                         return JobStarted(await run_in_threadpool(self._store.jobs.get, job_id))
