@@ -42,7 +42,7 @@ def level_problem(manifest: Manifest, level: str | None) -> str | None:
     names = ", ".join(level_names(manifest)) or "none"
     return (
         f"version {manifest.version} has no level {level!r}, which the robot is on (levels: {names}): "
-        "choose another with fleetmap agent-level"
+        "choose another with fleetmap agent-level, and with --next if this map names the levels otherwise"
     )
 
 
@@ -76,6 +76,8 @@ def load_level(
     level: str,
     variables: Callable[[MapDirectory, Manifest, Sequence[str], Sequence[str], str | None, str], Mapping[str, str]],
     log: Callable[..., None],
+    *,
+    for_next_map: bool = False,
 ) -> None:
     """Run the agent's hooks for one level of the current map, and store the level.
 
@@ -83,11 +85,13 @@ def load_level(
 
     Args:
         variables: builds the hook variables from directory, manifest, changed files and layers, level and robot.
+        for_next_map: only store the level, which the next map has and the current one has not.
 
     Raises:
         NotFound: no map is installed, or it has no such level.
-        Conflict: no agent has run in the directory, or it belongs to another user.
-        Unavailable: a hook failed; the level stays as it was.
+        Conflict: no agent has run in the directory, or it belongs to another user; the current map has the level
+            that is for the next one.
+        Unavailable: a hook failed; the level stays as it was, and its hooks were run again.
     """
     folder = MapDirectory(directory)
     commands, robot = _read_hooks(folder.path / "hooks.json")
@@ -96,15 +100,29 @@ def load_level(
         if manifest is None:
             raise NotFound(f"no map in {directory} yet: wait for the agent's first sync")
         names = level_names(manifest)
-        if level not in names:
+        if for_next_map and level in names:
+            raise Conflict(f"the current map has the level {level}: load it without --next")
+        if not for_next_map and level not in names:
             choice = f"choose one of {', '.join(names)}" if names else "the map has no levels"
-            raise NotFound(f"unknown level {level[:80]!r}: {choice}")
+            raise NotFound(f"unknown level {level[:80]!r}: {choice}, or add --next if the next map has it")
+
+        def run(of: str | None) -> str | None:
+            """Run the hooks for a level; None: the default one. Return the problem of the first that fails."""
+            files = sorted(manifest.content) if of is None else level_files(manifest, of)
+            values = variables(folder, manifest, files, sorted(manifest.layers), of, robot)
+            for command in commands:
+                if (problem := hooks.run(command, values)) is not None:
+                    return problem
+                log("hook", command=command, version=manifest.version, level=of)
+            return None
+
         folder.hook_status.unlink(missing_ok=True)
-        values = variables(folder, manifest, level_files(manifest, level), sorted(manifest.layers), level, robot)
-        for command in commands:
-            if (problem := hooks.run(command, values)) is not None:
-                raise Unavailable(f"could not load level {level}: {problem}")
-            log("hook", command=command, version=manifest.version, level=level)
+        if not for_next_map and (problem := run(level)) is not None:
+            before = read_level(folder)
+            again = run(before)
+            outcome = "is loaded again" if again is None else f"could not be loaded again either ({again})"
+            name = "the default level" if before is None else f"level {before}"
+            raise Unavailable(f"could not load level {level}: {problem}; {name} {outcome}")
         write_durably(folder.path / "level", level.encode() + b"\n")
         log("level", level=level, version=manifest.version)
 

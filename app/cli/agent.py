@@ -249,6 +249,9 @@ def _run(agent: Agent, *, once: bool) -> None:
 def agent_level(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of the agent (`--into`).")],
     level: Annotated[str, typer.Argument(help="New level of the robot, one of `current/levels.json`.")],
+    for_next_map: Annotated[
+        bool, typer.Option("--next", help="Only store the level: the next map has it, the current one has not.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each event.")] = False,
 ) -> None:
     """Load another level of the robot's map, for example after a ride in a lift.
@@ -261,7 +264,7 @@ def agent_level(
     from app.agent.activation import hook_variables
     from app.agent.levels import load_level
 
-    load_level(directory, level, hook_variables, _logger(as_json=as_json))
+    load_level(directory, level, hook_variables, _logger(as_json=as_json), for_next_map=for_next_map)
 
 
 def _logger(*, as_json: bool) -> Callable[..., None]:

@@ -52,9 +52,9 @@ def robot(fake: Fake, tmp_path: Path) -> Robot:
     return make
 
 
-def load(into: Path, level: str) -> list[dict[str, Any]]:
+def load(into: Path, level: str, **more: Any) -> list[dict[str, Any]]:
     lines: list[dict[str, Any]] = []
-    load_level(into, level, hook_variables, lambda event, **members: lines.append({"event": event, **members}))
+    load_level(into, level, hook_variables, lambda event, **members: lines.append({"event": event, **members}), **more)
     return lines
 
 
@@ -184,6 +184,36 @@ def test_agent_level_loads_a_level_and_remembers_it(fake: Fake, robot: Robot, tm
     assert (tmp_path / "taken").read_text() == "L2|L2|tmap2/network.tmap2.yaml\n"
     load(one.into, "ground")
     assert (tmp_path / "taken").read_text().startswith("ground||")
+
+
+def test_level_before_is_loaded_again_if_another_cannot_be(robot: Robot, tmp_path: Path) -> None:
+    """One command may have loaded its part of the new level when the next one fails."""
+    first = f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded'
+    one = robot(first, f'test ! -e {tmp_path}/bad -o "$FLEETMAP_LEVEL" != L2')
+    assert one.once()
+    (tmp_path / "bad").touch()
+    with pytest.raises(Unavailable, match=r"could not load level L2: .*; the default level is loaded again"):
+        load(one.into, "L2")
+    assert (tmp_path / "loaded").read_text().split("\n") == ["", "L2", "", ""]
+    load(one.into, "ground")
+    with pytest.raises(Unavailable, match=r"could not load level L2: .*; level ground is loaded again"):
+        load(one.into, "L2")
+    assert (tmp_path / "loaded").read_text().split() == ["L2", "ground", "L2", "ground"]
+    assert (one.into / "level").read_text() == "ground\n"
+
+
+def test_robot_follows_a_map_with_renamed_levels(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    one = robot(f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded')
+    assert one.once()
+    load(one.into, "L2")
+    fake.levels = {path: f"new-{level}" for path, level in LEVELS.items()}
+    fake.put({path: data + b"\n" for path, data in SITE.items()})
+    assert not robot(f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded').once()
+    with pytest.raises(Conflict, match="the current map has the level ground"):
+        load(one.into, "ground", for_next_map=True)
+    assert load(one.into, "new-L2", for_next_map=True) == [{"event": "level", "level": "new-L2", "version": 1}]
+    assert robot(f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded').once()
+    assert (tmp_path / "loaded").read_text().splitlines() == ["", "L2", "new-L2"]
 
 
 def test_agent_level_refuses_what_it_cannot_load(fake: Fake, robot: Robot, tmp_path: Path) -> None:
