@@ -186,6 +186,8 @@ def test_switch_level_service_loads_level(graph: Graph, folder: Path) -> None:
 def test_node_restarts_stopped_agent(graph: Graph, folder: Path) -> None:
     graph.services["/map_server/load_map"] = load_map()
     (folder.parent / "calls.end").touch()
+    program = folder.parent / "bin" / "fleetmap"
+    graph.parameters["fleetmap"] = str(program)
     node = configured(graph, folder)
     node.on_activate(None)
     calls = folder.parent / "calls"
@@ -195,6 +197,11 @@ def test_node_restarts_stopped_agent(graph: Graph, folder: Path) -> None:
     eventually(lambda: len(graph.latched["/fleetmap_agent/status"]) == 2)
     node._agent._process.send_signal(signal.SIGKILL)
     eventually(lambda: len(calls.read_text().splitlines()) == 3)
+    program.rename(program.with_name("away"))  # as during an upgrade
+    node._agent._process.send_signal(signal.SIGKILL)
+    eventually(lambda: any(f"could not run {program}" in text for _, text in graph.log))
+    program.with_name("away").rename(program)
+    eventually(lambda: len(calls.read_text().splitlines()) == 4)
     node.stop()
     assert node._agent is None
 
@@ -269,6 +276,22 @@ def test_ros_hook_fails_without_node(tmp_path: Path) -> None:
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert "no response from the node fleetmap_agent" in ended.stdout
+
+
+def test_hooks_are_answered_after_an_unexpected_error(tmp_path: Path) -> None:
+    def load(given: Any) -> tuple[bool, list[str]]:
+        if given["FLEETMAP_CURRENT"] == "large":
+            raise MemoryError("too large a grid")
+        return True, ["done"]
+
+    server = control.HookServer(load, lambda *_: None)
+    answers = []
+    for current in ("large", "small"):
+        command = f"FLEETMAP_CURRENT={current} {server.command}"
+        ended = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+        answers.append((ended.returncode, ended.stdout))
+    server.close()
+    assert answers == [(1, "could not load the map: MemoryError('too large a grid')\n"), (0, "done\n")]
 
 
 def test_hook_socket_is_private_and_removed_with_node(tmp_path: Path) -> None:

@@ -257,7 +257,10 @@ class HookServer:
             variables = {str(name): str(value) for name, value in body.items()}
         except (ValueError, AttributeError):
             return False, ["invalid request of the hook"]
-        ok, lines = self._loader(variables)
+        try:
+            ok, lines = self._loader(variables)
+        except Exception as error:  # noqa: BLE001  this thread also answers the hooks that follow
+            ok, lines = False, [f"could not load the map: {error!r}"]
         for line in lines:
             self._log("info" if ok else "warn", line)
         return ok, lines
@@ -334,15 +337,17 @@ class AgentProcess:
             status = process.wait()
             if self._stopping.is_set():
                 return
-            self.log("error", f"the agent exited with status {status}; restarting it in {pause:g} seconds")
-            if self._stopping.wait(pause):
-                return
-            pause = min(MAX_PAUSE_SECONDS, pause * 2)
-            try:
-                process = self._spawn()
-            except SettingsError as error:
-                self.log("error", str(error))
-                return
+            reason = f"the agent exited with status {status}"
+            while True:
+                self.log("error", f"{reason}; restarting it in {pause:g} seconds")
+                if self._stopping.wait(pause):
+                    return
+                pause = min(MAX_PAUSE_SECONDS, pause * 2)
+                try:
+                    process = self._spawn()
+                    break
+                except SettingsError as error:  # during an upgrade, for example
+                    reason = str(error)
             if self._stopping.is_set():
                 process.terminate()
 
