@@ -102,6 +102,7 @@ class StatusReporter:
             return
         except FleetMapError as error:
             self._refused(f"the server rejects the robot's status: {error.detail}")
+            return
         self._sent_http, self._sent_http_at, self.confirm_at = status, now, None
         self._is_confirmed = True
 
