@@ -18,6 +18,7 @@ from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from app.agent.state import Mark
+from app.dangerous_variables import DANGEROUS_VARIABLE
 from app.errors import Untrusted
 
 MAX_CLOCK_SKEW = timedelta(seconds=60)
@@ -43,10 +44,6 @@ _TIME = re.compile(
     re.ASCII,
 )
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
-_FORBIDDEN = re.compile(
-    r"PATH|ENV|IFS|HOME|SHELL|(LD|DYLD|BASH|GIT|SSH|FLEETMAP)_\w*|PYTHON\w*|\w*_PRELOAD|\w*LIBRARY_PATH"
-)
-"""Variables that the robot refuses even if they are signed; the server never sends them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +257,7 @@ def _check_variables(variables: Mapping[str, str]) -> None:
         raise Untrusted(f"manifest has {len(variables)} variables, more than {MAX_VARIABLES}")
     for name, value in variables.items():
         fine = _VARIABLE.fullmatch(name) and isinstance(value, str) and (value.isprintable() or not value)
-        if not fine or _FORBIDDEN.fullmatch(name):
+        if not fine or DANGEROUS_VARIABLE.fullmatch(name):
             raise Untrusted(f"manifest contains the forbidden or invalid variable {name[:80]!r}")
 
 

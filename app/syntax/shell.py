@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from app.dangerous_variables import DANGEROUS_VARIABLE
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.model.frame import is_writable
 
@@ -66,14 +67,6 @@ _OPENS = frozenset({"if", "case", "for", "while", "until", "select", "{"})
 _CLOSES = frozenset({"fi", "esac", "done", "}"})
 _LEADS = frozenset({"then", "do", "else", "elif", "!", "time"})
 """Words before another command."""
-
-_DANGEROUS = re.compile(
-    r"PATH|ENV|IFS|SHELL|SHELLOPTS|CDPATH|HOME|USER|LOGNAME|TMPDIR|EDITOR|VISUAL|PAGER|BROWSER|PS[0-4]|PROMPT_COMMAND"
-    r"|(LD|DYLD|BASH|ZSH|GIT|SSH|SUDO|LUA|GCONV|FLEETMAP)_\w*|PYTHON\w*|PERL\w*|RUBY\w*|NODE_(OPTIONS|PATH)"
-    r"|(JAVA|JDK|JAVA_TOOL)_(OPTIONS|OPTS|HOME)|BASHOPTS|_JAVA_OPTIONS|CLASSPATH|MALLOC_\w+|GLIBC_\w+|\w*LIBRARY_PATH|\w*PLUGIN_PATH|\w*PREFIX_PATH"
-    r"|RMW_IMPLEMENTATION|LOCPATH|NLSPATH|\w*_PRELOAD|\w*_PROXY|\w*_proxy"
-)
-"""Names of variables that control what a program loads, starts or connects to."""
 
 
 def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
@@ -161,7 +154,7 @@ def exports(values: Mapping[str, str]) -> bytes:
 
 def _unfit_reason(name: str, value: str, variables: Mapping[str, str]) -> str:
     """Return why a variable must not be exported, or an empty text."""
-    if _DANGEROUS.fullmatch(name):
+    if DANGEROUS_VARIABLE.fullmatch(name):
         return "the variable controls how programs run"
     if not is_writable(value):
         return "its value has control characters"

@@ -124,7 +124,10 @@ def recover(robot: Start, gate: Gate) -> None:
     assert whole(one.into)["version"] == 2
 
 
-VARIABLES = ({"LD_PRELOAD": "/x"}, {"PATH": "/x"}, {"A B": "1"}, {"A;rm": "1"}, {"A": "1\n2"}, {"A": 7}, [1], "x")
+VARIABLES = (
+    *({name: "/x"} for name in ("LD_PRELOAD", "PATH", "PROMPT_COMMAND", "GAZEBO_PLUGIN_PATH", "A B", "A;rm")),
+    *({"A": "1\n2"}, {"A": 7}, [1], "x"),
+)
 
 
 def test_variables_that_change_how_programs_run_are_refused(lagging: str, robot: Start, gate: Gate, keys: Keys) -> None:
