@@ -70,8 +70,8 @@ class Settings(RetentionSettings):
     tls_key: Path | None = Field(default=None, description="Private key of `tls_certificate` (PEM).")
     public_url: str | None = Field(
         default=None,
-        description="Address of the server for its clients, such as `https://maps.example.org/fleet`, for absolute "
-        "links below `/ogc`. Set it behind a proxy. Unset: scheme and `Host` of the request.",
+        description="Address of the server for its clients, such as `https://maps.example.org/fleet`, for "
+        "absolute links. Set it behind a proxy. Unset: scheme and `Host` of the request.",
     )
     workers: int = Field(default=1, ge=1, le=256, description="Number of processes that serve requests.")
     admin_token: SecretStr | None = Field(

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.http.addresses import MapRequest, resolve_recipe
+from app.api.http.addresses import MapRequest, origin, resolve_recipe
 from app.api.http.auth import Principal, Viewer
 from app.api.http.conversions import JobStarted, job_started_response
 from app.api.http.dependencies import Services, ServicesDep
@@ -146,7 +146,7 @@ async def link_to(
     path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"
     path += "" if file is None else f"/{file}"
 
-    base = str(request.base_url).rstrip("/")
+    base = origin(request, services.options.public_url)
     if not signed:
         return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, map_file)
 

@@ -8,12 +8,13 @@ from fastapi import Path
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
+from app.api.http.addresses import origin
 from app.api.http.auth import Viewer
 from app.api.http.responses import API
 from app.errors import NotFound
 from app.ogc.footprints import geotiff_map, raster_parts
 from app.ogc.routing import both, ogc_router
-from app.ogc.service import Service, origin
+from app.ogc.service import Service
 
 TIFF = "image/tiff; application=geotiff; profile=cloud-optimized"
 SECONDS = 3600

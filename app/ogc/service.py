@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
+from app.api.http.addresses import origin
 from app.api.http.auth import Viewer
 from app.api.http.caching import cache_control, none_match
 from app.api.http.dependencies import Services, ServicesDep
@@ -30,8 +30,6 @@ FRESH_SECONDS = 0.1
 """Seconds for which a resolved address is cached: commits of other servers are visible within that time."""
 
 MAX_RESOLVED = 256
-
-_AUTHORITY = re.compile(r"[A-Za-z0-9._-]{1,255}(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]{2,60}\](:[0-9]{1,5})?")
 
 Link = Mapping[str, str]
 """Link as JSON: ``href``, ``rel``, ``type``, ``title``."""
@@ -121,17 +119,6 @@ class Service:
     def choose(self, offers: Mapping[str, str] = PAGES) -> str:
         """Return the requested representation."""
         return choose(self.request, offers)
-
-
-def origin(request: Request, public_url: str | None) -> str:
-    """Return the server's address for absolute links: the configured one, else scheme and ``Host`` of the request."""
-    if public_url is not None:
-        return public_url.rstrip("/")
-    host = request.headers.get("host", "")
-    if _AUTHORITY.fullmatch(host) is None:
-        server = request.scope.get("server") or ("localhost", None)
-        host = server[0] if server[1] is None else f"{server[0]}:{server[1]}"
-    return f"{request.url.scheme}://{host}"
 
 
 async def current_service(env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer) -> Service:

@@ -29,6 +29,9 @@ _ENVIRONMENT: Final = select(tables.environment).where(tables.environment.c.name
 _LOCKED_ENVIRONMENT: Final = _ENVIRONMENT.with_for_update()
 
 
+_NOT_IN_XML: Final = re.compile("[\\x00-\\x08\\x0b\\x0c\\x0e-\\x1f\\ufffe\\uffff]")
+
+
 def utcnow() -> datetime:
     """Return the current time, in UTC."""
     return datetime.now(UTC)
@@ -39,6 +42,13 @@ def checked_text(value: str, label: str, longest: int = MAX_TEXT) -> str:
     if len(value) > longest or "\x00" in value or any("\ud800" <= c <= "\udfff" for c in value):
         raise Invalid(f"{label} must have at most {longest} characters, none of them NUL or half of a surrogate pair")
     return value
+
+
+def checked_prose(value: str, label: str) -> str:
+    """Check a text that XML documents have, too: no control characters but tabs and line ends. Raises Invalid."""
+    if _NOT_IN_XML.search(value):
+        raise Invalid(f"{label} must have no control characters")
+    return checked_text(value, label)
 
 
 def storable_text(value: str) -> str:

@@ -23,6 +23,7 @@ from app.store.base import (
     check_environment_name,
     check_own,
     check_tags,
+    checked_prose,
     checked_text,
     environment_row,
     upsert,
@@ -73,8 +74,8 @@ class Environments:
             values = {
                 "id": secrets.token_hex(16),
                 "name": name,
-                "title": checked_text(title, "a title"),
-                "description": checked_text(description, "a description"),
+                "title": checked_prose(title, "a title"),
+                "description": checked_prose(description, "a description"),
                 "tags": check_tags(tags),
                 "head": 0,
                 "root": empty,
@@ -169,9 +170,9 @@ class Environments:
             row = environment_row(connection, name, lock=True)
             values: dict[str, Any] = {"updated": now}
             if title is not None:
-                values["title"] = checked_text(title, "a title")
+                values["title"] = checked_prose(title, "a title")
             if description is not None:
-                values["description"] = checked_text(description, "a description")
+                values["description"] = checked_prose(description, "a description")
             if tags is not None:
                 values["tags"] = check_tags(tags)
             table = tables.environment

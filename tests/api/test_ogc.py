@@ -84,6 +84,15 @@ def test_links_use_the_public_url(tmp_path: Path) -> None:
         assert all(one["href"].startswith("https://maps.example.org/fleet/ogc/farm/") for one in landing["links"])
 
 
+def test_texts_that_xml_cannot_have_are_refused(turned: Api, fresh: Callable[[], str]) -> None:
+    name = fresh()
+    for member in ("title", "description"):
+        detail = turned.problem("POST", "environments", 422, json={"name": name, member: "Farm\u0001"})["detail"]
+        assert f"a {member} must have no control characters" in detail
+        turned.problem("PATCH", "environments/turned", 422, json={member: "Farm\u000b"})
+    turned.post("environments", {"name": name, "description": "two\n\tlines"})
+
+
 def test_unusable_host_is_not_linked(turned: Api) -> None:
     landing = turned.get("/ogc/turned/", headers={"Host": 'x"><script>'}).text
     assert "<script" not in landing

@@ -16,7 +16,7 @@ import pytest
 from app.errors import Invalid
 from app.fleet.vda5050 import VehicleMaps, merge_levels, read_state
 from tests.api import samples
-from tests.api.conftest import Api
+from tests.api.conftest import Api, running, settings_for
 
 REAL = sorted(Path(__file__).parents[2].parent.glob("shared/data/vda5050/*/*tate*"))
 
@@ -52,6 +52,17 @@ def test_actions_contain_link_and_hash_of_the_file(api: Api, farm: str) -> None:
     api.problem("GET", f"{url}?nonsense=1", 422)
     api.problem("GET", f"{url}?format=occupancy_grid&grid=other", 404)
     api.problem("GET", f"environments/{farm}/versions/77/vda5050/actions", 404)
+
+
+def test_links_have_the_public_address(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, public_url="https://maps.example.org/fleet")) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", samples.grid())
+        body = api.get("environments/farm/versions/latest/vda5050/actions").json()
+        link = parameters(body["downloadMap"])["mapDownloadLink"]
+        assert link.startswith("https://maps.example.org/fleet/api/v1/environments/farm/")
+        path = link.removeprefix("https://maps.example.org/fleet")
+        assert hashlib.sha256(api.as_(None).get(path).content).hexdigest() == parameters(body["downloadMap"])["mapHash"]
 
 
 @pytest.fixture

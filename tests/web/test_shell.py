@@ -113,6 +113,27 @@ def test_revoked_token_asks_to_sign_in_and_loses_nothing(open_page: Open, server
     expect(page.get_by_role("button", name="Yard1", exact=False).first).to_be_visible()
 
 
+def test_failed_sign_out_is_told(open_page: Open) -> None:
+    """The cookie that stays would sign in whoever opens the page next."""
+    page = open_page("/")
+    page.route("**/api/v1/session", lambda route: route.abort())
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.locator(".toasts > *")).to_have_count(1)
+    expect(page.get_by_role("heading", name="Sites")).to_be_visible()
+    page.unroute("**/api/v1/session")
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("Token")).to_be_visible()
+
+
+def test_error_of_a_version_ends_with_it(open_page: Open, orchard: str) -> None:
+    page = open_page(f"/?site={orchard}")
+    expect(page.get_by_role("button", name="Hide Network")).to_be_visible()
+    page.evaluate("history.pushState(null, '', `${location.search}&version=999`); dispatchEvent(new Event('popstate'))")
+    expect(page.get_by_role("button", name="Try again")).to_be_visible()
+    page.go_back()
+    expect(page.get_by_role("button", name="Try again")).to_have_count(0)
+
+
 def test_site_opened_without_a_session_is_loaded_after_signing_in(open_page: Open, server: WebServer) -> None:
     token = server.make_token("editor")
     page = open_page("/", token=token["token"])

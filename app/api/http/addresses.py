@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,6 +20,18 @@ from app.model.closures import ClosureMode
 from app.store.values import LATEST, Version
 
 PRODUCTION = "production"
+_AUTHORITY = re.compile(r"[A-Za-z0-9._-]{1,255}(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]{2,60}\](:[0-9]{1,5})?")
+
+
+def origin(request: Request, public_url: str | None) -> str:
+    """Return the server's address for absolute links: the configured one, else scheme and ``Host`` of the request."""
+    if public_url is not None:
+        return public_url.rstrip("/")
+    host = request.headers.get("host", "")
+    if _AUTHORITY.fullmatch(host) is None:
+        server = request.scope.get("server") or ("localhost", None)
+        host = server[0] if server[1] is None else f"{server[0]}:{server[1]}"
+    return f"{request.url.scheme}://{host}"
 
 
 @dataclass(frozen=True, slots=True)

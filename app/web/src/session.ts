@@ -40,8 +40,11 @@ export async function signIn(credentials: { token: string } | { code: string }):
   return true;
 }
 
+/** Throws if the server cannot end the session: its cookie would sign in whoever comes next. */
 export async function signOut(): Promise<void> {
-  await ask(api.DELETE("/api/v1/session")).catch(() => undefined);
+  await ask(api.DELETE("/api/v1/session")).catch((error: unknown) => {
+    if (!(error instanceof ApiError && error.status === 401)) throw error;
+  });
   for (const name of await caches.keys().catch(() => [])) await caches.delete(name);
   session.value = null;
 }

@@ -86,6 +86,7 @@ export class Site {
 
   private readonly stops: (() => void)[] = [];
   private control = new AbortController();
+  private extentControl = new AbortController();
 
   constructor(readonly name: string) {
     this.events = new EventStream(name);
@@ -108,6 +109,7 @@ export class Site {
 
   close(): void {
     this.control.abort();
+    this.extentControl.abort();
     this.events.close();
     for (const stop of this.stops) stop();
   }
@@ -178,8 +180,10 @@ export class Site {
       const version = answer as Version | DryRun;
       if (version.root === this.version.peek()?.root) {
         this.version.value = version;
+        this.problem.value = null;
         return; // the same content under another number
       }
+      this.extentControl.abort();
       this.loading.value = true;
       const shown = refOf(version);
       const exact = { path: { env: this.name, v: shown } };
@@ -217,7 +221,9 @@ export class Site {
     const layers = this.partial.value;
     const version = this.version.peek();
     if (!layers.length || !extent || !version) return;
-    const { signal: stop } = this.control;
+    this.extentControl.abort();
+    this.extentControl = new AbortController();
+    const { signal: stop } = this.extentControl;
     try {
       const lists = await Promise.all(layers.map((layer) => this.loadLayer(refOf(version), layer, stop, extent)));
       if (stop.aborted) return;

@@ -13,6 +13,7 @@ import type { Site } from "../site";
 import { Button } from "../ui/button";
 import { Bars, Problem } from "../ui/states";
 import { count } from "../ui/text";
+import { attempt } from "../ui/toast";
 import { Access } from "./access";
 import { MapControls } from "./map-controls";
 import { loadViews, VIEWS } from "./registry";
@@ -100,7 +101,7 @@ export function SiteView({ site }: { site: Site }) {
           <ExternalLink size={18} aria-hidden="true" />
         </a>
         <ThemeButton />
-        <Button quiet icon={LogOut} label={`Sign out (${session.value?.name})`} onClick={() => void signOut()} />
+        <Button quiet icon={LogOut} label={`Sign out (${session.value?.name})`} onClick={() => void attempt(signOut)} />
       </header>
       <nav class="rail" aria-label="Views">
         {views.map(({ id, title: name, icon: Icon, key }) => (

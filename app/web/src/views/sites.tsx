@@ -78,7 +78,7 @@ export function Sites() {
           </Button>
         )}
         <ThemeButton />
-        <Button icon={LogOut} label={`Sign out (${session.value?.name})`} quiet onClick={() => void signOut()} />
+        <Button icon={LogOut} label={`Sign out (${session.value?.name})`} quiet onClick={() => void attempt(signOut)} />
       </header>
       <main>
         {wanted.length >= 2 && hits.length > 0 && (
