@@ -24,7 +24,7 @@ from app.agent.options import AgentOptions, robot_name
 from app.agent.requests import parse_requests
 from app.agent.router import find_router
 from app.agent.signed_manifest import Manifest, ManifestFile
-from app.agent.state import AgentState, StateStore
+from app.agent.state import AgentState, StateStore, read_boot_id
 from app.agent.status import StatusReporter, Subject, describe_status, loaded_version
 from app.agent.waking import CLOSURE_EVENTS, LATEST, Alarm, is_newer, is_relevant
 from app.agent.zenoh_client import ZenohClient
@@ -119,7 +119,10 @@ class Agent:
         if installed is not None and name is not None and (bad := self._folder.damaged_files(name, installed)):
             self._log_event("damaged", version=installed.version, files=bad[:20])
             state = dataclasses.replace(state, etag=None)
-        self._store.stage(state)
+        boot = read_boot_id()
+        if state.boot not in (None, boot):  # the robot's programs have forgotten what the hooks loaded
+            state = dataclasses.replace(state, activated=None)
+        self._store.stage(dataclasses.replace(state, boot=boot))
         self._signed_clock.floor = state.newest_time
         self._activation.protect()
         if installed is not None and name is not None:

@@ -23,6 +23,8 @@ HASH_BYTES = 1 << 18
 MAX_TIME = 253402214400.0
 """9999-12-31, in seconds since 1970."""
 
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
 STATE_FORMAT = 2
 """Format number of state.json. Format 1 (releases without epochs) is read as well."""
 
@@ -56,6 +58,7 @@ class AgentState:
         activated: version folder for which the hooks have run; None while they run.
         working: version folder whose hooks succeeded last; ``current`` goes back to it if those of a newer one fail.
         newest_time: newest signed time accepted, in seconds since 1970.
+        boot: of the machine, in which the hooks have run; None if unknown.
     """
 
     environment: str
@@ -69,6 +72,7 @@ class AgentState:
     activated: str | None = None
     working: str | None = None
     newest_time: float = 0.0
+    boot: str | None = None
 
     def with_mark(self, channel: str, mark: Mark) -> AgentState:
         """Return the state after a manifest of this channel was accepted."""
@@ -105,6 +109,7 @@ def load(path: Path, environment: str) -> AgentState:
             activated=_name(body.get("activated")),
             working=_name(body["working"] if "working" in body else body.get("activated")),
             newest_time=float(body.get("newest_time", 0)),
+            boot=_text(body.get("boot")),
         )
         if not 0 <= state.newest_time <= MAX_TIME:
             raise ValueError("newest_time is not a time")
@@ -138,8 +143,17 @@ def save(path: Path, state: AgentState) -> None:
         "activated": state.activated,
         "working": state.working,
         "newest_time": state.newest_time,
+        "boot": state.boot,
     }
     write_durably(path, json.dumps(body, indent=1).encode() + b"\n")
+
+
+def read_boot_id() -> str | None:
+    """Return the id of the machine's present boot; None if the system has none."""
+    try:
+        return BOOT_ID.read_text().strip() or None
+    except OSError:
+        return None
 
 
 def _text(value: Any) -> str | None:

@@ -269,6 +269,25 @@ def test_interrupted_hooks_run_without_server(fake: Fake, robot: Robot, tmp_path
     assert one.saw("active", version=1)
 
 
+def test_hooks_run_again_after_a_boot(
+    fake: Fake, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The programs that they told have started anew, also without a server."""
+    hook = f'echo "$FLEETMAP_CHANGED" >> {tmp_path}/loaded'
+    boot = tmp_path / "boot_id"
+    monkeypatch.setattr("app.agent.state.BOOT_ID", boot)
+    assert robot(hook).once()  # this system has no such file
+    for content in "aa":
+        boot.write_text(content)
+        assert robot(hook).once()
+    assert (tmp_path / "loaded").read_text().splitlines() == ["kml/map.kml"]
+    fake.instead = lambda h: send(h, 503, b"") or True  # type: ignore[func-returns-value]
+    for content in "bb":
+        boot.write_text(content)
+        assert not robot(hook).once()
+    assert (tmp_path / "loaded").read_text().splitlines() == ["kml/map.kml"] * 2
+
+
 def test_state_of_an_older_agent_is_read(fake: Fake, robot: Robot, tmp_path: Path) -> None:
     one = robot("true")
     assert one.once()
