@@ -134,7 +134,7 @@ class Activation:
             since: RFC 3339 time from which the version is ready.
         """
         with self._folder.hooks_lock(self._stopping):
-            problem = level_problem(manifest, read_level(self._folder))
+            problem = level_problem(manifest, read_level(self._folder, manifest))
             if problem is not None and self._folder.manifest(self._store.value.working) is not None:
                 self.pending = None
                 reason = f"version {manifest.version} is refused: {problem}"
@@ -250,7 +250,7 @@ class Activation:
 
     def _run_hooks(self, name: str, manifest: Manifest) -> str | None:
         """Run the ``--on-change`` commands; return None if all succeeded, and mark the version as loaded."""
-        level = read_level(self._folder)
+        level = read_level(self._folder, manifest)
         if (problem := level_problem(manifest, level)) is not None:
             return problem
         before = self._folder.manifest(self._store.value.activated)
@@ -280,7 +280,7 @@ class Activation:
     def _variables(self, manifest: Manifest, before: Manifest | None) -> dict[str, str]:
         """Return the environment variables of a command. before: manifest that the robot has loaded."""
         files, layers = changed_files(before, manifest), changed_layers(before, manifest)
-        return hook_variables(self._folder, manifest, files, layers, read_level(self._folder), self._robot)
+        return hook_variables(self._folder, manifest, files, layers, read_level(self._folder, manifest), self._robot)
 
 
 def hook_variables(

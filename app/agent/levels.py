@@ -27,12 +27,20 @@ def level_files(manifest: Manifest, level: str) -> list[str]:
     return sorted(file.path for file in manifest.files if file.level == level)
 
 
-def read_level(folder: MapDirectory) -> str | None:
-    """Return the robot's level; None if it was never set."""
+def read_level(folder: MapDirectory, manifest: Manifest) -> str | None:
+    """Return the robot's level by the name that it has in this map; None if it was never set."""
+    names = _level_file_names(folder)
+    known = level_names(manifest)
+    return next((name for name in names if name in known), names[0] if names else None)
+
+
+def _level_file_names(folder: MapDirectory) -> list[str]:
+    """Read the names of the robot's level: in the present map, and perhaps in the next one."""
     try:
-        return (folder.path / "level").read_bytes()[:MAX_LEVEL_BYTES].decode(errors="replace").strip("\n") or None
+        content = (folder.path / "level").read_bytes()[:MAX_LEVEL_BYTES]
     except FileNotFoundError:
-        return None
+        return []
+    return [name for name in content.decode(errors="replace").split("\n") if name]
 
 
 def level_problem(manifest: Manifest, level: str | None) -> str | None:
@@ -85,12 +93,12 @@ def load_level(
 
     Args:
         variables: builds the hook variables from directory, manifest, changed files and layers, level and robot.
-        for_next_map: only store the level, which the next map has and the current one has not.
+        for_next_map: only store that the robot's level has this name in the next map.
 
     Raises:
         NotFound: no map is installed, or it has no such level.
-        Conflict: no agent has run in the directory, or it belongs to another user; the current map has the level
-            that is for the next one.
+        Conflict: no agent has run in the directory, or it belongs to another user; the current map has a level of
+            that name, or the robot is on the default level.
         Unavailable: a hook failed; the level stays as it was, and its hooks were run again.
     """
     folder = MapDirectory(directory)
@@ -99,15 +107,24 @@ def load_level(
         manifest = folder.manifest(folder.current_version)
         if manifest is None:
             raise NotFound(f"no map in {directory} yet: wait for the agent's first sync")
-        names = level_names(manifest)
-        if for_next_map and level in names:
-            raise Conflict(f"the current map has the level {level}: load it without --next")
-        if not for_next_map and level not in names:
+        names, before = level_names(manifest), read_level(folder, manifest)
+        if for_next_map:
+            if before is None:
+                raise Conflict(
+                    "the robot is on the default level, which each map has: it needs no name for the next map"
+                )
+            if level in names:
+                raise Conflict(f"the current map has a level {level}: load it without --next")
+            write_durably(folder.path / "level", f"{before}\n{level}\n".encode())
+            log("level", level=before, next=level, version=manifest.version)
+            return
+        if level not in names:
             choice = f"choose one of {', '.join(names)}" if names else "the map has no levels"
-            raise NotFound(f"unknown level {level[:80]!r}: {choice}, or add --next if the next map has it")
+            raise NotFound(f"unknown level {level[:80]!r}: {choice}, or add --next if the next map calls it so")
 
         def run(of: str | None) -> str | None:
             """Run the hooks for a level; None: the default one. Return the problem of the first that fails."""
+            folder.hook_status.unlink(missing_ok=True)
             files = sorted(manifest.content) if of is None else level_files(manifest, of)
             values = variables(folder, manifest, files, sorted(manifest.layers), of, robot)
             for command in commands:
@@ -116,14 +133,12 @@ def load_level(
                 log("hook", command=command, version=manifest.version, level=of)
             return None
 
-        folder.hook_status.unlink(missing_ok=True)
-        if not for_next_map and (problem := run(level)) is not None:
-            before = read_level(folder)
+        if (problem := run(level)) is not None:
             again = run(before)
             outcome = "is loaded again" if again is None else f"could not be loaded again either ({again})"
             name = "the default level" if before is None else f"level {before}"
             raise Unavailable(f"could not load level {level}: {problem}; {name} {outcome}")
-        write_durably(folder.path / "level", level.encode() + b"\n")
+        write_durably(folder.path / "level", f"{level}\n".encode())
         log("level", level=level, version=manifest.version)
 
 

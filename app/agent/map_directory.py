@@ -10,7 +10,7 @@
     DIR/state.json, DIR/lock                 persistent state; lock of the running agent
     DIR/changed                              changed files, as listed for the hooks
     DIR/hooks.json, DIR/hooks.lock           hooks for `fleetmap agent-level`; lock while hooks run
-    DIR/hook-status, DIR/level               results of the hooks' steps; the robot's level
+    DIR/hook-status, DIR/level               results of the hooks' steps; names of the robot's level
 
 Unchanged files are hard links to those of the previous version, so they are read-only.
 """

@@ -203,17 +203,28 @@ def test_level_before_is_loaded_again_if_another_cannot_be(robot: Robot, tmp_pat
 
 
 def test_robot_follows_a_map_with_renamed_levels(fake: Fake, robot: Robot, tmp_path: Path) -> None:
-    one = robot(f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded')
+    hook = f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded; test ! -e {tmp_path}/bad -o "$FLEETMAP_LEVEL" != new-L2'
+    one = robot(hook)
     assert one.once()
+    with pytest.raises(Conflict, match="the robot is on the default level"):
+        load(one.into, "new-L2", for_next_map=True)
     load(one.into, "L2")
     fake.levels = {path: f"new-{level}" for path, level in LEVELS.items()}
     fake.put({path: data + b"\n" for path, data in SITE.items()})
-    assert not robot(f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded').once()
-    with pytest.raises(Conflict, match="the current map has the level ground"):
+    assert not robot(hook).once()
+    with pytest.raises(Conflict, match="the current map has a level ground"):
         load(one.into, "ground", for_next_map=True)
-    assert load(one.into, "new-L2", for_next_map=True) == [{"event": "level", "level": "new-L2", "version": 1}]
-    assert robot(f'echo "$FLEETMAP_LEVEL" >> {tmp_path}/loaded').once()
-    assert (tmp_path / "loaded").read_text().splitlines() == ["", "L2", "new-L2"]
+    stored = load(one.into, "new-L2", for_next_map=True)
+    assert stored == [{"event": "level", "level": "L2", "next": "new-L2", "version": 1}]
+    (tmp_path / "bad").touch()
+    failed = robot(hook)
+    assert not failed.once()
+    assert "version 1 is restored" in failed.detail, "by the name that it has there"
+    (tmp_path / "bad").unlink()
+    assert robot(hook).once()
+    assert (tmp_path / "loaded").read_text().splitlines() == ["", "L2", "new-L2", "L2", "new-L2"]
+    load(one.into, "new-ground")
+    assert (one.into / "level").read_text() == "new-ground\n"
 
 
 def test_agent_level_refuses_what_it_cannot_load(fake: Fake, robot: Robot, tmp_path: Path) -> None:

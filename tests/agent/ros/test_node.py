@@ -197,6 +197,7 @@ def test_node_restarts_stopped_agent(graph: Graph, folder: Path) -> None:
     eventually(lambda: len(graph.latched["/fleetmap_agent/status"]) == 2)
     node._agent._process.send_signal(signal.SIGKILL)
     eventually(lambda: len(calls.read_text().splitlines()) == 3)
+    eventually(lambda: len(graph.latched["/fleetmap_agent/status"]) == 3)
     program.rename(program.with_name("away"))  # as during an upgrade
     node._agent._process.send_signal(signal.SIGKILL)
     eventually(lambda: any(f"could not run {program}" in text for _, text in graph.log))

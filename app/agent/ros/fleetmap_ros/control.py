@@ -394,7 +394,11 @@ def initial_site(settings: Settings) -> Site | None:
         folder = current.resolve(strict=True)
     except (OSError, RuntimeError):
         return None
-    level = ""
+    names: list[str] = []
     with contextlib.suppress(OSError, UnicodeDecodeError):
-        level = (settings.folder / "level").read_text().strip()
-    return Site(folder, settings.folder / "hooks", frozenset(), level)
+        names = (settings.folder / "level").read_text().splitlines()  # in this map, and perhaps in the next one
+    site = Site(folder, settings.folder / "hooks", frozenset(), names[0] if names else "")
+    with contextlib.suppress(LoadError):
+        known = site.level_names()
+        site.level = next((name for name in names if name in known), site.level)
+    return site

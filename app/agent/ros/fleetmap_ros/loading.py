@@ -172,6 +172,10 @@ class Site:
             return ""
         raise LoadError(f"the map has no files of level {level!r}")
 
+    def level_names(self) -> list[str]:
+        """Return the names of the map's levels; none if it does not list them. Raises LoadError."""
+        return self._levels()[0]
+
     def _levels(self) -> tuple[list[str], dict[str, list[str]]]:
         """Return level names and files by level of ``levels.json``; empty if there is no such file."""
         try:
