@@ -246,7 +246,7 @@ class Mirror:
         for environment, group in groupby(waiting, key=lambda change: change.environment):
             with NotedFailure(failures, environment, goes_on=True):
                 self._hand_on_changes(environment, list(group))
-        self.left = self._store.edge_changes.count_waiting() if failures else 0
+        self.left = sum(change.environment in failures for change in waiting)
         self._statuses.hand_on(state)
         return bool(waiting)
 

@@ -42,7 +42,7 @@ class Statuses:
     def __init__(self, store: Store, centre: Centre) -> None:
         self._store, self._centre = store, centre
         self._last_pass: datetime | None = None
-        self._handed_rows: set[int] = set()
+        self._handed_rows: dict[int, tuple[str, str, datetime]] = {}
         self._handed_times: dict[tuple[str, str], datetime] = {}
 
     def hand_on(self, state: MirrorState) -> None:
@@ -57,20 +57,20 @@ class Statuses:
             self._last_pass = began
 
     def _hand_on_changed(self, state: MirrorState, skipped: Skipped, since: datetime) -> bool:
-        """Hand on rows of the history; return whether these were all."""
+        """Hand on rows of the history; return whether these were all that there were at the last request."""
         store, end = self._store.edge_changes, time.monotonic() + PASS_SECONDS
-        newest = store.newest_report()  # SQLite uses the numbers of removed rows again
-        handed = min(state.reported, newest)
-        self._handed_rows = {row for row in self._handed_rows if handed - OVERLAP_ROWS < row <= newest}
+        handed = min(state.reported, store.newest_report())  # SQLite uses the numbers of removed rows again
         row = handed - OVERLAP_ROWS
+        self._handed_rows = {number: of for number, of in self._handed_rows.items() if number > row}
         while rows := store.reports_after(row, PAGE, handed=handed, since=since):
             row = rows[-1][0]
-            if new := [report for number, report in rows if number not in self._handed_rows]:
+            about = {number: (one.environment, one.robot, one.time) for number, one in rows}
+            if new := [one for number, one in rows if self._handed_rows.get(number) != about[number]]:
                 self._send(new, skipped, counted=True)
                 self._store.mirrors.save(reported=max(row, handed), skipped=skipped)
-                self._handed_rows.update(number for number, _ in rows)
+                self._handed_rows |= about
             if time.monotonic() > end:
-                return False
+                return len(rows) < PAGE
         return True
 
     def _hand_on_present(self, state: MirrorState, skipped: Skipped) -> None:

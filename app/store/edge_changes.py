@@ -121,9 +121,11 @@ class EdgeChanges:
             return [QueuedChange(r.id, r.name, r.overlay_id, r.body) for r in connection.execute(query)]
 
     def count_waiting(self) -> int:
-        """Count the changes that wait for the centre."""
+        """Count the changes that wait for the centre, which takes none of a deleted environment."""
+        table, owner = tables.edge_change, tables.environment
+        query = select(func.count()).select_from(table).join(owner, owner.c.id == table.c.environment_id)
         with self._database.read() as connection:
-            return int(connection.execute(select(func.count()).select_from(tables.edge_change)).scalar_one())
+            return int(connection.execute(query.where(owner.c.deleted.is_(None))).scalar_one())
 
     def settle(self, change: QueuedChange, refusal: str | None, overlay: Mapping[str, Any] | None) -> None:
         """Note the centre's answer to a change.

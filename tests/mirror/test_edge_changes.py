@@ -15,7 +15,7 @@ from sqlalchemy import delete, insert, select
 from app.errors import Unavailable
 from app.events import messages
 from app.mirror.follow import FULL_PASS
-from app.mirror.process import PASS_SECONDS
+from app.mirror.process import MAX_PAUSE_SECONDS
 from app.store import tables
 from tests.api.conftest import Api, create_farm
 from tests.events.conftest import Listener, client_config, eventually
@@ -189,7 +189,7 @@ def test_statuses_that_are_stored_late_reach_the_centre(
     with database.write() as connection:
         for table, values in rows.items():
             connection.execute(insert(table).values(values))
-    later = database.now() + timedelta(seconds=PASS_SECONDS)
+    later = database.now() + timedelta(seconds=MAX_PAUSE_SECONDS)
     monkeypatch.setattr(database, "now", lambda: later)
     edge.follow()
     there = centre.get(f"robots/mower-4?environment={farm}").json()
