@@ -16,7 +16,7 @@ from app.api.http.auth import WINDOW_SECONDS
 from app.api.http.conversions import HEARTBEAT_SECONDS
 from app.api.http.dependencies import Services
 from app.backends.lead import LeadLostError
-from app.errors import Damaged, FleetMapError
+from app.errors import DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.fleet import next_step
 from app.formats import writable_formats
 from app.heap import OldGarbage, release_free_memory
@@ -175,8 +175,12 @@ class _Housekeeping:
                     versions += len(removed.versions)
                     files += removed.files
                     yield
-            except Damaged as error:
-                log.warning("retention: stopped (environment=%s): %s", plan.environment, error.detail)
+            except (LeadLostError, NoRoom, DatabaseDamaged):
+                raise
+            except Unavailable as error:
+                log.warning(
+                    "retention: interrupted until tomorrow (environment=%s): %s", plan.environment, error.detail
+                )
                 yield
             if versions or files:
                 log.info("retention: environment=%s versions=%d files=%d", plan.environment, versions, files)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import pytest
 from sqlalchemy import text
 
-from app.errors import Unavailable
+from app.errors import NoRoom, Unavailable
 from app.housekeeping import _Housekeeping
 from app.store.retention_rule import Rule
 from app.store.store import Store
@@ -65,6 +67,25 @@ def test_daily_run_is_due_a_day_after_the_last_one_of_any_process(api: Api, monk
         last[0] = strange
         housekeeping._collect_daily()
     assert len(runs) == 3, "without a run before, or after a leap of the clock"
+
+
+def test_environment_that_is_busy_delays_no_other(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    housekeeping, store = _Housekeeping(api.app.state.services), store_of(api)
+    (plan,) = store.retention.plan(RULE)
+    plans = [replace(plan, environment=name) for name in ("busy", "farm", "full", "other")]
+    thinned = []
+
+    def apply(plan: Any, rule: Rule) -> Iterator[Any]:
+        thinned.append(plan.environment)
+        if plan.environment in ("busy", "full"):
+            raise {"busy": Unavailable, "full": NoRoom}[plan.environment]("not now")
+        yield from ()
+
+    monkeypatch.setattr(store.retention, "plan", lambda *_: plans)
+    monkeypatch.setattr(store.retention, "apply", apply)
+    with pytest.raises(NoRoom):
+        list(housekeeping._thin(store.now()))
+    assert thinned == ["busy", "farm", "full"]
 
 
 def test_thinning_over_http(api: Api) -> None:
