@@ -181,6 +181,7 @@ export class Site {
       if (version.root === this.version.peek()?.root) {
         this.version.value = version;
         this.problem.value = null;
+        if (this.extentControl.signal.aborted) void this.loadByExtent(this.extent.peek());
         return; // the same content under another number
       }
       this.extentControl.abort();
@@ -220,8 +221,8 @@ export class Site {
   private async loadByExtent(extent: Box | null): Promise<void> {
     const layers = this.partial.value;
     const version = this.version.peek();
-    if (!layers.length || !extent || !version) return;
     this.extentControl.abort();
+    if (!layers.length || !extent || !version) return;
     this.extentControl = new AbortController();
     const { signal: stop } = this.extentControl;
     try {
