@@ -139,8 +139,8 @@ async def _check_item(service: Service, collection: str, feature: str, if_match:
     shown = await get_item(service, collection, feature)
     if not none_match(if_match, shown.headers["etag"]):  # weakly: compression makes tags of the same content weak
         raise StaleParent(
-            f"the feature {feature[:80]!r} has changed, or the tag is not that of its GeoJSON in CRS84: read it again as "
-            "such, and repeat the change"
+            f"the feature {feature[:80]!r} has changed, or the tag is not that of its GeoJSON in CRS84: read it again "
+            "so, and repeat the change"
         )
     pending = service.version.pending
     return None if pending is None else f'"{pending.tag}"'

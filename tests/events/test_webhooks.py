@@ -311,7 +311,10 @@ def test_interrupted_end_of_a_wait_tells_of_no_removed_events(
     assert [e["type"] for e in receiver.events if e["type"] == "resync"] == []
 
 
-def test_server_that_takes_over_a_wait_tells_of_no_removed_events(store: Store, receiver: Receiver, start: Any) -> None:
+def test_server_that_takes_over_a_wait_tells_of_no_removed_events(
+    store: Store, receiver: Receiver, start: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.events.webhooks.FIRST_RETRY_SECONDS", 3600.0)
     receiver.answer = lambda _, __: 422
     webhook = hook(store, receiver)
     first = start()
