@@ -39,6 +39,7 @@ from app.convert.recipe import Recipe
 from app.errors import Unavailable
 
 MAX_LOST_ATTEMPTS = 5
+MAX_PLANS = 20
 """Maximum number of conversions if a map leaves the cache before it is read."""
 
 OVERLAYS = b"fleetmap-overlays"
@@ -87,6 +88,8 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
             answer = await _fetch(request, services, key, wanted, recipe, empty)
             if answer is not None:
                 return answer
+            if attempt >= MAX_PLANS:
+                raise Unavailable("other ways to make the map are found again and again: try again in a few seconds")
         except LostMap:  # damaged or evicted while being read: convert again
             if attempt >= MAX_LOST_ATTEMPTS:
                 raise

@@ -88,6 +88,7 @@ class Maps:
         self._trials = Trials(cache_dir / "trials")
         self._crossings_cache: dict[Any, list[Problem]] = {}
         self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
+        self._detours: OrderedDict[str, tuple[ChainFailure, ...]] = OrderedDict()
         self._guard = threading.Lock()
 
     def recipe(
@@ -114,7 +115,10 @@ class Maps:
             self._check_known_failure(recipe)
             return replace(recipe, failed=tuple(failed), replan=plan, order=order)
 
-        return first_working(plan, check)
+        planned = first_working(plan, check)
+        with self._guard:
+            found_by_others = self._detours.get(planned.key)
+        return planned if found_by_others is None else planned.without(found_by_others)
 
     def _planner(
         self, version: Version, name: str, values: Mapping[str, str], *, derive: bool, file: str | None, listed: bool
@@ -157,8 +161,16 @@ class Maps:
         return self.cache.get(recipe.key)
 
     def get_made(self, recipe: Recipe, failed: Sequence[ChainFailure]) -> tuple[Recipe, CachedMap] | None:
-        """Return a map that another server has made, after these derivations of its recipe found nothing to use."""
+        """Return a map that another process has made, after these derivations of its recipe found nothing to use.
+
+        They are remembered: this process has not tried them, and would plan the same recipe again.
+        """
         planned = recipe.without(failed)
+        if planned.key != recipe.key:
+            with self._guard:
+                self._detours[recipe.key] = tuple(failed)
+                while len(self._detours) > MAX_CACHED_RESULTS:
+                    self._detours.popitem(last=False)
         cached_map = self.cache.get_or_fetch(planned.key)
         return None if cached_map is None else (planned, cached_map)
 
@@ -212,6 +224,10 @@ class Maps:
         except WorkerDied as error:
             raise CannotConvert(f"the map in {recipe.format.name} could not be read back: {error.detail}") from error
         return ConvertedMap({"losses.json": (content, "application/json")}, None, cached_map.report)
+
+    def note_failure(self, recipe: Recipe, error: FleetMapError) -> None:
+        """Remember that another process could not make this map, for ``failure``."""
+        self._note_failure(recipe.key, error)
 
     def failure(self, recipe: Recipe) -> FleetMapError | None:
         """Return the error of a recent conversion that content or parameters made impossible, or None."""

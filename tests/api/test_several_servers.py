@@ -26,6 +26,7 @@ from app.store.values import Source
 from app.worker import create_worker
 from tests.api import samples
 from tests.api.conftest import Api, parts, running, settings_for
+from tests.api.test_derivation_choice import SQUARE
 from tests.events.conftest import eventually
 from tests.preloaded import run_preloaded
 from tests.seaweed import Fault, FaultyStore, Seaweed
@@ -121,6 +122,28 @@ def test_worker_shares_nothing_with_its_servers_but_database_and_blob_store(
         copies = list((tmp_path / "w" / "blobs").glob("[0-9a-f][0-9a-f]/*"))
         assert bool(copies) == str(place).startswith("s3:"), "files of the bucket, read by hash"
         assert conversions([a, b]) == 0
+
+
+def test_what_a_worker_finds_out_about_a_map_is_known_to_its_server(settings: list[Settings], tmp_path: Path) -> None:
+    """Else the server would ask for the same map again and again."""
+    url, place = settings[0].database_url, settings[0].blob_url
+    with (
+        running(settings[0]) as api,
+        working(settings_for(tmp_path / "w", database_url=url, blob_url=place)) as counter,
+    ):
+        api.post("environments", {"name": "beds"})
+        api.upload("beds", {"a.geojson": SQUARE})
+        manifest = "environments/beds/versions/latest/manifest?formats=geojson&optional=tmap2"
+        body = api.get(manifest).json()
+        assert [one["format"] for one in body["missing"]] == ["tmap2"]
+        assert "outlines=true" in body["missing"][0]["detail"]
+        api.upload("beds", samples.grid())
+        network = api.get("/maps/beds/tmap2")
+        assert network.content
+        report = api.get("environments/beds/versions/latest/reports/tmap2").json()
+        assert any("outlines=true" in one["problem"] for one in report["warnings"]), "it took another way"
+        assert counter.labels("tmap2", "made")._value.get() == 1
+        assert "missing" not in api.get(manifest).json() or not api.get(manifest).json()["missing"]
 
 
 def test_map_made_on_one_server_is_served_by_all(servers: list[Api]) -> None:

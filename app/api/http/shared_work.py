@@ -16,7 +16,7 @@ from app.convert.cache import CachedMap
 from app.convert.maps import Maps
 from app.convert.recipe import Recipe
 from app.derive import ChainFailure
-from app.errors import FleetMapError, NotFound, Unavailable
+from app.errors import CannotConvert, FleetMapError, Invalid, NotFound, Unavailable
 from app.ingest import CommitRequest, CommitResult
 from app.pool import CancelHandle, Cancelled
 from app.store.audit import CALLER
@@ -84,7 +84,10 @@ class SharedWork:
         """
         job = self._wait(job.id, stop)
         if job.state == "failed":
-            raise error_from_json(job.outcome)
+            error = error_from_json(job.outcome)
+            if isinstance(error, CannotConvert | NotFound | Invalid):
+                self._maps.note_failure(recipe, error)
+            raise error
         if job.state == "cancelled":
             raise Cancelled("the conversion was cancelled: request it again")
         failed = [ChainFailure(**one) for one in (job.outcome or {}).get("failed", ())]
