@@ -13,7 +13,7 @@ UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo $(BIN)/uv)
 SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --extra server --inexact --quiet --no-python-downloads
 
 # What a robot runs, and signing for its tests: on Python 3.10 as well (Ubuntu 22.04, ROS 2 Humble). `compression` is Python 3.14's; others take the backport.
-ROBOT := app/__init__.py app/clock.py app/dangerous_variables.py app/errors.py app/event_types.py app/backends/__init__.py app/backends/documents.py \
+ROBOT := app/__init__.py app/bearer.py app/clock.py app/dangerous_variables.py app/errors.py app/event_types.py app/backends/__init__.py app/backends/documents.py \
   app/backends/locks.py \
   app/events/__init__.py app/events/credentials.py \
   app/events/messages.py app/model/__init__.py app/model/frame.py app/model/names.py app/signing.py app/agent app/cli

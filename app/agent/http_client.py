@@ -19,6 +19,7 @@ import httpx
 
 from app.agent.signed_manifest import ManifestFile
 from app.agent.state import digest
+from app.bearer import authorization
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events.credentials import server_ssl_context
 
@@ -131,7 +132,7 @@ class ServerClient:
         self.server = (server if "://" in server else f"http://{server}").rstrip("/")
         headers = {"User-Agent": "fleetmap-agent", "Accept-Encoding": "identity"}
         if token:
-            headers["Authorization"] = f"Bearer {token}"
+            headers["Authorization"] = authorization(token)
         self._http = httpx.Client(
             base_url=self.server,
             headers=headers,

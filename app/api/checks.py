@@ -125,6 +125,7 @@ async def get_checks(
 
     Closures in force do not count: they are no part of a version.
     """
+    generation = services.response_cache.generation()  # before the read: a commit meanwhile makes the response stale
     version = await run_in_threadpool(services.store.versions.get, env, parse_version_ref(v))
     _require_level(version, level)
     etag = f'"{hashlib.sha256(json_bytes(["checks", RELEASE, version.root, version.ref, level])).hexdigest()[:32]}"'
@@ -136,7 +137,6 @@ async def get_checks(
     }
     if none_match(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
-    generation = services.response_cache.generation()
     cached = services.response_cache.get(request_key(request))
     if cached is not None and cached.etag == etag and cached.body is not None:
         body = cached.body  # of the same root, so still valid after commits

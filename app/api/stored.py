@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import Path
+from fastapi import Path, Request
 from starlette.responses import Response
 
 from app.api.http.auth import ServerAdmin
 from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import api_router
 from app.api.http.schemas import problem_responses
-from app.api.http.streams import IN_MEMORY, stream_file
+from app.api.http.streams import IN_MEMORY, raw_response, stream_file
 from app.errors import Damaged, NotFound
 
 TYPE = "application/octet-stream"
@@ -34,6 +34,7 @@ def stored(
         Path(description="Uploaded files, or chunks of versions.", examples=["blobs"]),
     ],
     sha256: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bytes in hex.")],
+    request: Request,
     services: ServicesDep,
     _: ServerAdmin,
 ) -> Response:
@@ -44,6 +45,8 @@ def stored(
     try:
         if kind == "blobs" and (size := services.store.blobs.size(sha256)) > IN_MEMORY:
             headers = [(b"content-type", TYPE.encode()), (b"content-length", str(size).encode())]
+            if request.scope["state"].get("head"):
+                return raw_response(200, headers)
             return stream_file(services.store.blobs.open(sha256), 0, size, 200, headers)
         data = services.store.blobs.get(sha256) if kind == "blobs" else services.store.chunks.read(sha256)
     except Damaged as error:  # a chunk that never existed looks like a lost one

@@ -14,7 +14,7 @@ from app.api.http.dependencies import ServicesDep
 from app.api.http.responses import api_router, json_response
 from app.api.http.schemas import ApiTime, RequestModel, problem_responses
 from app.api.session import sign_in_path
-from app.errors import Conflict, Invalid, NotFound, Problem
+from app.errors import Invalid, Problem
 from app.events.messages import ROBOT_NAME
 from app.store.values import Role, Token, rfc3339
 
@@ -153,12 +153,7 @@ def delete_token(id: TokenPath, services: ServicesDep, _: ServerAdmin) -> Respon
 
     The last token of a full administrator cannot be revoked.
     """
-    tokens = {token.id: token for token in services.store.tokens.all()}
-    if id not in tokens:
-        raise NotFound(f"unknown token {id[:80]!r}")
-    if _is_full_admin(tokens[id]) and not any(_is_full_admin(t) for t in tokens.values() if t.id != id):
-        raise Conflict("this is the last administrator's token: create another one first")
-    services.store.tokens.delete(id)
+    services.store.tokens.delete(id, is_needed=_is_full_admin)
     services.access.invalidate()
     return Response(status_code=204)
 

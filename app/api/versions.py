@@ -367,6 +367,8 @@ def get_source(
     start, end = part or (0, source.size)
     headers = [*range_headers(part, source.size), *headers]
     status = 206 if part else 200
+    if request.scope["state"].get("head"):
+        return raw_response(status, headers)
     if source.size > IN_MEMORY:
         return stream_file(services.store.blobs.open(source.sha256), start, end, status, headers)
     return raw_response(status, headers, services.store.blobs.get(source.sha256)[start:end])

@@ -19,6 +19,7 @@ from urllib.parse import quote, unquote, urljoin
 
 import httpx
 
+from app.bearer import authorization
 from app.cli import variables
 from app.cli.output import ProgressBar, print_status, progress_bar
 from app.cli.problems import RequestFailed
@@ -122,7 +123,7 @@ class Client:
             print_status(f"warning: {warning}", style="yellow")
         headers = {"User-Agent": "fleetmap"}
         if self.token:
-            headers["Authorization"] = f"Bearer {self.token}"
+            headers["Authorization"] = authorization(self.token)
         ca = os.environ.get("FLEETMAP_CA")
         self._http = httpx.Client(
             base_url=self.server,
@@ -212,6 +213,8 @@ class Client:
             if answer.status_code != httpx.codes.OK:
                 answer.read()
                 self._check(answer)
+            if not answer.headers.get("content-type", "").startswith("text/event-stream"):
+                raise _not_ours(answer, "no stream of events")
             event: dict[str, Any] = {}
             for line in answer.iter_lines():
                 name, _, value = line.partition(":")
@@ -343,10 +346,7 @@ class Client:
         try:
             return answer.json()
         except ValueError as error:
-            detail = f"unexpected response from {answer.url} (not JSON): check the address of the Fleet Map Server"
-            raise RequestFailed(
-                {"title": "Not a Fleet Map Server", "detail": detail}, status=answer.status_code
-            ) from error
+            raise _not_ours(answer, "not JSON") from error
 
     def _wait(self, answer: httpx.Response) -> dict[str, Any]:
         """Wait for a job with a progress bar and return it. Raises RequestFailed with its problem if it fails."""
@@ -414,6 +414,11 @@ def _seconds(retry_after: str, otherwise: float) -> float:
         return min(MAX_RETRY_SECONDS, max(0.0, float(retry_after)))
     except ValueError:
         return otherwise
+
+
+def _not_ours(answer: httpx.Response, reason: str) -> RequestFailed:
+    detail = f"unexpected response from {answer.url} ({reason}): check the address of the Fleet Map Server"
+    return RequestFailed({"title": "Not a Fleet Map Server", "detail": detail}, status=answer.status_code)
 
 
 def _unreachable(server: str, error: httpx.TransportError) -> RequestFailed:

@@ -54,15 +54,19 @@ def events(
     Example: `fleetmap events --follow --environment farm`
     """
     with Client(server, token) as client:
-        query = {"environment": environment, "follow": "false", "since": since or 0}
-        past = deque(client.stream("/events", query), maxlen=None if since is not None else limit)
+        last = since or 0
+        query = {"environment": environment, "follow": "false", "since": last}
+        past: deque[dict[str, Any]] = deque(maxlen=None if since is not None else limit)
+        for event in client.stream("/events", query):
+            past.append(event)
+            last = event["id"]
         for event in past:
             _show(event, as_json=as_json)
         if follow:
-            _follow(client, environment, past[-1]["id"] if past else since, as_json=as_json)
+            _follow(client, environment, last, as_json=as_json)
 
 
-def _follow(client: Client, environment: str | None, last: int | None, *, as_json: bool) -> None:
+def _follow(client: Client, environment: str | None, last: int, *, as_json: bool) -> None:
     """Print events until the process is interrupted; resume an interrupted stream after its last event."""
     pause = RETRY_SECONDS
     while True:

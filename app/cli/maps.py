@@ -121,13 +121,13 @@ def export_map(
         base = quote_path("environments", environment, "versions", chosen)
         with client.download(base + quote_path("maps", format, *(file.split("/") if file else ())), params) as got:
             written = store(got, to)
-        report = client.get(base + quote_path("reports", format), params)
+        report = client.get(base + quote_path("reports", format), params) if as_json or verbose else None
     if as_json:
         output.show_json({"files": written, "report": report})
         return
     for name in written:
         output.print_result(name)
-    if verbose:
+    if report is not None:
         show_report(report)
 
 

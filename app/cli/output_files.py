@@ -33,7 +33,17 @@ def to_stdout(stream: IO[bytes]) -> None:
 
 
 def to_file(path: Path, stream: IO[bytes]) -> None:
-    """Write all bytes to a file atomically: to a temporary file, which is then renamed. Raises Invalid."""
+    """Write all bytes to a file atomically: to a temporary file, which is then renamed. Raises Invalid.
+
+    A device or pipe, such as ``/dev/stdout``, is written to, not replaced.
+    """
+    if path.exists() and not path.is_dir() and (not path.is_file() or path.parts[:2] in (("/", "dev"), ("/", "proc"))):
+        try:
+            with path.open("wb") as target:
+                shutil.copyfileobj(stream, target)
+        except OSError as error:
+            raise Invalid(f"could not write {path}: {error.strerror or error}") from error
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")

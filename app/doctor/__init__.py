@@ -30,7 +30,7 @@ def examine(site: Site, only: Collection[str] = ()) -> Iterator[Result]:
         try:
             findings = list(function(site))
         except FleetMapError as error:
-            findings = [_finding_of(error, site)]
+            findings = [_finding_of(error, site, only)]
         except OSError as error:
             findings = [Finding("error", system_reason(error), str(error.filename or ""))]
         except Exception as error:  # noqa: BLE001  a defect in one check must not hide the others
@@ -40,9 +40,10 @@ def examine(site: Site, only: Collection[str] = ()) -> Iterator[Result]:
             yield Result(name, finding)
 
 
-def _finding_of(error: FleetMapError, site: Site) -> Finding:
+def _finding_of(error: FleetMapError, site: Site, only: Collection[str]) -> Finding:
     """Return the result of a check that could not be made: its cause is reported once, by the check of the database."""
-    if isinstance(error, Unavailable) and not site.is_database_usable:
+    is_reported = not only or "database" in only
+    if isinstance(error, Unavailable) and not site.is_database_usable and is_reported:
         return Finding("ok", "not checked without a usable database: see the check database")
     return Finding("error", error.detail)
 

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 
 from app import __version__
+from app.api.http.connections import FILES_PER_CONNECTION, OTHER_FILES
 from app.config import is_loopback
 from app.doctor.registry import Finding, check, error, human_size, ok, warning
 from app.doctor.site import Site
@@ -88,7 +89,7 @@ def open_files(site: Site) -> Iterator[Finding]:
     """Compare the limit of open files with the connections."""
     chosen = site.settings
     _, limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = 2 * chosen.max_connections
+    needed = chosen.max_connections * FILES_PER_CONNECTION + OTHER_FILES
     if limit == resource.RLIM_INFINITY or limit >= needed:
         yield ok(f"{limit if limit != resource.RLIM_INFINITY else 'any number of'} open files are allowed")
     else:

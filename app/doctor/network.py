@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib.metadata
 import socket
+import ssl
 from collections.abc import Iterator
 from http import HTTPStatus
 
@@ -42,12 +43,21 @@ def http_port(site: Site) -> Iterator[Finding]:
         try:
             answer = site.fetch("/healthz", address)
             is_server = answer.status_code == HTTPStatus.OK and answer.json() == {"status": "ok"}
-        except (FleetMapError, ValueError):
-            is_server = scheme == "https"  # its certificate, which another check examines, may not name this address
+        except ValueError:
+            is_server = False
+        except FleetMapError as failure:  # its certificate, which another check examines, may not name this address
+            is_server = _is_of_certificate(failure)
         if is_server:
             yield ok("a server answers", place)
         else:
             yield error("another program uses the port", place, "stop it (`ss -ltnp`), or set another FLEETMAP_PORT")
+
+
+def _is_of_certificate(failure: BaseException | None) -> bool:
+    """Return whether a TLS server answered with a certificate that is not trusted here."""
+    while failure is not None and not isinstance(failure, ssl.SSLCertVerificationError):
+        failure = failure.__cause__ or failure.__context__
+    return failure is not None
 
 
 def _bind_problem(host: str, port: int) -> OSError | None:

@@ -14,6 +14,7 @@ from urllib.parse import quote
 import httpx
 
 from app.agent import signatures
+from app.bearer import authorization
 from app.errors import Conflict, Denied, FleetMapError, NotFound, Unauthenticated, Unavailable, Untrusted
 from app.store.mirror_source import SIGNATURE
 from app.store.values import rfc3339
@@ -48,7 +49,7 @@ class Centre:
     ) -> None:
         self.url, self.key, self._given = url.rstrip("/"), key, given
         self._http = client or httpx.Client(timeout=TIMEOUT)
-        self._headers = {"authorization": f"Bearer {token}"}
+        self._headers = {"authorization": authorization(token)}
         self.received = self.sent = 0
 
     def close(self) -> None:

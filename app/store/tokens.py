@@ -5,6 +5,7 @@ from __future__ import annotations
 import hmac
 import logging
 import secrets
+from collections.abc import Callable
 from datetime import datetime, timedelta
 from typing import Any, Final, get_args
 
@@ -101,10 +102,18 @@ class Tokens:
             rows = connection.execute(select(table).order_by(table.c.created, table.c.id)).all()
         return [_as_token(r) for r in rows]
 
-    def delete(self, id: str) -> None:
-        """Revoke a token. Raises NotFound."""
+    def delete(self, id: str, *, is_needed: Callable[[Token], bool] = lambda _: False) -> None:
+        """Revoke a token. Raises NotFound, or Conflict for the last of those that are needed.
+
+        is_needed: tells of an administrator's token whether one like it must remain.
+        """
+        table = tables.token
+        admins = select(table).where(table.c.role == "admin").order_by(table.c.id).with_for_update()
         with self._database.write() as connection:
-            if not connection.execute(delete(tables.token).where(tables.token.c.id == id)).rowcount:
+            needed = [token.id for row in connection.execute(admins) if is_needed(token := _as_token(row))]
+            if needed == [id]:
+                raise Conflict("this is the last administrator's token: create another one first")
+            if not connection.execute(delete(table).where(table.c.id == id)).rowcount:
                 raise NotFound(f"unknown token {id[:80]!r}")
 
     def find(self, text: str) -> Token | None:

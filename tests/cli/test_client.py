@@ -212,6 +212,19 @@ def test_foreign_server_is_recognised(talk: Talk) -> None:
     client, _ = talk(reply(404, b"<html>", "text/html"))
     with pytest.raises(RequestFailed, match="returned status 404"):
         client.get("/formats")
+    client, _ = talk(reply(200, b"<html>", "text/html"))
+    with pytest.raises(RequestFailed, match="no stream of events"):
+        list(client.stream("/events", {}))
+
+
+def test_token_is_sent_without_line_end_and_never_shown(talk: Talk) -> None:
+    client, script = talk(reply(200, {}), token="secret-of-a-file\r\n")
+    client.get("/formats")
+    assert script.asked[0][2]["Authorization"] == "Bearer secret-of-a-file"
+    for token in ("two secrets", "sec\nret", "secrét", " \n"):
+        with pytest.raises(Invalid, match="copy it again") as caught:
+            talk(reply(200, {}), token=token)
+        assert "sec" not in str(caught.value).removeprefix("the token")
 
 
 def test_pages_are_followed_up_to_limit(talk: Talk) -> None:

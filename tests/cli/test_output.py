@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from app.cli import output
+from app.cli.output_files import to_file
 from app.cli.versions import change_line, counts
 
 
@@ -106,3 +111,13 @@ def test_table_keeps_names_on_one_line_and_wraps_texts(
         assert sorted("".join(stdout.split())) == sorted(
             "".join(("environment", "version", "time(UTC)", "reason", *row)).replace(" ", "")
         ), "nothing is cut off"
+
+
+def test_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(1) as thread:
+        read = thread.submit(pipe.read_bytes)
+        to_file(pipe, io.BytesIO(b"content"))
+        assert read.result(60) == b"content"
+    assert pipe.is_fifo()

@@ -226,6 +226,11 @@ def taken_port(place: Place) -> Site:
     return place.site(port=place.stub({"/": (200, "another program")}).port)
 
 
+def taken_tls_port(place: Place) -> Site:
+    """A program without TLS has the port of a server with TLS."""
+    return tls_site(place, 90, port=place.stub({"/": (200, "another program")}).port)
+
+
 def reserved_port(place: Place) -> Site:
     """A program has the port, and does not listen yet."""
     holder = socket.socket()
@@ -355,6 +360,7 @@ CASES: list[Case] = [
     ("http-port", "ok", "free", lambda p: p.site(port=free_port())),
     ("http-port", "ok", "a server answers", running_server),
     ("http-port", "error", "another program", taken_port),
+    ("http-port", "error", "another program", taken_tls_port),
     ("http-port", "error", "cannot listen", reserved_port),
     ("http-port", "error", "cannot listen", lambda p: p.site(host="192.0.2.1", port=free_port())),
     ("memory", "ok", "need", lambda p: p.site(memory=lambda: 64 * 2**30)),
@@ -476,6 +482,18 @@ def test_check(
     chosen = [r.finding for r in results if r.finding.level == level and detail in r.finding.detail]
     assert chosen, listed
     assert all(finding.advice for finding in chosen if finding.level == "error" and name != "zenoh-router"), listed
+
+
+def test_check_that_could_not_be_made_is_an_error_unless_the_cause_is_listed(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    site = Place(tmp_path, request).site(
+        database_url=f"postgresql+psycopg://fleetmap:pw@127.0.0.1:{free_port()}/x", blob_url=str(tmp_path / "blobs")
+    )
+    (alone,) = examine(site, ["backup"])
+    assert (alone.finding.level, "database" in alone.finding.detail) == ("error", True)
+    levels = {result.check: result.finding.level for result in examine(site, ["backup", "database"])}
+    assert levels == {"backup": "ok", "database": "error"}
 
 
 def test_every_check_has_a_good_and_a_bad_case() -> None:

@@ -59,7 +59,8 @@ class Listener:
 
     def wait(self, condition: Callable[[Listener], bool], seconds: float = 60.0) -> None:
         with self._news:
-            assert self._news.wait_for(lambda: condition(self), seconds), [e["sequence"] for e in self.events]
+            heard = self._news.wait_for(lambda: condition(self), seconds)
+        assert heard, "heard: " + " ".join(str(e["sequence"]) for e in self.events)
 
 
 def eventually(condition: Callable[[], Any], seconds: float = 60.0) -> Any:

@@ -58,7 +58,7 @@ def test_environment_create_describe_and_find(store: Store):
         store.environments.get("farm-2")
     changed = store.environments.update("farm-1", title="New", tags=["x"])
     assert (changed.title, changed.description, changed.tags) == ("New", "of apples", ("x",))
-    with pytest.raises(Invalid, match="NUL"):
+    with pytest.raises(Invalid, match="no control characters"):
         store.environments.update("farm-1", description="a\x00")
 
 
@@ -470,3 +470,21 @@ def test_version_changes_name_level_of_parts_with_equal_names(store: Store):
     version = save(store, "farm", Replace(first, grid()), Replace(second, grid(seed=1)))
     assert set(version.changes["occupancy"]) == {"first/map", "ground/map"}
     assert rows(features([], "local")) == {}
+
+
+def test_one_of_the_needed_tokens_remains(store: Store):
+    """Also if the last two are revoked at once."""
+    names = [store.tokens.create(name, "admin")[0].id for name in ("ann", "bob")]
+    store.tokens.create("carl", "viewer")
+
+    def revoke(token_id: str) -> str:
+        try:
+            store.tokens.delete(token_id, is_needed=lambda token: token.role == "admin")
+        except Conflict as error:
+            return error.detail
+        return ""
+
+    with ThreadPoolExecutor(2) as threads:
+        outcomes = sorted(threads.map(revoke, names))
+    assert outcomes == ["", "this is the last administrator's token: create another one first"]
+    assert [token.role for token in store.tokens.all()] == ["admin", "viewer"]
