@@ -37,7 +37,6 @@ ELSEWHERE = {
     r"sudo ": "tests/docker/test_service.py and test_offline.py, on a machine of their own",
     r"(make bundle|sha256sum --check)": "tests/test_bundle.py and tests/docker/test_offline.py",
     r"python3 docker/make_secrets.py": "tests/docker/test_scale_files.py",
-    r"fleetmap token create prometheus": "an sh block of deploy.md",
     r"(pgbackrest |fleetmap restore --raise-epoch && fleetmap verify$)": "tried by hand; the page has the versions",
     r"(litestream replicate|rclone config|rclone copy /var)": "tried by hand; the page has the versions",
     r"FLEETMAP_CA=ca.pem FLEETMAP_ZENOH_CA=": "the same agent as in deploy.md",
