@@ -119,10 +119,7 @@ class Agent:
         if installed is not None and name is not None and (bad := self._folder.damaged_files(name, installed)):
             self._log_event("damaged", version=installed.version, files=bad[:20])
             state = dataclasses.replace(state, etag=None)
-        boot = read_boot_id()
-        if state.boot not in (None, boot):  # the robot's programs have forgotten what the hooks loaded
-            state = dataclasses.replace(state, activated=None)
-        self._store.stage(dataclasses.replace(state, boot=boot))
+        self._store.stage(state.in_boot(read_boot_id()))
         self._signed_clock.floor = state.newest_time
         self._activation.protect()
         if installed is not None and name is not None:

@@ -30,8 +30,7 @@ def level_files(manifest: Manifest, level: str) -> list[str]:
 def read_level(folder: MapDirectory, manifest: Manifest) -> str | None:
     """Return the robot's level by the name that it has in this map; None if it was never set."""
     names = _level_file_names(folder)
-    known = level_names(manifest)
-    return next((name for name in names if name in known), names[0] if names else None)
+    return next((name for name in names if name in level_names(manifest)), names[0] if names else None)
 
 
 def _level_file_names(folder: MapDirectory) -> list[str]:

@@ -74,6 +74,11 @@ class AgentState:
     newest_time: float = 0.0
     boot: str | None = None
 
+    def in_boot(self, boot: str | None) -> AgentState:
+        """Return the state in this boot of the machine; in another one nothing is loaded that the hooks had loaded."""
+        activated = self.activated if self.boot in (None, boot) else None
+        return dataclasses.replace(self, activated=activated, boot=boot)
+
     def with_mark(self, channel: str, mark: Mark) -> AgentState:
         """Return the state after a manifest of this channel was accepted."""
         return dataclasses.replace(self, marks={**self.marks, channel: mark}, channel=channel)

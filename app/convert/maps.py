@@ -116,9 +116,7 @@ class Maps:
             return replace(recipe, failed=tuple(failed), replan=plan, order=order)
 
         planned = first_working(plan, check)
-        with self._guard:
-            found_by_others = self._detours.get(planned.key)
-        return planned if found_by_others is None else planned.without(found_by_others)
+        return planned.without(self._detours.get(planned.key, planned.failed))
 
     def _planner(
         self, version: Version, name: str, values: Mapping[str, str], *, derive: bool, file: str | None, listed: bool
@@ -167,10 +165,9 @@ class Maps:
         """
         planned = recipe.without(failed)
         if planned.key != recipe.key:
-            with self._guard:
-                self._detours[recipe.key] = tuple(failed)
-                while len(self._detours) > MAX_CACHED_RESULTS:
-                    self._detours.popitem(last=False)
+            self._detours[recipe.key] = tuple(failed)
+            while len(self._detours) > MAX_CACHED_RESULTS:
+                self._detours.popitem(last=False)
         cached_map = self.cache.get_or_fetch(planned.key)
         return None if cached_map is None else (planned, cached_map)
 
@@ -207,7 +204,7 @@ class Maps:
                 self._trials.add(key, ChainFailure.from_error(error), lasting=_is_lasting(recipe.chain))
             raise
         except (CannotConvert, NotFound, Invalid) as error:
-            self._note_failure(recipe.key, error)
+            self.note_failure(recipe, error)
             raise
 
     def _find_losses(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
@@ -225,20 +222,17 @@ class Maps:
             raise CannotConvert(f"the map in {recipe.format.name} could not be read back: {error.detail}") from error
         return ConvertedMap({"losses.json": (content, "application/json")}, None, cached_map.report)
 
-    def note_failure(self, recipe: Recipe, error: FleetMapError) -> None:
-        """Remember that another process could not make this map, for ``failure``."""
-        self._note_failure(recipe.key, error)
-
     def failure(self, recipe: Recipe) -> FleetMapError | None:
         """Return the error of a recent conversion that content or parameters made impossible, or None."""
         with self._guard:
             since, error = self._failures.get(recipe.key, (0.0, None))
         return error if time.monotonic() - since < FAILURE_SECONDS else None
 
-    def _note_failure(self, key: str, error: FleetMapError) -> None:
+    def note_failure(self, recipe: Recipe, error: FleetMapError) -> None:
+        """Remember that this map could not be made, here or by another process."""
         with self._guard:
-            self._failures[key] = (time.monotonic(), error)
-            self._failures.move_to_end(key)
+            self._failures[recipe.key] = (time.monotonic(), error)
+            self._failures.move_to_end(recipe.key)
             while len(self._failures) > MAX_CACHED_RESULTS:
                 self._failures.popitem(last=False)
 

@@ -399,6 +399,6 @@ def initial_site(settings: Settings) -> Site | None:
         names = (settings.folder / "level").read_text().splitlines()  # in this map, and perhaps in the next one
     site = Site(folder, settings.folder / "hooks", frozenset(), names[0] if names else "")
     with contextlib.suppress(LoadError):
-        known = site.level_names()
-        site.level = next((name for name in names if name in known), site.level)
+        levels = site.level_names()
+        site.level = next((name for name in names if name in levels), site.level)
     return site
