@@ -49,7 +49,7 @@ def level_problem(manifest: Manifest, level: str | None) -> str | None:
     names = ", ".join(level_names(manifest)) or "none"
     return (
         f"version {manifest.version} has no level {level!r}, which the robot is on (levels: {names}): "
-        "choose another with fleetmap agent-level, and with --next if this map names the levels otherwise"
+        "choose another with fleetmap agent-level, or give the name that it has in this map, with --next"
     )
 
 
@@ -119,7 +119,7 @@ def load_level(
             return
         if level not in names:
             choice = f"choose one of {', '.join(names)}" if names else "the map has no levels"
-            raise NotFound(f"unknown level {level[:80]!r}: {choice}, or add --next if the next map calls it so")
+            raise NotFound(f"unknown level {level[:80]!r}: {choice}, or add --next if that is its name in the next map")
 
         def run(of: str | None) -> str | None:
             """Run the hooks for a level; None: the default one. Return the problem of the first that fails."""

@@ -58,7 +58,7 @@ class AgentState:
         activated: version folder for which the hooks have run; None while they run.
         working: version folder whose hooks succeeded last; ``current`` goes back to it if those of a newer one fail.
         newest_time: newest signed time accepted, in seconds since 1970.
-        boot: of the machine, in which the hooks have run; None if unknown.
+        boot: id of the boot of the machine in which the hooks have run; None if unknown.
     """
 
     environment: str

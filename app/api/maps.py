@@ -39,8 +39,10 @@ from app.convert.recipe import Recipe
 from app.errors import Unavailable
 
 MAX_LOST_ATTEMPTS = 5
-MAX_PLANS = 20
 """Maximum number of conversions if a map leaves the cache before it is read."""
+
+MAX_PLANS = 20
+"""Maximum number of ways to make a map that are planned, each since a derivation of the one before found nothing."""
 
 OVERLAYS = b"fleetmap-overlays"
 """Name of the header with the digest of the closures in force that a map shows."""
@@ -89,7 +91,7 @@ async def _get_or_convert(request: Request, services: Services) -> CachedRespons
             if answer is not None:
                 return answer
             if attempt >= MAX_PLANS:
-                raise Unavailable("other ways to make the map are found again and again: try again in a few seconds")
+                raise Unavailable(f"the map is planned anew after {MAX_PLANS} attempts: try again in a few seconds")
         except LostMap:  # damaged or evicted while being read: convert again
             if attempt >= MAX_LOST_ATTEMPTS:
                 raise

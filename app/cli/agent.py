@@ -250,7 +250,7 @@ def agent_level(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of the agent (`--into`).")],
     level: Annotated[str, typer.Argument(help="New level of the robot, one of `current/levels.json`.")],
     for_next_map: Annotated[
-        bool, typer.Option("--next", help="Only store that the next map calls the robot's level so.")
+        bool, typer.Option("--next", help="Store that the robot's level has this name in the next map; load nothing.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each event.")] = False,
 ) -> None:

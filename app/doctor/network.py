@@ -46,15 +46,15 @@ def http_port(site: Site) -> Iterator[Finding]:
         except ValueError:
             is_server = False
         except FleetMapError as failure:  # its certificate, which another check examines, may not name this address
-            is_server = _is_of_certificate(failure)
+            is_server = _has_untrusted_certificate(failure)
         if is_server:
             yield ok("a server answers", place)
         else:
             yield error("another program uses the port", place, "stop it (`ss -ltnp`), or set another FLEETMAP_PORT")
 
 
-def _is_of_certificate(failure: BaseException | None) -> bool:
-    """Return whether a TLS server answered with a certificate that is not trusted here."""
+def _has_untrusted_certificate(failure: BaseException | None) -> bool:
+    """Return whether there was an answer over TLS, with a certificate that is not trusted here."""
     while failure is not None and not isinstance(failure, ssl.SSLCertVerificationError):
         failure = failure.__cause__ or failure.__context__
     return failure is not None

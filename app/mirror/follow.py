@@ -16,13 +16,7 @@ from fnmatch import fnmatchcase
 from itertools import groupby
 from typing import Any, Final
 
-from app.errors import (
-    Denied,
-    FleetMapError,
-    NotFound,
-    Unavailable,
-    Untrusted,
-)
+from app.errors import Denied, FleetMapError, NotFound, Unavailable, Untrusted
 from app.mirror.centre import Centre
 from app.mirror.content import Fetcher
 from app.mirror.failures import NotedFailure

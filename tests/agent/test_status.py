@@ -45,7 +45,8 @@ def test_status_that_the_server_did_not_take_is_confirmed_later(
     now = [1000.0]
     monkeypatch.setattr(status_module.time, "monotonic", lambda: now[0])
     server, refused = Server(error), list[str]()
-    reporter = StatusReporter("farm", "r1", server, threading.Event(), refused.append)  # type: ignore[arg-type]
+    client: Any = server
+    reporter = StatusReporter("farm", "r1", client, threading.Event(), refused.append)
     reporter.bus = Router()
     reporter.set(STATUS)
     reporter.send()

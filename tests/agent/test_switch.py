@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,12 @@ def calls(path: Path) -> list[str]:
 def loads(taken: Path) -> str:
     """A hook that loads each map but those with b."""
     return f"cd $FLEETMAP_CURRENT/kml; grep -q b map.kml && {{ echo 'no b'; exit 3; }}; cp map.kml {taken}"
+
+
+def unavailable(request: BaseHTTPRequestHandler) -> bool:
+    """Answer each request of an agent with 503."""
+    send(request, 503, b"")
+    return True
 
 
 def state(one: One) -> dict[str, Any]:
@@ -262,7 +269,7 @@ def test_interrupted_hooks_run_without_server(fake: Fake, robot: Robot, tmp_path
     assert robot("true").once()
     path = robot().into / "state.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "activated": None}))
-    fake.instead = lambda h: send(h, 503, b"") or True  # type: ignore[func-returns-value]
+    fake.instead = unavailable
     one = robot(f"touch {tmp_path}/loaded")
     assert not one.once()
     assert (tmp_path / "loaded").exists()
@@ -281,7 +288,7 @@ def test_hooks_run_again_after_a_boot(
         boot.write_text(content)
         assert robot(hook).once()
     assert (tmp_path / "loaded").read_text().splitlines() == ["kml/map.kml"]
-    fake.instead = lambda h: send(h, 503, b"") or True  # type: ignore[func-returns-value]
+    fake.instead = unavailable
     for content in "bb":
         boot.write_text(content)
         assert not robot(hook).once()

@@ -59,8 +59,8 @@ class Listener:
 
     def wait(self, condition: Callable[[Listener], bool], seconds: float = 60.0) -> None:
         with self._news:
-            heard = self._news.wait_for(lambda: condition(self), seconds)
-        assert heard, "heard: " + " ".join(str(e["sequence"]) for e in self.events)
+            is_met = self._news.wait_for(lambda: condition(self), seconds)
+        assert is_met, "received: " + " ".join(str(e["sequence"]) for e in self.events)
 
 
 def eventually(condition: Callable[[], Any], seconds: float = 60.0) -> Any:

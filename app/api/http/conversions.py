@@ -53,7 +53,7 @@ class JobStarted:
 
 @dataclass(slots=True)
 class _RunningConversion:
-    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id.
+    """Conversion in progress. waiters: number of waiting requests. jobs: principal id -> job id. creating: its locks.
 
     shared: job that waits for a worker of all servers, if one makes the map. noted: the progress that its jobs show.
     """
