@@ -1,6 +1,6 @@
 /** The signed-in user. The token stays in an HttpOnly cookie that scripts cannot read. */
 import { effect, signal } from "@preact/signals";
-import { ApiError, api, ask, type Role, returns, type Schemas, unauthenticated } from "./api/client";
+import { ApiError, api, asApiError, ask, type Role, returns, type Schemas, unauthenticated } from "./api/client";
 
 export type Session = Schemas["SessionOut"];
 
@@ -43,7 +43,8 @@ export async function signIn(credentials: { token: string } | { code: string }):
 /** Throws if the server cannot end the session: its cookie would sign in whoever comes next. */
 export async function signOut(): Promise<void> {
   await ask(api.DELETE("/api/v1/session")).catch((error: unknown) => {
-    if (!(error instanceof ApiError && error.status === 401)) throw error;
+    if (error instanceof ApiError && error.status === 401) return;
+    throw new Error(`you are still signed in: ${asApiError(error).message}`);
   });
   for (const name of await caches.keys().catch(() => [])) await caches.delete(name);
   session.value = null;
