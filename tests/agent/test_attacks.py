@@ -126,6 +126,7 @@ def recover(robot: Start, gate: Gate) -> None:
 
 VARIABLES = (
     *({name: "/x"} for name in ("LD_PRELOAD", "PATH", "PROMPT_COMMAND", "GAZEBO_PLUGIN_PATH", "A B", "A;rm")),
+    *({name: "/x"} for name in ("OPENSSL_CONF", "ZENOH_CONFIG_OVERRIDE", "ROS_MASTER_URI")),
     *({"A": "1\n2"}, {"A": 7}, [1], "x"),
 )
 

@@ -241,3 +241,32 @@ def test_exports_match_real_shell() -> None:
 def test_exports_rejects_invalid_names_and_values(name: str, value: str) -> None:
     with pytest.raises(ValueError, match="cannot be exported"):
         shell.exports({name: value})
+
+
+CONTROLLING = """
+OPENSSL_CONF OPENSSL_MODULES SSL_CERT_FILE CURL_CA_BUNDLE REQUESTS_CA_BUNDLE CURL_HOME HOSTALIASES RES_OPTIONS
+ROS_MASTER_URI ROS_DOMAIN_ID ROS_DISCOVERY_SERVER ROS_SECURITY_ENABLE ROS_PACKAGE_PATH ROSCONSOLE_CONFIG_FILE
+RMW_IMPLEMENTATION ZENOH_CONFIG_OVERRIDE ZENOH_SESSION_CONFIG_URI CYCLONEDDS_URI FASTDDS_DEFAULT_PROFILES_FILE
+FASTRTPS_DEFAULT_PROFILES_FILE GAZEBO_MASTER_URI GAZEBO_MODEL_DATABASE_URI GAZEBO_RESOURCE_PATH GZ_CONFIG_PATH GZ_IP
+LESSOPEN LESSCLOSE GTK_MODULES GIO_EXTRA_MODULES GDK_PIXBUF_MODULE_FILE QT_QPA_PLATFORMTHEME QML2_IMPORT_PATH
+VK_LAYER_PATH LIBGL_DRIVERS_PATH XDG_CONFIG_HOME DOCKER_HOST NUMBA_CACHE_DIR TMOUT LD_PRELOAD PATH
+"""
+
+OF_PLACES = """
+FARM_NAME FIELD_NAME FIELD_ID FIELD_TYPE ENVIRONMENT_ORIGINS ENVIRONMENT_COMMON_LATEST_RELEASE LOCALISATION_ZONE WORLD
+ROSE_GARDEN QTY LESSON GAZEBO_WORLD_FILE GAZEBO_CUSTOM_MODELS GAZEBO_MODEL_PATH ROBOT_NAME
+"""
+
+
+def test_variables_that_control_programs_and_ros_are_not_exported() -> None:
+    names = CONTROLLING.split()
+    variables, warnings = shell.assignments("".join(f"{name}='x'\n" for name in names).encode())
+    assert (variables, len(warnings)) == ({}, len(names))
+    for name in names:
+        with pytest.raises(ValueError, match="controls how programs run"):
+            shell.exports({name: "x"})
+
+
+def test_variables_of_places_are_exported() -> None:
+    wanted = dict.fromkeys(OF_PLACES.split(), "x")
+    assert shell.assignments(shell.exports(wanted)) == (wanted, [])
