@@ -97,6 +97,7 @@ class Agent:
         self._preloaded_closures = ""
         self._fetched: Manifest | None = None
         self._refreshed: tuple[str, str] | None = None
+        self._closures_problem = ""  # why the current map lacks the newest closures, while the channel's is not active
         self._announced_sequence = 0
         self._stale_replies = 0
 
@@ -314,7 +315,7 @@ class Agent:
 
     def _refresh_closures(self) -> None:
         """Apply the newest closures to the current version if the channel's version is not active."""
-        name = self._folder.current_version
+        name, self._closures_problem = self._folder.current_version, ""
         current, digest = self._folder.manifest(name), self._manifests.overlays_digest
         if name is None or current is None or digest is None or self._state.working != name:
             return
@@ -324,10 +325,7 @@ class Agent:
         try:
             begun = time.monotonic()
             manifest, sources = self._fetch_version(current.version, keep)
-            if manifest.root != current.root:
-                raise Untrusted(
-                    f"version {manifest.version} has root {manifest.root[:8]} instead of {current.root[:8]}"
-                )
+            self._manifests.check_refreshed(manifest, current)
             if manifest.map_key == current.map_key:
                 self._refreshed = (name, digest)  # these closures do not concern this version
                 return
@@ -343,7 +341,8 @@ class Agent:
             built = self._folder.build(manifest, sources)
             outcome = self._activation.replace(built, manifest, members, self._time_text()[:19] + "Z")
         except FleetMapError as error:
-            self._log_event("failed", detail=f"closures of version {current.version}: {error.detail}")
+            self._closures_problem = f"closures of version {current.version}: {error.detail}"
+            self._log_event("failed", detail=self._closures_problem)
             return
         if outcome.state == "failed":
             self._log_event("failed", detail=outcome.detail)
@@ -527,17 +526,18 @@ class Agent:
 
     def _report(self, outcome: Outcome, *, is_planned: bool = False) -> None:
         """Report the outcome of the channel's map. is_planned: with a planned version, skip an unchanged status."""
-        report_key = (outcome.state, outcome.detail, self._folder.current_version, self._accepted_sequence)
+        detail = "; ".join(text for text in (outcome.detail, self._closures_problem) if text)
+        report_key = (outcome.state, detail, self._folder.current_version, self._accepted_sequence)
         if is_planned and report_key == self._reported:
             return
         self._reported = report_key
         if outcome.state == "active":
             self._set_status("active", self._remark())
         elif outcome.state == "failed":
-            if self._set_status("failed", outcome.detail, outcome.manifest):
-                self._log_event("failed", detail=outcome.detail)
+            if self._set_status("failed", detail, outcome.manifest):
+                self._log_event("failed", detail=detail)
         else:
-            self._set_status("ready", outcome.detail, outcome.manifest)
+            self._set_status("ready", detail, outcome.manifest)
 
     def _remark(self) -> str | None:
         """Return remarks about an active map: missing optional formats, server behind its events, failed hook steps."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from app.agent import signatures, signed_manifest
 from app.agent.freshness import Freshness, SignedClock
-from app.agent.http_client import ServerClient
+from app.agent.http_client import ClosuresChanged, ServerClient
 from app.agent.map_directory import MapDirectory
 from app.agent.options import AgentOptions
 from app.agent.requests import FormatRequest, encode_entries
@@ -101,6 +101,21 @@ class Manifests:
         if manifest.version != version:
             raise Untrusted(f"the server returned the manifest of version {manifest.version} instead of {version}")
         return manifest
+
+    def check_refreshed(self, manifest: Manifest, current: Manifest) -> None:
+        """Check that a manifest is the current version's, with the closures of the channel's newest manifest.
+
+        It has no sequence of its own that could show a replay. Closures are those of the environment, whatever the
+        version. Raises Untrusted, ClosuresChanged.
+        """
+        if manifest.root != current.root:
+            raise Untrusted(f"version {manifest.version} has root {manifest.root[:8]} instead of {current.root[:8]}")
+        got, newest = manifest.overlays_digest or "none", self.overlays_digest or "none"
+        if got != newest:
+            raise ClosuresChanged(
+                f"the server returned closures {got[:8]} instead of {newest[:8]}, those of the channel's newest "
+                "manifest: they have just changed, or an old manifest was replayed"
+            )
 
     def note_installed(self, manifest: Manifest) -> None:
         """Store the ETag of the installed manifest."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import pytest
 from app.agent import agent
 from app.events.messages import RobotStatus
 from tests.agent.conftest import whole
-from tests.agent.fake import Fake, One, run
+from tests.agent.fake import Fake, One, run, send
 from tests.agent.test_bad_server import event
 from tests.events.conftest import eventually
 
@@ -341,6 +342,44 @@ def test_closure_reaches_a_robot_that_waits_or_refused(fake: Fake, robot: Robot,
         fake.close_edges()
         eventually(lambda: fake.statuses[-1].get("overlays") == fake.digest)
         assert closed(one) == []
+
+
+@pytest.mark.parametrize("status", ["75", "1"])
+def test_replayed_manifest_opens_no_closed_edge(fake: Fake, robot: Robot, status: str) -> None:
+    """A robot that cannot have the channel's version yet takes closures only from a manifest that has the newest."""
+    assert robot().once()
+    old = fake.manifest("1", "formats=kml&closures=apply")
+    old_file, old_digest = fake.file("kml/map.kml", 1), fake.digest
+    key, signature = fake.keys.sign(old)
+    signed = f"{key}:{base64.b64encode(signature).decode()}"
+    fake.put(B)
+    fake.close_edges("e7")
+    hook = {"before_switch": (f"test $FLEETMAP_VERSION = 1 || exit {status}",)}
+    one = robot(**hook)
+    assert not one.once()
+    assert closed(one) == ["e7"]
+
+    def replay(handler: BaseHTTPRequestHandler) -> bool:
+        if handler.path.partition("?")[0].endswith("/versions/1/manifest"):
+            send(handler, 200, old, **{"fleetmap-signature": signed})
+        elif "/versions/1/maps/" in handler.path:
+            send(handler, 200, old_file, **{"fleetmap-overlays": old_digest})
+        else:
+            return False
+        return True
+
+    fake.instead = replay
+    fake.close_edges("e7", "e8")
+    one = robot(**hook)
+    assert not one.once()
+    assert closed(one) == ["e7"]
+    assert "an old manifest was replayed" in fake.statuses[-1]["detail"]
+    assert one.saw("failed", detail=one.agent._closures_problem), one.lines
+    fake.instead = lambda _: False
+    one = robot(**hook)
+    assert not one.once()
+    assert closed(one) == ["e7", "e8"]
+    assert "replayed" not in fake.statuses[-1]["detail"]
 
 
 def test_closure_that_cannot_be_loaded_is_retried_with_backoff(fake: Fake, robot: Robot, tmp_path: Path) -> None:
