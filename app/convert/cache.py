@@ -291,13 +291,16 @@ class Cache:
         for key in random.sample(keys, math.ceil(len(keys) * share)):
             yield key, *self.check(key)
 
-    def get_or_make(self, key: str, maker: Callable[[], ConvertedMap]) -> CachedMap:
-        """Return the map; if it is not cached, one caller converts it and the others wait."""
+    def get_or_make(self, key: str, maker: Callable[[], ConvertedMap], *, uses_cache: bool = False) -> CachedMap:
+        """Return the map; if it is not cached, one caller converts it and the others wait.
+
+        uses_cache: the maker gets other maps from this cache; their makers must not.
+        """
         cached_map = self.get(key)
         if cached_map is not None:
             self.hits += 1
             return cached_map
-        with self._key_lock(key):
+        with self._key_lock(key, uses_cache=uses_cache):
             cached_map = self.get_or_fetch(key)
             if cached_map is not None:
                 self.hits += 1
@@ -512,12 +515,14 @@ class Cache:
         return out
 
     @contextlib.contextmanager
-    def _key_lock(self, key: str) -> Iterator[None]:
-        """Lock a key among threads and processes."""
+    def _key_lock(self, key: str, *, uses_cache: bool) -> Iterator[None]:
+        """Lock a key among threads and processes. uses_cache: other keys are locked meanwhile, see ``get_or_make``."""
         with self._guard:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
-            path = self._folder / "locks" / key[:2]  # few lock files; keys that share one rarely collide
+            # Few lock files; keys that share one rarely collide. Who locks other keys meanwhile has files of its own:
+            # otherwise it would wait for itself if they share one.
+            path = self._folder / "locks" / (f"{key[:2]}-uses-cache" if uses_cache else key[:2])
             with contextlib.ExitStack() as stack:
                 try:
                     stack.enter_context(file_lock(path))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import threading
 import time
 from collections import OrderedDict
@@ -13,9 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import orjson
-
-from app import __version__, formats, parameters, templates
+from app import formats, parameters, templates
 from app.convert import closures as applied_closures
 from app.convert import files as direct
 from app.convert import losses, site
@@ -24,7 +21,7 @@ from app.convert import worker as making
 from app.convert.cache import Cache, CachedFile, CachedMap, ConvertedMap, LostMap, SharedMaps
 from app.convert.recipe import Recipe
 from app.convert.report import LayerLine, Report, all_credits, merge_reports, unsupported_layers
-from app.convert.trials import Trials
+from app.convert.trials import Trials, is_lasting, trial_key
 from app.derive import ChainFailure, first_working
 from app.errors import (
     Ambiguous,
@@ -150,7 +147,7 @@ class Maps:
             if one.members or not one.steps or (one.spread is not None and one.spread.optional):
                 continue
             with contextlib.suppress(KeyError):
-                tried = self._trials[_trial_key(one.version, one.chain)]
+                tried = self._trials[trial_key(one.version, one.chain)]
                 if tried is not None and tried.step:
                     raise tried.as_error()
 
@@ -178,7 +175,8 @@ class Maps:
         Raises CannotConvert if no chain works.
         """
         if recipe.compared is not None:
-            return recipe, self.cache.get_or_make(recipe.key, partial(self._find_losses, recipe.compared, stop))
+            find_losses = partial(self._find_losses, recipe.compared, stop)
+            return recipe, self.cache.get_or_make(recipe.key, find_losses, uses_cache=True)
         try:
             return recipe, self._convert(recipe, stop)
         except CannotDerive:
@@ -200,8 +198,8 @@ class Maps:
             return self.cache.get_or_make(recipe.key, lambda: self._run_conversion(recipe, stop))
         except CannotDerive as error:
             if not recipe.members:  # otherwise the member stores it
-                key = _trial_key(recipe.version, recipe.chain)
-                self._trials.add(key, ChainFailure.from_error(error), lasting=_is_lasting(recipe.chain))
+                key = trial_key(recipe.version, recipe.chain)
+                self._trials.add(key, ChainFailure.from_error(error), lasting=is_lasting(recipe.chain))
             raise
         except (CannotConvert, NotFound, Invalid) as error:
             self.note_failure(recipe, error)
@@ -427,7 +425,7 @@ class Maps:
         if fmt.needs.missing_content is None:
             return
         failure = self._find_failure(
-            _trial_key(version, chain, fmt), chain, making.find_missing_content, version, fmt.name, chain
+            trial_key(version, chain, fmt), chain, making.find_missing_content, version, fmt.name, chain
         )
         if failure is not None:
             raise CannotConvert(failure.reason, [Problem(failure.reason)])
@@ -435,7 +433,7 @@ class Maps:
     def _find_chain_failure(self, version: Version, chain: recipes.DerivationChain) -> ChainFailure | None:
         """Find the step of a chain that fails on the stored layers, and why (an empty step: no single one)."""
         chain = recipes.reduce_chain(chain)
-        return self._find_failure(_trial_key(version, chain), chain, making.find_chain_failure, version, chain)
+        return self._find_failure(trial_key(version, chain), chain, making.find_chain_failure, version, chain)
 
     def _find_failure(
         self, key: str, chain: recipes.DerivationChain, function: Callable[..., Any], *args: Any
@@ -446,7 +444,7 @@ class Maps:
         store_location = (self._store.database_url, str(self._store.blob_dir))
         try:
             failure: ChainFailure | None = self._run_trial(function, *store_location, *args)
-            lasting = _is_lasting(chain)
+            lasting = is_lasting(chain)
         except WorkerDied as error:
             failure, lasting = ChainFailure("", error.detail), False
         self._trials.add(key, failure, lasting=lasting)
@@ -578,23 +576,3 @@ def _stale_warnings(recipe: Recipe) -> list[Problem]:
 def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
     members = tuple(replace(member, recipe=replace(member.recipe, origin=origin)) for member in recipe.members)
     return replace(recipe, origin=origin, members=members)
-
-
-def _trial_key(version: Version, chain: recipes.DerivationChain, fmt: formats.Format | None = None) -> str:
-    """Hash the inputs of a trial: a chain's steps and, with ``fmt``, the format whose needs are checked."""
-    keys = recipes.reduce_chain(chain).keys if fmt is None else chain.keys
-    entries = {e.key: e.hash for e in version.parts}
-    ingredients = {
-        "server": __version__,
-        "format": None if fmt is None else [fmt.name, fmt.version],
-        "steps": [[s.name, s.version, s.given] for s in chain.steps],
-        "parts": [[k.layer, k.level, k.name, entries[k]] for k in keys],
-        "datum": version.datum.as_dict() if version.datum else None,
-        "levels": [[level.name, level.elevation] for level in version.levels],
-    }
-    return hashlib.sha256(orjson.dumps(ingredients)).hexdigest()
-
-
-def _is_lasting(chain: recipes.DerivationChain) -> bool:
-    """Return whether the result of a trial is permanent: not if a step uses a model, which may be added or removed."""
-    return not any(dict(step.given).get("model") for step in chain.steps)

@@ -114,7 +114,7 @@ class Previews:
             pixels = _Drawing(self._store, self._tiles, version, request, entries).pixels()
             return ConvertedMap({"preview.png": (images.encode_png(pixels), "image/png")}, None, Report("preview"))
 
-        return self._cache.get_or_make(preview_key(version, request), make).files[0].read()
+        return self._cache.get_or_make(preview_key(version, request), make, uses_cache=True).files[0].read()
 
 
 def select_entries(version: Version, request: PreviewRequest) -> list[PartEntry]:

@@ -16,7 +16,11 @@ from uuid import uuid4
 
 import orjson
 
+from app import __version__
+from app.convert.recipe import DerivationChain, reduce_chain
 from app.derive import ChainFailure
+from app.formats import Format
+from app.store.values import Version
 
 MAX_TRIALS = 10_000
 """Maximum number of cached trials; the file is compacted at twice as many lines."""
@@ -80,6 +84,26 @@ class Trials:
         finally:
             temporary.unlink(missing_ok=True)
         self._lines = len(self._results)
+
+
+def trial_key(version: Version, chain: DerivationChain, fmt: Format | None = None) -> str:
+    """Hash the inputs of a trial: a chain's steps and, with ``fmt``, the format whose needs are checked."""
+    keys = reduce_chain(chain).keys if fmt is None else chain.keys
+    entries = {e.key: e.hash for e in version.parts}
+    ingredients = {
+        "server": __version__,
+        "format": None if fmt is None else [fmt.name, fmt.version],
+        "steps": [[s.name, s.version, s.given] for s in chain.steps],
+        "parts": [[k.layer, k.level, k.name, entries[k]] for k in keys],
+        "datum": version.datum.as_dict() if version.datum else None,
+        "levels": [[level.name, level.elevation] for level in version.levels],
+    }
+    return hashlib.sha256(orjson.dumps(ingredients)).hexdigest()
+
+
+def is_lasting(chain: DerivationChain) -> bool:
+    """Return whether the result of a trial is permanent: not if a step uses a model, which may be added or removed."""
+    return not any(dict(step.given).get("model") for step in chain.steps)
 
 
 def _line(key: str, failure: ChainFailure | None) -> bytes:

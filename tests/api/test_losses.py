@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from app.convert.losses import losses_recipe
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 
@@ -137,6 +140,18 @@ def test_long_comparison_is_a_job(tmp_path: Path) -> None:
             assert time.monotonic() < deadline
             time.sleep(0.05)
         assert (done["state"], done["result"]["location"]) == ("done", f"/api/v1/{path}")
+
+
+def test_losses_may_share_a_lock_file_with_the_map(api: Api, farm: str) -> None:
+    """The comparison waited for the map, and the map for the comparison."""
+    maps, version = api.app.state.services.maps, api.app.state.services.store.versions.get(farm)
+    recipe = maps.recipe(version, "geojson")
+    compared = replace(losses_recipe(recipe), key=recipe.key[:2] + losses_recipe(recipe).key[2:])
+    comparison = threading.Thread(target=maps.get_or_convert, args=[compared], daemon=True)
+    comparison.start()
+    comparison.join(120)
+    assert not comparison.is_alive()
+    assert maps.get_cached(compared) is not None
 
 
 @pytest.mark.parametrize("fmt", ["geojson", "kml"])

@@ -66,6 +66,36 @@ def test_concurrent_callers_run_one_conversion(tmp_path: Path) -> None:
     assert (cache.misses, cache.hits) == (1, 19)
 
 
+def key_in_folder(text: str, prefix: str) -> str:
+    """Return a key with these first two digits: keys with equal ones share a lock file."""
+    return next(one for number in range(100_000) if (one := key(f"{text}{number}")).startswith(prefix))
+
+
+def test_map_made_from_another_one_does_not_wait_for_itself(tmp_path: Path) -> None:
+    """Two maps and what they are made from share lock files crosswise; then one shares its own."""
+    cache, done, made = Cache(tmp_path, 10**6), [], threading.Barrier(2, timeout=60)
+
+    def request(outer: str, inner: str, *, meet: bool) -> None:
+        def maker() -> ConvertedMap:
+            if meet:
+                made.wait()
+            return product(cache.get_or_make(inner, product).single_file().read())
+
+        done.append(cache.get_or_make(outer, maker, uses_cache=True).single_file().read())
+
+    def run(*pairs: tuple[str, str]) -> None:
+        meet = len(pairs) == 2
+        threads = [threading.Thread(target=request, args=pair, kwargs={"meet": meet}, daemon=True) for pair in pairs]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+
+    run((key_in_folder("a", "01"), key_in_folder("b", "02")), (key_in_folder("c", "02"), key_in_folder("d", "01")))
+    run((key_in_folder("e", "03"), key_in_folder("f", "03")))
+    assert done == [b"hello"] * 3
+
+
 def test_failed_conversion_leaves_nothing_and_is_retried(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 10**6)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import shapely
 from PIL import Image
 
+from app.convert import tiles
 from app.convert.cache import Cache
 from app.convert.drawing import Canvas, fit_frame
 from app.convert.painting import THEMES
@@ -194,6 +196,21 @@ def test_an_image_is_below_and_dimmed_in_the_dark(site: Site) -> None:
     light, dark = site.picture(version), site.picture(version, theme="dark")
     assert near(light, (200, 200, 200), 1).mean() > 0.2
     assert near(dark, (140, 140, 140), 1).mean() > 0.2
+
+
+def test_a_picture_may_share_a_lock_file_with_what_it_is_made_from(site: Site) -> None:
+    """The range of the image's values is in the same cache; it waited for the picture, and the picture for it."""
+    heights = (np.arange(50)[:, None] + np.arange(60)[None, :]).astype(np.float32)
+    photo = PartKey("imagery", "ground", "photo")
+    version = site.version({photo: GeoImage(heights[:, :, None], (0.1, 0.0, 0.0, 0.0, -0.1, 5.0))})
+    entry = version.part(photo)
+    assert entry is not None
+    shared = tiles._key(entry, "range")[:2]
+    width = next(w for w in range(100, 100_000) if preview_key(version, PreviewRequest(width=w)).startswith(shared))
+    drawing = threading.Thread(target=site.picture, args=[version], kwargs={"width": width}, daemon=True)
+    drawing.start()
+    drawing.join(120)
+    assert not drawing.is_alive()
 
 
 def test_degrees_without_a_datum_are_drawn_north_up_and_to_scale(site: Site) -> None:

@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 
 from app import derive
-from app.convert import maps as module
 from app.convert import trials
 from app.convert.maps import Maps
 from app.convert.recipe import DerivationChain
-from app.convert.trials import Trials
+from app.convert.trials import Trials, is_lasting, trial_key
 from app.derive import ChainFailure
 from app.limits import Limits
 from app.pool import WorkerDied
@@ -145,10 +144,10 @@ def test_result_of_dead_worker_is_not_stored(api: Api, version: Any, tmp_path: P
 def test_trial_result_with_a_model_is_not_stored(version: Any) -> None:
     step = derive.all_derivations()["imagery_to_objects"].step()
     plain = DerivationChain((step,), ())
-    assert module._is_lasting(plain)
+    assert is_lasting(plain)
     with_model = derive.with_parameters([step], {"model": "trees"})
-    assert not module._is_lasting(DerivationChain(with_model, ()))
-    assert module._trial_key(version, plain) != module._trial_key(version, DerivationChain(with_model, ()))
+    assert not is_lasting(DerivationChain(with_model, ()))
+    assert trial_key(version, plain) != trial_key(version, DerivationChain(with_model, ()))
 
 
 def test_trials_do_not_wait_for_maps(api: Api, version: Any, tmp_path: Path) -> None:
