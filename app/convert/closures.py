@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from app.errors import FleetMapError
 from app.formats import Format
+from app.model import masks
 from app.model.closures import Closure, ClosureMode, Closures, closures_digest, zone_id
 from app.model.features import Features, concatenate, features
 from app.model.frame import Anchor, Datum
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
-from app.model.layers import Layers, Part, PartKey
+from app.model.layers import MAP, Layers, Part, PartKey
 from app.store.values import Bounds, Box, PartEntry, Provenance, Version
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dic
     if closures is None:
         return {}
     network = fmt.traits.is_container or "topology" in fmt.layers
-    masked = fmt.traits.is_container or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
+    masked = fmt.traits.is_container or any(_may_be_keepout(key) for key in keys)
     out: dict[str, Any] = {}
     if closures.items and (network or masked):
         out["closures"] = closures.digest
@@ -263,13 +264,13 @@ def close(
     for key, part in layers.parts.items():
         if isinstance(part, Features) and key.layer == "topology":
             parts[key] = _close_edges(key, part, items, layers.frame, mark=mark, effects=effects, report=report)
-        elif isinstance(part, OccupancyGrid) and key.name == KEEPOUT:
+        elif isinstance(part, OccupancyGrid) and _may_be_keepout(key) and masks.is_keepout(key.name, part.properties):
             areas = [c for c in items if c.polygon is not None and c.level == key.level]
             complete = True
             if key not in drawn and areas:
                 parts[key], complete = _burn(part, areas, layers.frame)
             for area in areas:
-                effects[area.id].cells = "keepout cells" if complete else "keepout cells (cropped at the mask's edge)"
+                effects[area.id].note_cells(complete=complete)
         elif isinstance(part, Features) and key.layer == "zones":
             for overlay_id in (zones[i] for i in part.ids if i in zones):
                 effects[overlay_id].zone = True
@@ -288,6 +289,12 @@ class _Effect:
     edges: list[str] = field(default_factory=list)
     zone: bool = False
     cells: str = ""
+
+    def note_cells(self, *, complete: bool) -> None:
+        """Note that a mask contains the area, complete or cropped; a cropped one counts."""
+        if not complete:
+            self.cells = "keepout cells (cropped at the mask's edge)"
+        self.cells = self.cells or "keepout cells"
 
     def text(self, *, mark: bool) -> str:
         edges = "1 edge" if len(self.edges) == 1 else f"{len(self.edges)} edges"
@@ -399,6 +406,11 @@ def _area_in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
 
 
 # --- grids ---
+
+
+def _may_be_keepout(key: PartKey) -> bool:
+    """Return whether a part can be a keepout mask by its name: recipes are planned without the grids' properties."""
+    return key.layer == "occupancy" and key.name != MAP and key.name not in masks.MASKS - masks.KEEPOUT_MASKS
 
 
 def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | None) -> tuple[OccupancyGrid, bool]:

@@ -24,6 +24,9 @@ TYPES = range(5)
 MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
 """Names of grids that mark where robots should drive, not obstacles."""
 
+KEEPOUT_MASKS = frozenset({"keepout", "nogo"})
+"""Those of them that mark where robots must not drive."""
+
 MAX_NAMESPACES = 4
 """Maximum depth of namespaces around a node."""
 
@@ -39,6 +42,15 @@ class FilterInfo:
     def as_dict(self) -> dict[str, Any]:
         """Return Nav2's parameters."""
         return {"type": self.type, "base": self.base, "multiplier": self.multiplier}
+
+
+def is_keepout(name: str, properties: Mapping[str, Any]) -> bool:
+    """Return whether a grid with this name and these properties marks where robots must not drive."""
+    if name in MASKS:
+        return name in KEEPOUT_MASKS
+    stored = properties.get(NAME)
+    document = stored.get("params") if isinstance(stored, Mapping) else None
+    return any(server.get("type") == KEEPOUT for server in servers(document))
 
 
 def params(name: str, info: FilterInfo) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,8 +33,6 @@ from app.model.obstacles import object_role
 from app.review.findings import MAX_IDS, Finding, Site, name_list, point
 from app.review.fixes import Fixer
 from app.review.network import Floats
-
-KEEPOUT_GRIDS = frozenset({"keepout", "nogo"})
 
 
 def first_hits(lines: NDArray[np.object_], grid: OccupancyGrid, before: OccupancyGrid | None = None) -> Floats:
@@ -78,15 +76,7 @@ def keepout_zones(layers: Layers, level: str) -> list[KeepoutZone]:
 
 def keepout_masks(layers: Layers, level: str) -> dict[str, OccupancyGrid]:
     """Return the keepout masks of a level by name."""
-    return {key.name: grid for key, grid in layers.grids(level).items() if _is_keepout(key.name, grid)}
-
-
-def _is_keepout(name: str, grid: OccupancyGrid) -> bool:
-    if name in masks.MASKS:
-        return name in KEEPOUT_GRIDS
-    stored = grid.properties.get(masks.NAME)
-    document = stored.get("params") if isinstance(stored, Mapping) else None
-    return any(server.get("type") == masks.KEEPOUT for server in masks.servers(document))
+    return {key.name: grid for key, grid in layers.grids(level).items() if masks.is_keepout(key.name, grid.properties)}
 
 
 def _finding(level: str, ids: tuple[str, ...], obstacle: str, at: Floats, item: str | None = None) -> Finding:

@@ -19,6 +19,12 @@ from tests.api.conftest import Api
 SQUARE = {"type": "Polygon", "coordinates": [[[4, -1], [6, -1], [6, 1], [4, 1], [4, -1]]]}
 """Polygon across the lane between gate and barn, in metres."""
 
+KEEPOUT_FILTER = (
+    b"costmap_filter_info_server:\n  ros__parameters:\n    type: 0\n    filter_info_topic: /wet_info\n"
+    b"    mask_topic: /wet_mask\n    base: 0.0\n    multiplier: 1.0\n"
+)
+"""Parameters of a costmap filter whose mask marks where robots must not drive."""
+
 NO_CLOSURES = closures_digest([])
 
 
@@ -140,12 +146,17 @@ def test_area_closes_masks_and_the_edges_that_cross_it(api: Api, farm: str) -> N
     api.problem("GET", mask, 404)
 
 
-def test_stored_mask_gets_closed_areas_and_grows_where_they_reach_beyond_it(api: Api, farm: str) -> None:
-    api.upload(farm, samples.grid("keepout"), grid="keepout")
-    place = f"/maps/{farm}/occupancy_grid/keepout.pgm"
+@pytest.mark.parametrize("name", ["keepout", "nogo", "wet_floor"])
+def test_stored_mask_gets_closed_areas_and_grows_where_they_reach_beyond_it(api: Api, farm: str, name: str) -> None:
+    """Robots are told to use the mask nogo if there is one; the filter of another mask says what it is."""
+    filter_info = {} if name != "wet_floor" else {f"{name}_filter_info.yaml": KEEPOUT_FILTER}
+    api.upload(farm, {**samples.grid(name), **filter_info}, grid=name)
+    place = f"/maps/{farm}/occupancy_grid/{name}.pgm"
+    tag = api.get(place).headers["etag"]
     before, size = pgm(api.get(place).content), yaml.safe_load(api.get(place.replace("pgm", "yaml")).content)
     close(api, farm, polygon=SQUARE, crs="local")
     after, grown = pgm(api.get(place).content), yaml.safe_load(api.get(place.replace("pgm", "yaml")).content)
+    assert api.get(place).headers["etag"] != tag
     assert grown["origin"] == size["origin"]
     assert after.shape == (6, 14), "from x = -1 to x = 6, cells of half a metre"
     assert np.array_equal(after[:, :8], before)
@@ -153,6 +164,8 @@ def test_stored_mask_gets_closed_areas_and_grows_where_they_reach_beyond_it(api:
     assert (after[:4, 10:] == 0).all(), "from y = -1 to y = 1, the upper edge of the grid"
     assert (after[5, 10:] == free).all()
     assert (after[:, 8:9] == free).all()
+    (line,) = api.get(f"environments/{farm}/versions/latest/reports/occupancy_grid?grid={name}").json()["closures"]
+    assert line["effect"] == "keepout cells"
 
 
 def test_closed_areas_in_degrees_and_without_a_place(api: Api, farm: str, bare: str) -> None:
