@@ -20,7 +20,14 @@ from app.ingest.match import match_ids
 from app.limits import Limits
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
-from app.model.grid import UNKNOWN, OccupancyGrid
+from app.model.grid import (
+    UNKNOWN,
+    UNKNOWN_GREY,
+    OccupancyGrid,
+    pack_cells,
+    unknown_grey,
+    unknown_grey_as_unknown,
+)
 from app.model.imagery import GeoImage
 from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
@@ -305,7 +312,8 @@ def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyG
     """Merge two grids: known cells of the new grid overwrite the old ones, unknown cells overwrite nothing.
 
     The result covers both. Both must have the same resolution and yaw, and origins a whole number of cells apart (to a
-    hundredth of a cell).
+    hundredth of a cell). Free cells with the grey of unknown ones count as unknown; they stay free where neither grid
+    knows better.
     """
     if abs(old.resolution - new.resolution) > 1e-9 or abs(old.origin[2] - new.origin[2]) > 1e-9:
         raise Invalid(
@@ -322,13 +330,35 @@ def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyG
             f"grid {name}: merging needs origins a whole number of cells apart; they are {across:.3f} × {up:.3f} cells "
             "apart: use mode=replace, or resample the upload onto the stored grid"
         )
+    if _thresholds(new) != _thresholds(old):  # its grey is free by its own thresholds only
+        new = unknown_grey_as_unknown(new)
     left, bottom = min(0, column), min(0, row)
     width = max(old.width, column + new.width) - left
     height = max(old.height, row + new.height) - bottom
-    cells = np.full((height, width), UNKNOWN, np.uint8)
-    cells[-bottom : -bottom + old.height, -left : -left + old.width] = old.cells
-    window = cells[row - bottom : row - bottom + new.height, column - left : column - left + new.width]
-    np.copyto(window, new.cells, where=new.cells != UNKNOWN)
+    stored = np.s_[-bottom : -bottom + old.height, -left : -left + old.width]
+    window = np.s_[row - bottom : row - bottom + new.height, column - left : column - left + new.width]
+    cells, grey = np.full((height, width), UNKNOWN, np.uint8), np.zeros((height, width), bool)
+    cells[stored], grey[stored] = old.cells, _grey_mask(old)
+    new_grey = _grey_mask(new)
+    is_seen = (new.cells != UNKNOWN) & ~new_grey
+    new_grey &= cells[window] == UNKNOWN
+    np.copyto(cells[window], new.cells, where=is_seen | new_grey)
+    grey[window] = (grey[window] & ~is_seen) | new_grey
+    properties = dict(old.properties)
+    if grey.any():
+        properties[UNKNOWN_GREY] = pack_cells(grey)
+    else:
+        properties.pop(UNKNOWN_GREY, None)
     x = old.origin[0] + (left * c - bottom * s) * res
     y = old.origin[1] + (left * s + bottom * c) * res
-    return replace(old, cells=cells, origin=(float(x), float(y), yaw))
+    return replace(old, cells=cells, origin=(float(x), float(y), yaw), properties=properties)
+
+
+def _thresholds(grid: OccupancyGrid) -> tuple[str, bool, float, float]:
+    return grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh
+
+
+def _grey_mask(grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Mark the free cells with the grey of unknown ones: bool [height, width]."""
+    grey = unknown_grey(grid)
+    return np.zeros(grid.cells.shape, bool) if grey is None else grey

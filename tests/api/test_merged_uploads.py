@@ -1,0 +1,71 @@
+"""Uploads with mode=merge: what they change in stored grids, and what they keep."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.api.conftest import Api
+
+WALL, CLEAR, GREY = 0, 254, 205
+"""Pixels of map_saver: occupied, free, unknown."""
+
+NAV2, EARLIER = 0.25, 0.196
+"""free_thresh of Nav2's map_saver, which reads its own grey as free, and of the map_saver before it."""
+
+
+def saved_grid(
+    pixels: NDArray[Any], *, free: float = NAV2, origin: tuple[float, float] = (0.0, 0.0)
+) -> dict[str, bytes]:
+    """Write a grid of cells of 1 m as map_saver does. pixels: [height, width], row 0 at the bottom."""
+    text = (
+        f"image: map.pgm\nmode: trinary\nresolution: 1.0\norigin: [{origin[0]}, {origin[1]}, 0]\nnegate: 0\n"
+        f"occupied_thresh: 0.65\nfree_thresh: {free}\n"
+    )
+    height, width = pixels.shape
+    image = b"P5\n%d %d\n255\n" % (width, height) + np.flipud(pixels).astype(np.uint8).tobytes()
+    return {"map.yaml": text.encode(), "map.pgm": image}
+
+
+def written_pixels(api: Api, env: str) -> NDArray[np.uint8]:
+    """Read the pixels of the grid that robots fetch, row 0 at the bottom."""
+    data = api.get(f"environments/{env}/versions/latest/maps/occupancy_grid/map.pgm").content
+    _, size, _, body = data.split(b"\n", 3)
+    width, height = map(int, size.split())
+    return np.flipud(np.frombuffer(body, np.uint8).reshape(height, width))
+
+
+def test_grey_of_unknown_cells_overwrites_nothing(api: Api, bare: str) -> None:
+    """Nav2's map_saver writes a threshold by which its grey is free; a wall below that grey was not seen again."""
+    monday = np.full((4, 5), CLEAR)
+    monday[1, :4], monday[3] = WALL, GREY
+    tuesday = np.full((4, 5), GREY)
+    tuesday[1:3, 0], tuesday[3, 0], tuesday[0, 1] = CLEAR, WALL, WALL
+    api.upload(bare, saved_grid(monday))
+    assert np.array_equal(written_pixels(api, bare), monday)
+    api.upload(bare, saved_grid(tuesday), mode="merge")
+    expected = monday.copy()
+    expected[1:3, 0], expected[3, 0], expected[0, 1] = CLEAR, WALL, WALL
+    assert np.array_equal(written_pixels(api, bare), expected)
+    api.upload(bare, saved_grid(tuesday), mode="merge", expect=200)
+
+
+def test_grey_beyond_the_stored_grid_stays_grey(api: Api, bare: str) -> None:
+    west, east = np.full((2, 3), GREY), np.full((2, 3), GREY)
+    west[0], east[1] = CLEAR, WALL
+    api.upload(bare, saved_grid(west))
+    api.upload(bare, saved_grid(east, origin=(2.0, 0.0)), mode="merge")
+    assert written_pixels(api, bare).tolist() == [
+        [CLEAR, CLEAR, CLEAR, GREY, GREY],
+        [GREY, GREY, WALL, WALL, WALL],
+    ]
+
+
+def test_grey_is_unknown_by_the_thresholds_of_the_stored_grid(api: Api, bare: str) -> None:
+    stored, uploaded = np.full((2, 2), GREY), np.full((2, 3), GREY)
+    stored[0], uploaded[1, 2] = WALL, CLEAR
+    api.upload(bare, saved_grid(stored, free=EARLIER))
+    api.upload(bare, saved_grid(uploaded), mode="merge")
+    assert written_pixels(api, bare).tolist() == [[WALL, WALL, GREY], [GREY, GREY, CLEAR]]
