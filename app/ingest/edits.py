@@ -117,7 +117,7 @@ class _Session:
         brought them warned about them.
         """
         out = []
-        for key, draft in self._drafts.items():
+        for key, draft in list(self._drafts.items()):
             if key.layer != "topology":
                 continue
             put = {i for i, (_, p, _) in draft.puts.items() if p.get("kind") == "edge"}

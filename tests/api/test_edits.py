@@ -174,3 +174,30 @@ def test_edge_follows_both_nodes_moved_in_one_edit(api: Api, farm: str) -> None:
     edit(api, farm, *(put("topology", node, crs="local") for node in ends))
     moved = features(api, farm, "topology", crs="local")[edge["id"]]
     assert moved["place"]["coordinates"] == [node["place"]["coordinates"] for node in ends]
+
+
+def node(name: str, x: float, y: float, level: str = "ground") -> Json:
+    place = {"type": "Point", "coordinates": [x, y]}
+    properties = {"kind": "node", "name": name}
+    return put("topology", {"type": "Feature", "id": name, "place": place, "properties": properties}, level=level)
+
+
+def edge(name: str, source: str, target: str, level: str | None = "ground", **properties: str) -> Json:
+    place = {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}
+    properties = {"kind": "edge", "source": source, "target": target, **properties}
+    change = put("topology", {"type": "Feature", "id": name, "place": place, "properties": properties})
+    return change if level is None else {**change, "level": level}
+
+
+@pytest.fixture
+def storeys(api: Api, bare: str) -> str:
+    """Create an environment with networks on two levels. A lift leads from one to the other; both have a `door`."""
+    nodes = (node("hall", 0, 0), node("door", 5, 0), node("loft", 1, 1, "upper"), node("door", 5, 5, "upper"))
+    edit(api, bare, *nodes, edge("walk", "hall", "door"), edge("way", "loft", "door", "upper"))
+    edit(api, bare, edge("lift", "hall", "loft", None))
+    return bare
+
+
+def test_edge_to_another_level_is_edited_on_its_level(api: Api, storeys: str) -> None:
+    edit(api, storeys, edge("lift", "hall", "loft", action="lift"))
+    assert features(api, storeys, "topology")["lift"]["properties"]["action"] == "lift"
