@@ -240,7 +240,7 @@ class _Reader:
             if p.get("shapes"):
                 self._solids(part, k, site, level)
                 return
-        body = obstacles.object_body(p, geometry)
+        body = obstacles.object_body(p, geometry, elevation=self.layers.elevation(level))
         if body is not None:
             site.footprints.append(body.area)
             site.base.append(body.base)

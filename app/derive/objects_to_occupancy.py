@@ -114,7 +114,7 @@ class Parameters:
     also=frozenset({"resources", "location"}),
     parameters=Parameters,
     cost=4.0,
-    version=3,
+    version=4,
 )
 def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Occupancy grid of each level from the obstacles at a height.

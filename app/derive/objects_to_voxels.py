@@ -65,7 +65,7 @@ class Parameters:
     also=frozenset({"resources"}),
     parameters=Parameters,
     cost=6.0,
-    version=3,
+    version=4,
     last=True,
 )
 def objects_to_voxels(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:

@@ -157,16 +157,18 @@ def object_role(properties: Properties, *, doors_closed: bool = False) -> Role:
     return "bodiless" if kind in SOLID and not _tags(properties) and "gazebo" not in properties else "mark"
 
 
-def object_body(properties: Properties, geometry: Any, width: float | None = None) -> Body | None:
+def object_body(
+    properties: Properties, geometry: Any, width: float | None = None, *, elevation: float = 0.0
+) -> Body | None:
     """Return the body of an object with the role ``outline``, or of a lift's walls; None if it has none.
 
-    geometry: in local metres. width: of a line, or of a point's disc, instead of the object's own. Raises Invalid if
-    its pose is invalid.
+    geometry: in local metres. width: of a line, or of a point's disc, instead of the object's own. elevation: of its
+    level, in metres. Raises Invalid if its pose is invalid.
     """
     if properties.get("kind") == "lift":
         return None if properties.get("shapes") else _cabin(properties, geometry)
     area = _area(shapely.force_2d(geometry), properties, width or object_width(properties) or 0.0)
-    return None if area is None or area.is_empty else Body(area, *object_heights(properties, geometry))
+    return None if area is None or area.is_empty else Body(area, *object_heights(properties, geometry, elevation))
 
 
 def object_ground(properties: Properties, geometry: Any) -> Any | None:
@@ -316,8 +318,11 @@ def _area(geometry: Any, p: Properties, width: float) -> Any:
     return shapely.buffer(geometry, width / 2, cap_style=caps, join_style="mitre", mitre_limit=2.0)
 
 
-def object_heights(properties: Properties, geometry: Any) -> tuple[float, float]:
-    """Return (base, top) of an extruded footprint in metres above the floor; the top is infinite if unknown."""
+def object_heights(properties: Properties, geometry: Any, elevation: float = 0.0) -> tuple[float, float]:
+    """Return (base, top) of an extruded footprint in metres above the floor; the top is infinite if unknown.
+
+    elevation: of the floor, in metres: a pose is in the local frame.
+    """
     p = properties
     if str(p.get("kind")) in HOLES:
         return -math.inf, math.inf
@@ -331,14 +336,19 @@ def object_heights(properties: Properties, geometry: Any) -> tuple[float, float]
     if not top and size is not None and len(size) > 2 and size[2] > 0:
         pose = p.get("pose")
         if shapely.get_type_id(geometry) == 0 and isinstance(pose, (list, tuple)) and len(pose) > 2:
-            base = (base or 0.0) + (_positive(pose[2]) or 0.0)
+            base = (base or 0.0) + (_positive(_number(pose[2]) - elevation) or 0.0)
         top = (base or 0.0) + size[2]
     return base or 0.0, top or math.inf
 
 
+def _number(value: Any) -> float:
+    """Return a number; NaN for anything else."""
+    return value if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+
+
 def _positive(value: Any) -> float | None:
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value <= MAX_METRES
-    return float(value) if good else None
+    number = _number(value)
+    return float(number) if 0 <= number <= MAX_METRES else None
 
 
 def box_size(p: Properties) -> tuple[float, ...] | None:

@@ -17,7 +17,7 @@ from app.model.frame import Level
 from app.model.layers import MAP, Layers, PartKey
 from app.model.notes import Filled
 from app.model.voxels import VoxelMap
-from tests.derive.test_objects_to_occupancy import BOX, layers, objects
+from tests.derive.test_objects_to_occupancy import BOX, grid, layers, objects
 
 
 def voxels(content: Layers, notes: DerivationNotes | None = None, **options: Any) -> VoxelMap:
@@ -87,6 +87,16 @@ def test_all_levels_share_one_voxel_map() -> None:
     v = voxels(content)
     assert v.bounds() == (0.0, -1.0, 0.0, 5.5, 1.0, 7.0)
     assert v.voxel_counts()["occupied"] == 1000 + 1000 + 6000
+
+
+def test_box_on_an_upper_level_stands_on_its_floor() -> None:
+    """Its pose is in the local frame, as Open-RMF's readers store it."""
+    table = {"kind": "furniture", "size": [2.0, 2.0, 1.0], "pose": [5.0, 5.0, 10.0, 0.0, 0.0, 0.0]}
+    rows = objects((shapely.box(0, 0, 10, 10), {"kind": "floor"}), (shapely.Point(5, 5), table))
+    content = layers(rows, level="L2", levels=(Level(), Level("L2", 10.0)))
+    g = grid(content, level="L2", resolution=0.1)
+    assert int((g.cells == 100).sum()) == 400
+    assert voxels(content).bounds() == (4.0, 4.0, 10.0, 6.0, 6.0, 11.0)
 
 
 def test_objects_without_body_raise_missing_layer() -> None:

@@ -595,13 +595,14 @@ def test_objects_of_other_formats_become_static_models() -> None:
         ("poi", shapely.Point(1, 1), {"kind": "poi"}),
         ("tree", shapely.Point(3, 4), {"kind": "tree"}),
         ("bin", shapely.Point(7, 7), {"kind": "bin", "size": [0.5, 0.6, 1.0]}),
+        ("shelf", shapely.Point(8, 9), {"kind": "shelf", "size": [1, 1, 2], "pose": [8, 9, 3.5, 0, 0, 0]}),
         ("nothing", None, {"kind": "building"}),
     ]
     parts = {PartKey("objects", name="osm", level="L2"): features(rows, "local")}
     files, context = report(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0)
     assert check(files) == []
     by = {f.properties["name"]: f for f in objects(read_upload(files))}
-    assert set(by) == {"a_b", "hall", "w", "floor", "door", "field", "tree", "bin", "ground_plane", "sun"}
+    assert set(by) == {"a_b", "hall", "w", "floor", "door", "field", "tree", "bin", "shelf", "ground_plane", "sun"}
     box = solids.Solids({}, False, True)
 
     def extent(name: str) -> Any:
@@ -616,6 +617,7 @@ def test_objects_of_other_formats_become_static_models() -> None:
     assert by["door"].properties["shapes"][0]["visual"] is True
     assert by["field"].properties["shapes"][0]["visual"] is True
     assert extent("bin") == (6.75, 6.7, 3, 7.25, 7.3, 4)
+    assert extent("shelf") == (7.5, 8.5, 3.5, 8.5, 9.5, 5.5), "its pose is in the local frame"
     colours = {t.subject: (t.value, t.option) for t in context.template if t.subject.startswith("colour")}
     assert colours["colour of building"] == ([0.75, 0.68, 0.6], "building_colour")
     assert set(colours) == {f"colour of {kind}" for kind in ("building", "wall", "floor", "door", "region", "ground")}

@@ -52,6 +52,9 @@ def test_door_is_outline_when_doors_are_closed() -> None:
 def test_height_is_top_above_floor() -> None:
     assert obstacles.object_heights({"kind": "wall", "base": 1.0, "height": 4.0}, LINE) == (1.0, 4.0)
     assert obstacles.object_heights({"kind": "crate", "size": [1, 1, 2], "pose": [0, 0, 1.5]}, POINT) == (1.5, 3.5)
+    shelf = {"kind": "crate", "size": [1, 1, 2], "pose": [0, 0, -2.5]}
+    assert obstacles.object_heights(shelf, POINT, elevation=-4.0) == (1.5, 3.5)
+    assert obstacles.object_heights(shelf, POINT, elevation=3.0) == (0.0, 2.0), "none is below its floor"
     assert obstacles.object_heights({"kind": "wall"}, LINE) == (0.0, math.inf)
     tags = {"building": "yes", "building:min_level": "1", "building:levels": "3"}
     assert obstacles.object_heights({"kind": "building", "osm": {"tags": tags}}, AREA) == (3.0, 9.0)

@@ -88,7 +88,7 @@ register(
             anchor="local",
             also=frozenset({"resources", "occupancy"}),
         ),
-        version=2,
+        version=3,
         selection=Selection(choose),
         claims=Claims(priority=10, sort=sort),
         traits=Traits(has_title=True),

@@ -259,11 +259,12 @@ class Bodies:
             return [], []
         role = obstacles.object_role(properties)
         body = (
-            obstacles.object_body(properties, geometry, self._width(one))
+            obstacles.object_body(properties, geometry, self._width(one), elevation=elevation)
             if role == "outline" or kind == "lift"
             else None
         )
-        base, top = obstacles.object_heights(properties, geometry) if body is None else (body.base, body.top)
+        heights = obstacles.object_heights(properties, geometry, elevation)
+        base, top = heights if body is None else (body.base, body.top)
         base = base if math.isfinite(base) else 0.0
         middle = np.round(shapely.get_coordinates(shapely.centroid(geometry))[0], 3) + 0.0
         shapes: list[dict[str, Any]] = []
