@@ -261,6 +261,19 @@ def test_level_without_vertices_is_written() -> None:
     assert offline({"0.yaml": text.encode()}, "tmap2").files, "an empty level is no part of other maps"
 
 
+def test_graph_without_lifts_section_gets_none() -> None:
+    """Older graphs name lifts at vertices only; with an empty section, fleet adapters would refuse them."""
+    text = (
+        "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {lift: Lift1}]], lanes: [[0, 1, {}]]}}\n"
+    )
+    graphs, context = write(read(text)[0])
+    assert graphs["0.yaml"]["levels"]["L"]["vertices"][1][2]["lift"] == "Lift1"
+    assert "lifts" not in graphs["0.yaml"]
+    assert not context.warnings
+    plain, _ = write(read(text.replace("{lift: Lift1}", "{}"))[0])
+    assert plain["0.yaml"]["lifts"] == {}
+
+
 def test_duplicate_names_give_a_warning() -> None:
     graphs, context = write(
         read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {name: a}]]}}\n")[0]

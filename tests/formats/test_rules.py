@@ -440,6 +440,10 @@ def nav(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[s
     return {"0.yaml": json.dumps(top).encode()}
 
 
+def _in_lift(top: dict[str, Any]) -> None:
+    level1(top)["vertices"][1][2].update(lift="l")
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -448,7 +452,9 @@ def nav(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[s
         (lambda top: level1(top).pop("lanes"), {(ERROR, "levels.L1")}),
         (lambda top: level1(top)["vertices"][0].pop(), {(ERROR, "levels.L1.vertices[0]")}),
         (lambda top: level1(top)["vertices"][1][2].update(name="a"), {(ERROR, "levels")}),
-        (lambda top: level1(top)["vertices"][1][2].update(lift="x"), {(WARNING, "levels.L1.vertices[1]")}),
+        (lambda top: level1(top)["vertices"][1][2].update(lift="x"), {(ERROR, "levels.L1.vertices[1]")}),
+        (lambda top: (_in_lift(top), top.update(lifts={})), {(ERROR, "levels.L1.vertices[1]")}),
+        (lambda top: (_in_lift(top), top.pop("lifts")), set()),
         (lambda top: level1(top)["lanes"][0].__setitem__(1, 2), {(ERROR, "levels.L1.lanes[0]")}),
         (lambda top: level1(top)["lanes"][0].pop(), {(ERROR, "levels.L1.lanes[0]")}),
         (

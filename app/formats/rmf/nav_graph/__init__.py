@@ -70,7 +70,7 @@ register(
         ),
         write_options=common.WriteOptions,
         extensions=(".yaml", ".yml"),
-        version=3,
+        version=4,
         selection=Selection(choose),
         claims=Claims(priority=30, sort=one_map_per_folder),
         traits=Traits(keeps_bends="nodes", has_title=True),

@@ -1,7 +1,7 @@
 """Rules of Open-RMF's fleet adapters for navigation graphs.
 
 Source: open-rmf/rmf_ros2, rmf_fleet_adapter, agv/parse_graph.cpp (yaml-cpp throws if a member is missing or has another
-type, and if a waypoint name is a duplicate).
+type, if a waypoint name is a duplicate, and if a graph with the key ``lifts`` lacks the lift of a vertex).
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def _graph(top: Any, main: str) -> Iterator[Problem]:
     if top.get("building_name") is None:
         yield warning_finding("a graph should name its building", main, where="building_name")
     called: list[str] = []
-    lifts = top.get("lifts")
+    has_lifts = "lifts" in top  # even if empty
+    lifts = top["lifts"] if isinstance(top.get("lifts"), dict) else {}
     for level, members in levels.items():
         vertices = members.get("vertices") if isinstance(members, dict) else None
         lanes = members.get("lanes") if isinstance(members, dict) else None
@@ -65,8 +66,8 @@ def _graph(top: Any, main: str) -> Iterator[Problem]:
             if isinstance(row[2].get("name"), str) and row[2]["name"]:
                 called.append(row[2]["name"])
             lift = row[2].get("lift")
-            if lift and isinstance(lifts, dict) and lift not in lifts:
-                yield warning_finding(f"unknown lift {shown(lift)}", main, where=location)
+            if lift and has_lifts and lift not in lifts:
+                yield error_finding(f"unknown lift {shown(lift)}", main, where=location)
         for k, row in enumerate(lanes):
             yield from _lane(row, len(vertices), main, f"levels.{level}.lanes[{k}]")
     if repeats := duplicates(called):

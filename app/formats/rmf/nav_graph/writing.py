@@ -324,15 +324,19 @@ class _Writer:
             if lift.graphs is None or graph in lift.graphs
         }
         before = {**{k: v for k, v in top.items() if k < "levels"}, "doors": doors}
-        after = {**{k: v for k, v in top.items() if k > "levels"}, "lifts": lifts}
         out = BytesIO()  # rows as bytes use a third of the memory
         out.write(f"{yaml.mapping(before, 0)}levels:\n".encode())
         names: Counter[str] = Counter()
+        lifts_of_vertices: set[str] = set()
         for storey in self.storeys:
-            rows = self._level(storey, graph, names)
+            rows = self._level(storey, graph, names, lifts_of_vertices)
             while batch := list(islice(rows, LINES_PER_WRITE)):
                 out.write("".join(batch).encode())
-        out.write(yaml.mapping(after, 0).encode())
+        after = {k: v for k, v in top.items() if k > "levels"}
+        # Fleet adapters refuse a vertex in a lift that the section lacks, but load graphs without the section.
+        if lifts or not lifts_of_vertices:
+            after["lifts"] = lifts
+        out.write(yaml.mapping(after, 0).encode() if after else b"")
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
             listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
@@ -340,8 +344,8 @@ class _Writer:
             self.context.warn(problem, file=f"{graph}.yaml", where="levels")
         return out.getvalue()
 
-    def _level(self, storey: _LevelWriter, graph: int, names: Counter[str]) -> Iterator[str]:
-        """Iterate over the lines of a level in a graph. names: number of vertices per name."""
+    def _level(self, storey: _LevelWriter, graph: int, names: Counter[str], lifts: set[str]) -> Iterator[str]:
+        """Iterate over the lines of a level in a graph; adds to ``names`` (vertices per name) and ``lifts``."""
         edges = storey.edges.get(graph, [])
         graphs = [get_source_properties(p, NAME).get("graphs") for p in storey.nodes]
         listed = [members.get(str(graph)) if isinstance(members, dict) else None for members in graphs]
@@ -350,17 +354,21 @@ class _Writer:
         new_index = {k: n for n, k in enumerate(order)}
         yield f"  {yaml.text(storey.name)}:\n"
         yield from _section("lanes", self._lanes(storey, graph, edges, new_index))
-        yield from _section("vertices", self._vertices(storey, order, names))
+        yield from _section("vertices", self._vertices(storey, order, names, lifts))
         extra_members = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
         yield yaml.mapping(extra_members, 4) if extra_members else ""
 
-    def _vertices(self, storey: _LevelWriter, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
+    def _vertices(
+        self, storey: _LevelWriter, order: Sequence[int], names: Counter[str], lifts: set[str]
+    ) -> Iterator[str]:
         texts = list(map(yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         for n, k in enumerate(order):
             vertex = common.with_area(self._vertex(storey, k), storey.nodes[k], typed=False)
             options = {**vertex, **self.robots.vertex_properties(storey.name, storey.ids[k])}
             if options.get("name"):
                 names[str(options["name"])] += 1
+            if options.get("lift"):
+                lifts.add(str(options["lift"]))
             more = "".join(f", {self.flow(v)}" for v in get_source_properties(storey.nodes[k], NAME).get("more") or ())
             yield f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(options)}{more}]\n"
 
