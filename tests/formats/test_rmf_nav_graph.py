@@ -212,6 +212,41 @@ def test_network_of_other_format_becomes_graph_0_with_ids_as_names() -> None:
     ]
 
 
+def test_repeated_names_of_other_formats_give_way_to_ids() -> None:
+    """Fleet adapters refuse a graph with a duplicate name; elsewhere names need not be unique, also over levels."""
+    line = shapely.LineString([(0, 0), (1, 0)])
+    parts = {}
+    for level, i, j, other in (("L1", "a", "b", "Hall"), ("L2", "c", "Dock", "Dock")):
+        rows = [(i, shapely.Point(0, 0), {"kind": "node", "name": "Dock"})]
+        rows += [(j, shapely.Point(1, 0), {"kind": "node", "name": other})]
+        rows += [(f"{i}_{j}", line, {"kind": "edge", "source": i, "target": j})]
+        rows += [(f"{level}/lone", shapely.Point(2, 0), {"kind": "node", "name": "Hall"})]
+        parts[PartKey("topology", level, "network")] = features(rows, "local")
+    graphs, context = write(Layers(parts))
+    names = [v[2]["name"] for level in ("L1", "L2") for v in graphs["0.yaml"]["levels"][level]["vertices"]]
+    assert names == ["a", "Hall", "c", "Dock"], "nodes without lanes are not in the graph"
+    (warning,) = context.warnings
+    assert "1 names occur more than once: Dock;" in warning.problem
+    context = WriteContext()
+    building = yaml.safe_load(formats.write(get_format("openrmf"), Layers(parts), context)["building.yaml"])
+    names = [v[3] for level in ("L1", "L2") for v in building["levels"][level]["vertices"]]
+    assert sorted(names) == ["Dock", "L1/lone", "L2/lone", "a", "b", "c"]
+    assert "2 names occur more than once: Dock, Hall;" in context.warnings[0].problem
+
+
+def test_name_of_open_rmf_stays_where_another_format_repeats_it() -> None:
+    layers, _ = read(
+        "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {}]], lanes: [[0, 1, {}]]}}\n"
+    )
+    rows: list[Any] = [("p", shapely.Point(3, 0), {"kind": "node", "name": "a"})]
+    rows += [("q", shapely.Point(4, 0), {"kind": "node"})]
+    rows += [("p_q", shapely.LineString([(3, 0), (4, 0)]), {"kind": "edge", "source": "p", "target": "q"})]
+    more = {PartKey("topology", "M", "network"): features(rows, "local")}
+    graphs, _ = write(Layers({**layers.parts, **more}))
+    levels = graphs["0.yaml"]["levels"]
+    assert [v[2]["name"] for level in "LM" for v in levels[level]["vertices"]] == ["a", "", "p", "q"]
+
+
 def test_options_fill_in_robots_and_lanes() -> None:
     rows: list[Any] = [(i, shapely.Point(k, 0), {"kind": "node"}) for k, i in enumerate(("a", "b10", "b9"))]
     line = shapely.LineString([(0, 0), (1, 0)])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import WriteContext
-from app.formats._network import natural_sort_key
+from app.formats._network import natural_sort_key, shorten_list
 from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
 from app.model.layers import Layers, PartKey
@@ -245,6 +246,36 @@ class WriteOptions:
         maximum=100.0,
         unit="m/s",
     )
+
+
+class VertexNames:
+    """Names of vertices. Fleet adapters refuse a name that occurs twice; nodes of other formats have ids instead."""
+
+    def __init__(self, nodes: Iterable[tuple[str, Properties]]) -> None:
+        """nodes: (id, properties) of all nodes of a building or a graph."""
+        counts = Counter(_vertex_name(i, p) for i, p in nodes)
+        self._repeated = frozenset(name for name, count in counts.items() if name and count > 1)
+        self._replaced: set[str] = set()
+
+    def choose(self, i: str, p: Properties) -> str:
+        """Return the name of a node's vertex: its own or, if another has it and it is not Open-RMF's, its id."""
+        name = _vertex_name(i, p)
+        if name == i or name not in self._repeated or p.keys() & {BUILDING, NAV_GRAPH}:
+            return name
+        self._replaced.add(name)
+        return i
+
+    def report(self, context: WriteContext, file: str, location: str) -> None:
+        """Report the names that were not written."""
+        if self._replaced:
+            problem = f"{len(self._replaced)} names occur more than once: {shorten_list(sorted(self._replaced))}"
+            context.warn(f"{problem}; their nodes' ids are written, as names must be unique", file=file, where=location)
+
+
+def _vertex_name(i: str, p: Properties) -> str:
+    """Return the name of a node's vertex, its id if it has none and comes from another format."""
+    name = p.get("name")
+    return name if isinstance(name, str) and name else "" if p.keys() & {BUILDING, NAV_GRAPH} else i
 
 
 CHARGER = ("is_charger", "is_parking_spot", "is_holding_point")

@@ -116,6 +116,7 @@ class _Writer:
         self.layers, self.context, self.storeys, self.system = layers, context, storeys, system
         self.options = context.options if isinstance(context.options, common.WriteOptions) else common.WriteOptions()
         self.robots = common.Robots(self.options, _iterate_nodes(storeys))
+        self.names = common.VertexNames((i, p) for _, i, p in _iterate_nodes(storeys))
         self.building = dict(building)
         self.resources = resources
         self.why = why
@@ -298,7 +299,7 @@ class _Writer:
                 else title or ""
             )
         else:
-            name = title if isinstance(title, str) and (title or NAV_GRAPH in p) else "" if NAV_GRAPH in p else i
+            name = self.names.choose(i, p)
             graph = mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "parameters")
             parameters = {
                 key: common.typed_parameter(value) for key, value in graph.items() if key not in ("name", "lift")
@@ -512,6 +513,7 @@ class _Writer:
             self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
             self.context.fill("lanes: orientation", LANE_TEMPLATE["orientation"][1], why)
         self.robots.report(self.context)
+        self.names.report(self.context, FILE, "levels")
         if self.created_ids["doors"]:
             parameters = {key: value[1] for key, value in DOOR_TEMPLATE.items()}
             self.context.fill(

@@ -118,6 +118,7 @@ class _Writer:
         nodes = ((s.name, i, p) for s in self.storeys for i, p in zip(s.ids, s.nodes, strict=True))
         self.robots = common.Robots(self.options, nodes)
         self.new_lanes = 0
+        self.names = common.VertexNames(())  # of the graph that is being written
 
     def _documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the top-level members of the building, and those of each graph."""
@@ -326,10 +327,14 @@ class _Writer:
         before = {**{k: v for k, v in top.items() if k < "levels"}, "doors": doors}
         out = BytesIO()  # rows as bytes use a third of the memory
         out.write(f"{yaml.mapping(before, 0)}levels:\n".encode())
+        orders = [_order(storey, graph) for storey in self.storeys]
+        self.names = common.VertexNames(
+            (s.ids[k], s.nodes[k]) for s, order in zip(self.storeys, orders, strict=True) for k in order
+        )
         names: Counter[str] = Counter()
         lifts_of_vertices: set[str] = set()
-        for storey in self.storeys:
-            rows = self._level(storey, graph, names, lifts_of_vertices)
+        for storey, order in zip(self.storeys, orders, strict=True):
+            rows = self._level(storey, graph, order, names, lifts_of_vertices)
             while batch := list(islice(rows, LINES_PER_WRITE)):
                 out.write("".join(batch).encode())
         after = {k: v for k, v in top.items() if k > "levels"}
@@ -337,6 +342,7 @@ class _Writer:
         if lifts or not lifts_of_vertices:
             after["lifts"] = lifts
         out.write(yaml.mapping(after, 0).encode() if after else b"")
+        self.names.report(self.context, f"{graph}.yaml", "levels")
         twice = sorted(name for name, count in names.items() if count > 1)
         if twice:
             listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
@@ -344,13 +350,11 @@ class _Writer:
             self.context.warn(problem, file=f"{graph}.yaml", where="levels")
         return out.getvalue()
 
-    def _level(self, storey: _LevelWriter, graph: int, names: Counter[str], lifts: set[str]) -> Iterator[str]:
+    def _level(
+        self, storey: _LevelWriter, graph: int, order: Sequence[int], names: Counter[str], lifts: set[str]
+    ) -> Iterator[str]:
         """Iterate over the lines of a level in a graph; adds to ``names`` (vertices per name) and ``lifts``."""
         edges = storey.edges.get(graph, [])
-        graphs = [get_source_properties(p, NAME).get("graphs") for p in storey.nodes]
-        listed = [members.get(str(graph)) if isinstance(members, dict) else None for members in graphs]
-        order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
-        order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
         new_index = {k: n for n, k in enumerate(order)}
         yield f"  {yaml.text(storey.name)}:\n"
         yield from _section("lanes", self._lanes(storey, graph, edges, new_index))
@@ -410,7 +414,7 @@ class _Writer:
         else:
             self.lost["nodes' orientations"] += p.get("orientation") is not None
             self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
-            options = {"name": p.get("name") or storey.ids[k]}
+            options = {"name": self.names.choose(storey.ids[k], p)}
         if storey.lifts[k] is not None:
             options["lift"] = storey.lifts[k]
         return options
@@ -463,6 +467,14 @@ class _Writer:
             for k in near[_meet(a[near], b[near], door.ends, storey.parallel)].tolist():
                 out[k] = door.name
         return out
+
+
+def _order(storey: _LevelWriter, graph: int) -> list[int]:
+    """Return the nodes of a level in a graph: those that the source lists, then others in the order of the lanes."""
+    graphs = [get_source_properties(p, NAME).get("graphs") for p in storey.nodes]
+    listed = [members.get(str(graph)) if isinstance(members, dict) else None for members in graphs]
+    order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
+    return list(dict.fromkeys([*order, *(k for e in storey.edges.get(graph, []) for k in (e.source, e.target))]))
 
 
 def _section(key: str, rows: Iterator[str]) -> Iterator[str]:
