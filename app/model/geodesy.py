@@ -304,6 +304,20 @@ def crs_to_wgs84(crs: str, points: Array) -> Array:
     return out
 
 
+def length_units(crs: str) -> tuple[float, float] | None:
+    """Return the metres of a unit of x and of z; None if x is an angle. Without a vertical axis, heights are in metres.
+
+    Raises Invalid for a CRS that PROJ does not know.
+    """
+    unit = engineering_unit(crs)
+    if unit is not None:
+        return unit, unit
+    definition = CRS.from_user_input(crs)
+    if definition.is_geographic or not definition.axis_info:
+        return None
+    return float(definition.axis_info[0].unit_conversion_factor), _vertical_unit(crs)
+
+
 def engineering_unit(crs: str) -> float | None:
     """Return the metres of a unit of an engineering CRS (a local frame without a position on earth), else None.
 

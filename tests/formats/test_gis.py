@@ -133,6 +133,48 @@ def test_surveyed_dxf_has_a_crs() -> None:
     assert part.geometry[0].bounds[:2] == pytest.approx((-7.5571, 49.7668), abs=1e-3), "the grid's false origin"
 
 
+def point_dxf(code: int, x: float, y: float, z: float) -> bytes:
+    """Return a drawing of one point, with the code of its unit in ``$INSUNITS``."""
+    lines = ["0", "SECTION", "2", "HEADER", "9", "$INSUNITS", "70", str(code), "0", "ENDSEC", "0", "SECTION", "2"]
+    lines += ["ENTITIES", "0", "POINT", "8", "0", "10", str(x), "20", str(y), "30", str(z), "0", "ENDSEC", "0", "EOF"]
+    return "\n".join([*lines, ""]).encode()
+
+
+FOOT = 1200 / 3937
+PLACES = {
+    "EPSG:2263": (21, (982_000.0, 200_000.0, 100.0), (-74.008116, 40.715630, 100 * FOOT)),
+    "EPSG:2263+6360": (21, (982_000.0, 200_000.0, 100.0), (-74.008116, 40.715630, 100 * FOOT)),
+    "EPSG:32618": (21, (583_760.0 / FOOT, 4_507_600.0 / FOOT, 100.0), (-74.00833, 40.71506, 100 * FOOT)),
+    "EPSG:27700": (4, (500_100_000.0, 370_100_000.0, 2000.0), (-0.50230, 53.21853, 2.0)),
+}
+"""Code of the unit, coordinates in it, and longitude, latitude and metres by Debian's cs2cs."""
+
+
+@pytest.mark.parametrize("crs", PLACES)
+def test_the_unit_of_a_drawing_becomes_that_of_its_crs(crs: str) -> None:
+    code, coordinates, expected = PLACES[crs]
+    context = ReadContext()
+    (point,) = objects("dxf", point_dxf(code, *coordinates), context, crs=crs)
+    assert shapely.get_coordinates(point.geometry, include_z=True)[0] == pytest.approx(expected, abs=2e-5)
+    assert not context.warnings
+
+
+def test_feet_of_other_length_than_those_of_the_crs_are_reported() -> None:
+    context = ReadContext()
+    (point,) = objects(
+        "dxf", point_dxf(2, 982_000 / 0.3048 * FOOT, 200_000 / 0.3048 * FOOT, 0.0), context, crs="EPSG:2263"
+    )
+    assert point.geometry.coords[0][:2] == pytest.approx((-74.008116, 40.715630), abs=2e-6)
+    assert ["metres_per_unit=0.3048006096" in w.problem for w in context.warnings] == [True]
+
+
+def test_dxf_in_degrees_has_no_length_unit() -> None:
+    with pytest.raises(UnreadableFile, match="metres_per_unit=1 if its coordinates are degrees"):
+        read("dxf", point_dxf(4, -0.5, 53.2, 0.0), crs="wgs84")
+    (point,) = objects("dxf", point_dxf(4, -0.5, 53.2, 0.0), crs="wgs84", metres_per_unit="1")
+    assert point.geometry.coords[0][:2] == (-0.5, 53.2)
+
+
 def test_shapefile_without_crs_or_index_is_refused() -> None:
     without = {name: data for name, data in SHAPEFILE.items() if not name.endswith(".prj")}
     with pytest.raises(UnreadableFile, match=r"names no CRS .*set crs=EPSG:<number>"):

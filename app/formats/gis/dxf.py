@@ -4,15 +4,15 @@ Each entity of the model space is an object of the family ``dxf``, or what the u
 resolved, arcs and splines become lines, closed lines become polygons. Its layer, type, line type and text are in
 ``properties.dxf``; a text is its ``name``, its handle is its id. The option ``layers`` selects layers of the drawing.
 
-The coordinates are metres of the local frame (or of the option ``crs``) after conversion from the unit in
-``$INSUNITS``. If the file names none, the option ``metres_per_unit`` is needed: units are never guessed.
+The coordinates are in the local frame (or in the option ``crs``) after conversion from the unit in ``$INSUNITS`` to its
+unit. If the file names none, the option ``metres_per_unit`` is needed: units are never guessed.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -21,12 +21,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.errors import Problem, TooLarge, UnreadableFile
+from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Format, ReadContext, Traits, register
 from app.formats.gis.layers import read_tables
 from app.formats.gis.shapes import raise_unreadable, scaled
 from app.formats.gis.tables import LOCAL, Table, to_parts
-from app.model.geodesy import WGS84
+from app.model.geodesy import WGS84, length_units
 from app.model.layers import VECTOR_LAYERS, Layers
 from app.model.names import did_you_mean
 from app.parameters import parameter
@@ -61,7 +61,7 @@ class ReadOptions:
         None, "length of a unit of the drawing; default: $INSUNITS of the file", minimum=1e-9, maximum=1e6, unit="m"
     )
     crs: str | None = parameter(
-        None, "CRS of a surveyed drawing in metres: EPSG:<number>; default: local (metres of the local frame)"
+        None, "CRS of a surveyed drawing: EPSG:<number>; default: local (metres of the local frame)"
     )
     layers: tuple[str, ...] | None = parameter(None, "layers of the drawing to read; default: all")
 
@@ -81,12 +81,13 @@ def read(files: Files, context: ReadContext) -> Layers:
         raise TooLarge(f"{context.main} has {len(data)} bytes; the limit for a text is {context.limits.text_bytes}")
     unit = _unit(data, options, context)
     check_blocks(data, context.limits.features)
-    crs = {None: LOCAL, LOCAL: LOCAL, "wgs84": WGS84}.get(options.crs and options.crs.lower(), options.crs)
+    crs = {LOCAL: LOCAL, "wgs84": WGS84}.get((options.crs or LOCAL).lower(), options.crs or LOCAL)
+    factors = _factors(unit, crs, context)
     version = _VERSION.search(data[:65536])
     encoding = "UTF-8" if version is not None and int(version[1]) >= UTF8_VERSION else None
     tables = read_tables(data, "DXF", context, encoding=encoding)
     context.options = None  # its crs is not that of a file without one
-    return Layers(to_parts([_objects(table, unit, crs, options, context) for table in tables], context, NAME))
+    return Layers(to_parts([_objects(table, factors, crs, options, context) for table in tables], context, NAME))
 
 
 def _unit(data: bytes, options: ReadOptions, context: ReadContext) -> float:
@@ -107,6 +108,32 @@ def _unit(data: bytes, options: ReadOptions, context: ReadContext) -> float:
         )
         raise UnreadableFile(reason, [Problem(reason, where="$INSUNITS")])
     return unit
+
+
+def _factors(unit: float, crs: str, context: ReadContext) -> Sequence[float]:
+    """Return the factors of x, y and z from the unit of the drawing, in metres, to the units of a CRS."""
+    if crs == LOCAL:
+        return unit, unit, unit
+    try:
+        units = length_units(crs)
+    except Invalid as error:
+        raise UnreadableFile(error.detail, [Problem(error.detail, where="crs")]) from error
+    if units is None:
+        if unit != 1.0:
+            raise_unreadable(
+                f"{crs[:60]} has degrees, but the unit of the drawing is {unit:g} m: set the CRS that the drawing was "
+                "surveyed in, or metres_per_unit=1 if its coordinates are degrees",
+                "crs",
+            )
+        return 1.0, 1.0, 1.0
+    plane, height = unit / units[0], unit / units[1]
+    if 1e-9 < abs(plane - 1.0) < 1e-5:
+        context.warn(
+            f"the unit of the drawing is {unit:.10g} m and that of {crs[:60]} {units[0]:.10g} m, so coordinates are "
+            f"converted: set metres_per_unit={units[0]:.10g} if they are in the unit of the CRS",
+            where="$INSUNITS",
+        )
+    return plane, plane, height
 
 
 def check_blocks(data: bytes, limit: int) -> None:
@@ -158,8 +185,8 @@ def _number(text: bytes | None) -> int:
     return max(1, int(text)) if text and text.isdigit() and len(text) < 10 else 1
 
 
-def _objects(table: Table, unit: float, crs: str | None, options: ReadOptions, context: ReadContext) -> Table:
-    """Return the entities of the model space as objects in metres."""
+def _objects(table: Table, factors: Sequence[float], crs: str, options: ReadOptions, context: ReadContext) -> Table:
+    """Return the entities of the model space as objects; factors: see ``_factors``."""
     columns = table.columns
     layers = [str(value or "0") for value in columns["Layer"]]
     chosen = np.array([not value for value in columns["PaperSpace"]], bool)
@@ -173,7 +200,7 @@ def _objects(table: Table, unit: float, crs: str | None, options: ReadOptions, c
     labels = [d.get("text") if point else None for d, point in zip(details, is_point, strict=True)]
     handles = [columns["EntityHandle"][k] for k in indices]
     geometry = _areas(table.geometry[indices])
-    return Table(NAME, {"id": handles, "name": labels, "dxf": details}, scaled(geometry, unit), crs)
+    return Table(NAME, {"id": handles, "name": labels, "dxf": details}, scaled(geometry, factors), crs)
 
 
 def _in_layers(layers: list[str], names: tuple[str, ...]) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -74,6 +75,6 @@ def transformed(geometry: NDArray[np.object_], function: Any) -> NDArray[np.obje
     return out
 
 
-def scaled(geometry: NDArray[np.object_], factor: float) -> NDArray[np.object_]:
-    """Multiply all coordinates by a factor, and round them to a nanometre."""
-    return transformed(geometry, lambda points: np.round(points * factor, METRES))
+def scaled(geometry: NDArray[np.object_], factors: Sequence[float]) -> NDArray[np.object_]:
+    """Multiply x, y and z by their factors, and round the results to 9 decimals (a nanometre, of metres)."""
+    return transformed(geometry, lambda points: np.round(points * factors[: points.shape[1]], METRES))

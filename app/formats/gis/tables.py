@@ -215,9 +215,8 @@ def convert(geometry: NDArray[np.object_], crs: str) -> tuple[NDArray[np.object_
         return _checked(geometry, MAX_METRES, MAX_METRES, "±1e7 metres"), True
     unit = engineering_unit(crs)
     if unit is not None:
-        return _checked(
-            geometry if unit == 1.0 else scaled(geometry, unit), MAX_METRES, MAX_METRES, "±1e7 metres"
-        ), True
+        metres = geometry if unit == 1.0 else scaled(geometry, (unit, unit, unit))
+        return _checked(metres, MAX_METRES, MAX_METRES, "±1e7 metres"), True
     if crs.upper() not in (WGS84, "OGC:CRS84"):
         _checked(geometry, 1e15, 1e15, "what a CRS covers")
         geometry = transformed(geometry, lambda points: np.column_stack(_degrees(crs, points)))
