@@ -59,7 +59,20 @@ def test_boundary_becomes_the_fence_beside_obstacles() -> None:
 def test_missing_file_of_a_field_is_reported() -> None:
     context = ReadContext()
     assert len(objects({MAIN: FILES[MAIN]}, context)) == 4
-    assert [w.problem for w in context.warnings] == ["PFD00002 is not in the upload"]
+    assert context.warnings[0].problem == "PFD00002 is not in the upload"
+
+
+def test_elements_without_a_shape_are_counted() -> None:
+    context = ReadContext()
+    objects(FILES, context)
+    assert [w.problem for w in context.warnings] == [
+        "not read: CTR (1); only the shapes and guidance lines of fields (PFD) are"
+    ]
+
+
+def test_a_type_with_leading_zeros_is_no_error() -> None:
+    data = FILES[MAIN].replace(b'<PLN A="1"', b'<PLN A="0001999"', 1)
+    assert objects({MAIN: data}).properties[0]["isoxml"]["type"] == "other"
 
 
 @pytest.mark.parametrize(
@@ -94,7 +107,8 @@ SCHEMA = {
     "PNT": ({"A": "[1-9]|1[01]", "C": NUMBER, "D": NUMBER},
             {"B": TEXT, "E": r"-?[0-9]{1,10}", "G": r"PNT-?[0-9]{1,11}"}, set()),
     "GGP": ({"A": r"GGP-?[0-9]{1,11}"}, {"B": TEXT}, {"GPN"}),
-    "GPN": ({"A": r"GPN-?[0-9]{1,11}", "C": "[1-5]"}, {"B": TEXT}, {"LSG"}),
+    "GPN": ({"A": r"GPN-?[0-9]{1,11}", "C": "[1-5]"},
+            {"B": TEXT, **dict.fromkeys("DEF", "[1-4]"), "G": NUMBER, **dict.fromkeys("HNO", COUNT)}, {"LSG"}),
 }  # fmt: skip
 """Required attributes, optional ones and children of each element, by the public schema of ISO 11783-10, version 4."""
 
@@ -117,7 +131,8 @@ def check_schema(root: etree._Element) -> None:
         (line,) = pattern
         assert line.get("A") == "5"
         ends = [point.get("A") for point in line]
-        assert ends == ["6", *["9"] * (len(ends) - 2), "7"]
+        if pattern.get("C") in ("1", "3"):
+            assert ends == ["6", *["9"] * (len(ends) - 2), "7"]
 
 
 def layers() -> Layers:
@@ -176,3 +191,63 @@ def test_fields_that_were_read_come_back_whole() -> None:
     assert again.ids == first.ids
     assert again.properties == first.properties
     assert shapely.equals_exact(again.geometry, first.geometry).all()
+
+
+PATTERNS = b"""<?xml version="1.0"?>
+<ISO11783_TaskData VersionMajor="4" VersionMinor="3"><PFD A="PFD1" C="Oats" D="0">
+  <LSG A="6" C="300" F="LSG4"><PNT A="2" C="53.1" D="-0.5"/><PNT A="2" C="53.2" D="-0.5"/></LSG>
+  <GGP A="GGP1" B="Ways">
+    <GPN A="GPN7" B="circle" C="4" D="3" H="400000"><LSG A="5" C="6000"><PNT A="8" C="53.1" D="-0.5"/></LSG></GPN>
+    <GPN A="GPN2" C="4" D="1" H="445000"><LSG A="5" C="6000"><PNT A="8" C="53.1" D="-0.5"/>
+      <PNT A="6" C="53.104" D="-0.5"/><PNT A="7" C="53.1" D="-0.51"/></LSG></GPN>
+    <GPN A="GPN3" C="2" G="45"><LSG A="5"><PNT A="6" C="53.1" D="-0.5"/></LSG></GPN>
+    <GPN A="GPN4" C="1" E="2" G="0" N="3" O="4"><LSG A="5"><PNT A="6" C="53.1" D="-0.5"/>
+      <PNT A="7" C="53.2" D="-0.5"/></LSG></GPN>
+    <GPN A="GPN5" C="3"><LSG A="5"><PNT A="6" C="53.1" D="-0.5"/><PNT A="7" C="53.2" D="-0.5"/></LSG></GPN>
+  </GGP>
+</PFD></ISO11783_TaskData>"""
+
+
+def written(part: Features, context: WriteContext) -> etree._Element:
+    data = formats.write(FORMAT, Layers({PartKey("objects", "ground", "isoxml"): part}), context)
+    root = etree.fromstring(data[MAIN])
+    check_schema(root)
+    return root
+
+
+def test_guidance_patterns_come_back_whole() -> None:
+    reading, writing = ReadContext(), WriteContext()
+    part = objects({MAIN: PATTERNS}, reading)
+    assert [w.problem.partition(":")[0] for w in reading.warnings] == [
+        "3 guidance patterns are neither straight lines (AB) nor curves"
+    ]
+    assert {f.id: f.properties.get("width") for f in part} == {
+        "LSG4": 0.3, "GPN7": 6.0, "GPN2": 6.0, "GPN3": None, "GPN4": None, "GPN5": None,
+    }  # fmt: skip
+    root, source = written(part, writing), etree.fromstring(PATTERNS)
+    for tag in ("GPN", "LSG", "PNT"):
+        assert [dict(e.attrib) for e in root.iter(tag)] == [dict(e.attrib) for e in source.iter(tag)]
+    assert writing.dropped == []
+
+
+def test_headings_and_radii_of_moved_points_are_reported() -> None:
+    part = objects({MAIN: PATTERNS})
+    moved = features(
+        [(f.id, shapely.transform(f.geometry, lambda points: points + 1e-4), f.properties) for f in part], "wgs84"
+    )
+    context = WriteContext()
+    patterns = {p.get("A"): dict(p.attrib) for p in written(moved, context).iter("GPN")}
+    assert patterns["GPN2"] == {"A": "GPN2", "C": "4", "D": "1"}, "its points say the radius"
+    assert patterns["GPN4"] == {"A": "GPN4", "C": "1", "E": "2", "N": "3", "O": "4"}
+    assert (patterns["GPN7"]["H"], patterns["GPN3"]["G"]) == ("400000", "45"), "they do not depend on the place"
+    assert {d.subject: d.count for d in context.dropped} == {"headings and radii": 2}
+
+
+def test_a_pivot_that_became_another_line_is_no_straight_line() -> None:
+    line = shapely.LineString([(-0.5, 53.1), (-0.5, 53.2), (-0.4, 53.2), (-0.4, 53.1)])
+    changed = features([(f.id, line, f.properties) for f in objects({MAIN: PATTERNS})], "wgs84")
+    context = WriteContext()
+    assert [(p.get("A"), p.get("C")) for p in written(changed, context).iter("GPN")] == [("GPN4", "3"), ("GPN5", "3")]
+    assert {d.subject: d.count for d in context.dropped} == {
+        "guidance patterns": 3, "properties of guidance lines": 4
+    }  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -13,7 +14,19 @@ from lxml import etree
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, ReadContext
-from app.formats.isoxml.words import LINES, NAME, POINTS, POLYGONS
+from app.formats.isoxml.words import (
+    AB,
+    CURVE,
+    GUIDANCE,
+    LINES,
+    NAME,
+    PATTERN,
+    POINTS,
+    POLYGONS,
+    VALUE,
+    place_hash,
+    plain_pattern,
+)
 from app.model.features import MAX_ID, NO_GEOMETRY, Properties, features, unique_ids
 from app.model.frame import MAX_METRES, is_writable
 from app.model.layers import Layers, PartKey
@@ -49,6 +62,9 @@ def read(files: Files, context: ReadContext) -> Layers:
     for element in [*root, *_external(root, files, context)]:
         if element.tag == "PFD":
             reader.read_field(element)
+        elif element.tag != "XFR":
+            reader.unread[str(element.tag)] += 1
+    reader.report()
     if not reader.rows:
         context.warn("it has no field (PFD) with a geometry")
     ids = unique_ids(i for i, _, _ in reader.rows)
@@ -73,6 +89,21 @@ class _Reader:
         self.rows: list[tuple[str, Any, Properties]] = []
         self.field = ""
         self.field_id = ""
+        self.unread: Counter[str] = Counter()
+        self.unusual = 0
+        """Number of guidance patterns that are no lines."""
+
+    def report(self) -> None:
+        """Warn of what is not read, and of what its shape does not show."""
+        if self.unread:
+            tags = ", ".join(f"{tag[:20]} ({n})" for tag, n in sorted(self.unread.items())[:30])
+            self.context.warn(f"not read: {tags}; only the shapes and guidance lines of fields (PFD) are")
+        if self.unusual:
+            self.context.warn(
+                f"{self.unusual} guidance patterns are neither straight lines (AB) nor curves: their shapes are the "
+                "points that define them, not where a machine drives",
+                where="GPN",
+            )
 
     def read_field(self, field: etree._Element) -> None:
         """Read the polygons, lines, points and guidance lines of a field."""
@@ -82,11 +113,14 @@ class _Reader:
             if element.tag == "PLN":
                 self.add_polygon(element)
             elif element.tag == "LSG":
-                self.add(element, element.get("F"), element.get("B"), _type(element, LINES), self.line(element))
+                kind, width = _type(element, LINES), self.width(element)
+                self.add(element, element.get("F"), element.get("B"), kind, self.line(element), width=width)
             elif element.tag == "PNT":
                 self.add(element, element.get("G"), element.get("B"), _type(element, POINTS), self.point(element))
             elif element.tag == "GGP":
                 self.add_guidance(element)
+            else:
+                self.unread[str(element.tag)] += 1
 
     def add_polygon(self, element: etree._Element) -> None:
         rings = [(child.get("A"), self.positions(child)) for child in element.iterchildren("LSG")]
@@ -106,10 +140,39 @@ class _Reader:
         self.add(element, element.get("E"), title, kind, shape)
 
     def add_guidance(self, group: etree._Element) -> None:
-        for pattern in group.iterchildren("GPN"):
-            for line in pattern.iterchildren("LSG"):
-                more = {"group": group.get("B") or group.get("A")}
-                self.add(line, pattern.get("A"), pattern.get("B"), "guidance line", self.line(line), more)
+        title = group.get("B") or group.get("A")
+        for pattern in group:
+            if pattern.tag != "GPN":
+                self.unread[str(pattern.tag)] += 1
+                continue
+            for line in pattern:
+                if line.tag != "LSG":
+                    self.unread[str(line.tag)] += 1
+                    continue
+                shape = self.line(line)
+                more = {"group": title, "pattern": self.pattern(pattern, line, shape)}
+                name, width = pattern.get("B"), self.width(line)
+                self.add(line, pattern.get("A"), name, GUIDANCE, shape, more, width=width)
+
+    def pattern(self, pattern: etree._Element, line: etree._Element, shape: Any) -> Properties | None:
+        """Return what the shape of a guidance pattern does not say: attributes, and types of points; None if nothing.
+
+        ``place`` tells whether the points have been moved since.
+        """
+        attributes = {name: str(pattern.get(name)) for name in PATTERN if VALUE.fullmatch(pattern.get(name) or "")}
+        kinds = [str(point.get("A") or "2") for point in line.iterchildren("PNT")]
+        self.unusual += int(bool(kinds) and attributes.get("C", AB) not in (AB, CURVE))
+        if (attributes, kinds) == plain_pattern(len(kinds)):
+            return None
+        return {**attributes, "points": kinds, "place": place_hash(shape)}
+
+    def width(self, line: etree._Element) -> float | None:
+        """Return the width of a line in metres; None if it has none."""
+        text = str(line.get("C") or "0")
+        if not (text.isascii() and text.isdigit() and len(text) < 10):
+            self.context.warn(f"C must be a width in mm, got {text[:40]!r}", line=line.sourceline, where="LSG")
+            return None
+        return int(text) / 1000 or None
 
     def add(
         self,
@@ -119,6 +182,8 @@ class _Reader:
         kind: str,
         shape: Any,
         more: Properties | None = None,
+        *,
+        width: float | None = None,
     ) -> None:
         if shape.is_empty:
             self.context.warn("it has no points and is not read", line=element.sourceline, where=str(element.tag))
@@ -129,6 +194,8 @@ class _Reader:
         properties: dict[str, Any] = {"kind": ("poi", "path", "region")[int(shapely.get_dimensions(shape))]}
         if title:
             properties["name"] = title
+        if width is not None:
+            properties["width"] = width
         details = {"field": self.field, "type": kind, **(more or {})}
         properties[NAME] = {name: value for name, value in details.items() if value}
         self.rows.append((text, shape, properties))
@@ -170,4 +237,5 @@ def _closed(ring: Sequence[Sequence[float]]) -> Any:
 
 def _type(element: etree._Element, names: Sequence[str]) -> str:
     text = str(element.get("A") or "")
-    return names[int(text) - 1] if text.isascii() and text.isdigit() and 0 < int(text[:4]) <= len(names) else "other"
+    number = int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
+    return names[number - 1] if 0 < number <= len(names) else "other"

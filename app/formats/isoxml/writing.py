@@ -12,14 +12,25 @@ import shapely
 from lxml import etree
 
 from app.formats import WriteContext
-from app.formats.isoxml.words import LINES, NAME, POINTS, POLYGONS, ROOT
+from app.formats.isoxml.words import (
+    AB,
+    CURVE,
+    DECIMALS,
+    GUIDANCE,
+    LINES,
+    NAME,
+    PATTERN,
+    POINTS,
+    POLYGONS,
+    ROOT,
+    VALUE,
+    place_hash,
+    plain_pattern,
+)
 from app.model.features import Features, Properties
 from app.model.frame import GROUND, Level
 from app.model.geodesy import surface
 from app.model.layers import Layer, Layers, PartKey
-
-DECIMALS = 9
-"""Decimals of a degree: 0.1 mm on the ground. The standard has no exponents."""
 
 MAX_TEXT = 32
 """Maximum length of a name, in characters."""
@@ -35,7 +46,7 @@ _ID = {0: re.compile(r"PNT-?[0-9]{1,11}"), 1: re.compile(r"LSG-?[0-9]{1,11}"), 2
 _GUIDANCE_ID = re.compile(r"GPN-?[0-9]{1,11}")
 _ILLEGAL = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML cannot contain."""
-_GUIDANCE = "guidance line"
+_POINT_TYPES = {str(number) for number in range(1, len(POINTS) + 1)}
 
 
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
@@ -114,9 +125,9 @@ class _Writer:
         if kind is None:
             self.lost["lines", "ISOXML lines are fences, obstacles, drainage … and have no other type"] += 1
             return
-        self._report_properties(properties)
+        self._report_properties(properties, has_width=dimension == 1 or kind == GUIDANCE)
         name, field = self._field(key, properties)
-        if kind == _GUIDANCE:
+        if kind == GUIDANCE:
             group = source.get("group") if isinstance(source, Mapping) else None
             self._add_guidance((name, str(group or "")), identifier, shape, properties)
             return
@@ -133,6 +144,7 @@ class _Writer:
                 element = self._polygon(field, number, shown)
             elif dimension == 1:
                 element = self._line(field, number, shown)
+                _set_width(element, properties)
             else:
                 element = _point(field, number, shapely.get_coordinates(shown, include_z=True)[0])
             if isinstance(title, str) and title:
@@ -149,14 +161,17 @@ class _Writer:
             return "boundary"
         if dimension == 2 and key.layer == "zones":
             return "obstacle" if kind == "keepout" else "treatment zone"
+        if dimension == 0 and source.get("type") == GUIDANCE and isinstance(source.get("pattern"), Mapping):
+            return GUIDANCE  # a direction (A+), or a circle around a point
         names = _TYPES[dimension]
         for candidate in (source.get("type"), KINDS.get(str(kind))):
             if candidate in names:
                 return str(candidate)
         return "other" if "other" in names else None
 
-    def _report_properties(self, properties: Properties) -> None:
-        further = [name for name in properties if name not in ("kind", "name", NAME)]
+    def _report_properties(self, properties: Properties, *, has_width: bool) -> None:
+        known = {"kind", "name", NAME, "width"} if has_width else {"kind", "name", NAME}
+        further = [name for name in properties if name not in known]
         self.lost["further properties", "ISOXML shapes have a type and a name"] += len(further)
 
     def _polygon(self, parent: etree._Element, kind: str, shape: Any) -> etree._Element:
@@ -171,7 +186,7 @@ class _Writer:
         element = etree.SubElement(parent, "LSG", A=kind)
         rows = shapely.get_coordinates(line, include_z=True)
         for k, row in enumerate(rows):
-            _point(element, points[min(k, 1) if k < len(rows) - 1 else 2] if points else "2", row)
+            _point(element, points[k] if points else "2", row)
         return element
 
     # --- guidance ---
@@ -190,24 +205,51 @@ class _Writer:
         self._add_guidance((name, key.name), identifier, shape, properties)
 
     def _add_guidance(self, key: tuple[str, str], identifier: str, shape: Any, properties: Properties) -> None:
-        """Add a pattern for each line of a shape: a straight one, or a curve."""
+        """Add a pattern for each line of a shape: the one that was read, else a straight one or a curve."""
+        source = properties.get(NAME)
+        kept = source.get("pattern") if isinstance(source, Mapping) else None
+        for line in shapely.get_parts(shape):
+            known = self._pattern(line, kept if isinstance(kept, Mapping) else None)
+            if known is None:
+                continue
+            attributes, points = known
+            pattern = etree.SubElement(self._group(key), "GPN", A=self._pattern_id(identifier))
+            title = properties.get("name")
+            if isinstance(title, str) and title:
+                pattern.set("B", self._short(title))
+            for name, value in attributes.items():
+                pattern.set(name, value)
+            _set_width(self._line(pattern, "5", line, points), properties)
+
+    def _group(self, key: tuple[str, str]) -> etree._Element:
+        """Return the group of guidance lines of a field and a name."""
         if key not in self.groups:
             self.counts["GGP"] += 1
             group = etree.SubElement(self.fields[key[0]], "GGP", A=f"GGP{self.counts['GGP']}")
             if key[1]:
                 group.set("B", self._short(key[1]))
             self.groups[key] = group
-        for line in shapely.get_parts(shape):
-            straight = shapely.get_num_points(line) == 2
-            pattern = etree.SubElement(self.groups[key], "GPN", A=self._pattern_id(identifier))
-            title = properties.get("name")
-            if isinstance(title, str) and title:
-                pattern.set("B", self._short(title))
-            pattern.set("C", "1" if straight else "3")
-            element = self._line(pattern, "5", line, ("6", "9", "7"))
-            width = properties.get("width")
-            if isinstance(width, int | float) and 0 < width < 1e6:
-                element.set("C", str(round(width * 1000)))
+        return self.groups[key]
+
+    def _pattern(self, line: Any, kept: Mapping[str, Any] | None) -> tuple[dict[str, str], Sequence[str]] | None:
+        """Return attributes and types of points: those that were read, as far as they still hold. None: left out."""
+        count = int(shapely.get_num_coordinates(line))
+        attributes, points = plain_pattern(count)
+        if kept is None:
+            return attributes, points
+        read = {name: kept[name] for name in PATTERN if VALUE.fullmatch(str(kept.get(name, "")))}
+        types = kept.get("points")
+        if not isinstance(types, Sequence) or len(types) != count or not _POINT_TYPES.issuperset(map(str, types)):
+            if read.get("C", AB) in (AB, CURVE):
+                self.lost["properties of guidance lines", "points were added or removed"] += len(read.keys() - {"C"})
+                return attributes, points
+            self.lost["guidance patterns", "points of a pivot, spiral or direction were added or removed"] += 1
+            return None
+        if count > 1 and kept.get("place") != place_hash(line):
+            stale = {name for name in "GH" if name in read}
+            self.lost["headings and radii", "the points of the guidance pattern were moved"] += len(stale)
+            read = {name: value for name, value in read.items() if name not in stale}
+        return {**attributes, **{name: str(value) for name, value in read.items()}}, [str(kind) for kind in types]
 
     def _pattern_id(self, identifier: str) -> str:
         if _GUIDANCE_ID.fullmatch(identifier) and identifier not in self.taken:
@@ -219,6 +261,13 @@ class _Writer:
             if name not in self.taken:
                 self.taken.add(name)
                 return name
+
+
+def _set_width(line: etree._Element, properties: Properties) -> None:
+    """Set the width of a line, in millimetres."""
+    width = properties.get("width")
+    if isinstance(width, int | float) and 0 < width < 1e6:
+        line.set("C", str(round(width * 1000)))
 
 
 def _point(parent: etree._Element, kind: str, row: Any) -> etree._Element:
