@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -113,15 +111,6 @@ def features(server: WebServer, site: str, layer: str = "topology", version: str
 def at(feature: dict[str, Any]) -> tuple[float, ...]:
     geometry = feature.get("place") or feature["geometry"]
     return tuple(round(value, 6) for value in geometry["coordinates"])
-
-
-def test_any_order_of_edits_can_be_undone_and_merged(tmp_path: Path) -> None:
-    web = Path(__file__).resolve().parents[2] / "app" / "web"
-    bundler, program = web / "node_modules" / ".bin" / "rolldown", tmp_path / "edit.mjs"
-    arguments = [str(bundler), "src/views/edit/edit.check.ts", "--file", str(program), "--platform", "node"]
-    subprocess.run(arguments, cwd=web, check=True, capture_output=True, timeout=120)
-    done = subprocess.run(["node", str(program)], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
 
 
 def test_draw_split_undo_reload_and_save(server: WebServer, edit: Edit) -> None:

@@ -1,4 +1,4 @@
-/** Any order of edits keeps lanes tied to their nodes, can be undone, replayed and merged (run by tests/web/test_edit.py). */
+/** Any order of edits keeps lanes tied to their nodes, can be undone, replayed and merged (run by tests/web/test_modules.py). */
 import { type Command, Draft, isEdge, isNode, keyOf, same } from "./draft";
 import { compare, merged, withFreshIds } from "./merge";
 import * as operations from "./operations";

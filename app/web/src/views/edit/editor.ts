@@ -38,6 +38,8 @@ export class Editor {
   /** Where the draft is: on this device, or not (the device has no room). */
   readonly stored = signal<"kept" | "saving" | "failed">("kept");
   readonly ready = signal(false);
+  /** Whether a request that sends the draft is under way. */
+  readonly sending = signal(false);
   copied: Feature[] = [];
 
   readonly changes = computed(() => {
@@ -136,8 +138,15 @@ export class Editor {
     return twin ? [keyOf(feature), keyOf(twin)] : [keyOf(feature)];
   }
 
+  /** Why the draft must stay as it is: what is changed now would be in no request and in no merge. Empty: it may change. */
+  get hold(): string {
+    if (this.sending.peek()) return "Your changes are being saved: wait for the answer of the server";
+    return this.head.pending.peek() ? "Decide the conflicts first, or choose “Later”" : "";
+  }
+
   /** Does an operation, or says why it cannot be done. Selects what is given, or keeps what is left. */
   run(outcome: Outcome, select?: string[]): boolean {
+    if (this.refuse()) return false;
     if (typeof outcome === "string") {
       notify(outcome);
       return false;
@@ -150,12 +159,31 @@ export class Editor {
     return true;
   }
 
+  /** Keeps the draft as it is while it is sent. */
+  async whileSending(work: () => Promise<void>): Promise<void> {
+    this.sending.value = true;
+    try {
+      await work();
+    } finally {
+      this.sending.value = false;
+    }
+  }
+
+  /** Says why the draft must stay as it is, if it must. */
+  refuse(): boolean {
+    const { hold } = this;
+    if (hold) notify(hold);
+    return hold !== "";
+  }
+
   undo(): void {
+    if (this.refuse()) return;
     const command = this.draft.undo();
     if (command) this.afterStep(command, `Undone: ${command.title}`);
   }
 
   redo(): void {
+    if (this.refuse()) return;
     const command = this.draft.redo();
     if (command) this.afterStep(command, `Done again: ${command.title}`);
   }

@@ -40,6 +40,10 @@ export class EditPointer extends Interaction {
   override handleEvent(event: MapBrowserEvent<PointerEvent>): boolean {
     const { originalEvent: source } = event;
     if (!source || !this.isFree()) return true;
+    if (this.editor.hold && !this.down) {
+      if ((event.type as string) === "singleclick") this.editor.refuse();
+      return true;
+    }
     switch (event.type as string) {
       case "pointerdown":
         return this.press(source);

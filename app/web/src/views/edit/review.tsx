@@ -21,7 +21,7 @@ const SHOWN = 200;
 
 export function Review({ desk }: { desk: Desk }) {
   const { editor } = desk;
-  const [busy, setBusy] = useState(false);
+  const busy = editor.sending.value;
   const [problem, setProblem] = useState<ApiError | null>(null);
   const close = () => {
     desk.review.value = false;
@@ -29,14 +29,12 @@ export function Review({ desk }: { desk: Desk }) {
   const isOpen = desk.review.value && editor.head.pending.value === null;
   useEffect(() => setProblem(null), [isOpen]);
   const run = async (work: () => Promise<void>) => {
-    setBusy(true);
     setProblem(null);
     try {
-      await work();
+      await editor.whileSending(work);
     } catch (error) {
       setProblem(asApiError(error));
     }
-    setBusy(false);
   };
   const submit = () =>
     run(async () => {
@@ -77,7 +75,7 @@ export function Review({ desk }: { desk: Desk }) {
       wide
       actions={
         <>
-          <DiscardButton editor={editor} close={close} />
+          <DiscardButton editor={editor} busy={busy} close={close} />
           <span class="spacer" />
           <Button onClick={close}>Go on editing</Button>
           {draft === null ? (
@@ -171,12 +169,13 @@ function savedChanges(editor: Editor): string[] {
   return changesInWords(editor.target.content?.changes ?? {});
 }
 
-function DiscardButton({ editor, close }: { editor: Editor; close: () => void }) {
+function DiscardButton({ editor, busy, close }: { editor: Editor; busy: boolean; close: () => void }) {
   const [asked, setAsked] = useState(false);
   if (editor.count.value === 0) return null;
   return (
     <Button
       danger
+      busy={busy}
       onClick={() => {
         if (!asked) return setAsked(true);
         editor.discard();

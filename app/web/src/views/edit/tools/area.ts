@@ -59,7 +59,7 @@ export class AreaTool extends Tool {
 
   addAt(at: Position): void {
     const last = this.points.peek().at(-1);
-    if (last && distance(last, at) < 1e-6) return;
+    if ((last && distance(last, at) < 1e-6) || this.editor.refuse()) return;
     this.points.value = [...this.points.peek(), at];
     if (this.shape === "point") this.finish();
     else this.draw();
@@ -72,7 +72,7 @@ export class AreaTool extends Tool {
   override finish(): void {
     const points = this.points.peek();
     const least = { point: 1, line: 2, area: 3 }[this.shape];
-    if (!points.length) return;
+    if (!points.length || this.editor.refuse()) return;
     if (points.length < least) {
       notify(`${this.shape === "area" ? "An area" : "A line"} needs ${least} points or more`, { kind: "failed" });
       return;

@@ -1,0 +1,45 @@
+/** What modules of the page expect of a browser, for their checks, which run in Node: import it before them. */
+
+function storage() {
+  const kept = new Map<string, string>();
+  return {
+    getItem: (name: string) => kept.get(name) ?? null,
+    setItem: (name: string, value: string) => kept.set(name, value),
+    removeItem: (name: string) => kept.delete(name),
+  };
+}
+
+const nothing = () => undefined;
+
+Object.assign(globalThis, {
+  window: globalThis,
+  location: { search: "?site=yard", hash: "", pathname: "/", origin: "http://page" },
+  history: { replaceState: nothing, pushState: nothing },
+  addEventListener: nothing,
+  removeEventListener: nothing,
+  localStorage: storage(),
+  sessionStorage: storage(),
+  matchMedia: () => ({ matches: false, addEventListener: nothing }),
+  document: { documentElement: { dataset: {} } },
+  BroadcastChannel: class {
+    postMessage = nothing;
+    close = nothing;
+  },
+  Request: class extends Request {
+    constructor(path: string | Request, init?: RequestInit) {
+      super(typeof path === "string" ? `http://page${path}` : path, init);
+    }
+  },
+});
+
+/** Answers the page's requests with JSON, after those of `status` other than 200. Returns what ends it. */
+export function answerWith(answer: (request: Request) => Promise<{ status?: number; body?: unknown }>): void {
+  globalThis.fetch = async (input) => {
+    const { status = 200, body = {} } = await answer(input as Request);
+    return new Response(JSON.stringify(body), { status, headers: { "content-type": "application/json" } });
+  };
+}
+
+export function require(condition: boolean, text: string): asserts condition {
+  if (!condition) throw new Error(text);
+}

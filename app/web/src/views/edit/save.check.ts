@@ -1,0 +1,102 @@
+/** What is edited while a save or a decision is pending is not lost (run by tests/web/test_modules.py). */
+import { answerWith, require } from "../../in-node";
+import { signal } from "@preact/signals";
+import type { Feature } from "../../map/features";
+import type { SiteMap } from "../../map/site-map";
+import type { Site } from "../../site";
+import { keyOf } from "./draft";
+import { Editor } from "./editor";
+import * as operations from "./operations";
+import { save } from "./save";
+import { DraftStore, type StoredDraft } from "./storage";
+
+/** What the device keeps. */
+let stored: StoredDraft | null = null;
+DraftStore.prototype.load = async () => stored;
+DraftStore.prototype.save = async () => undefined;
+DraftStore.prototype.clear = async () => undefined;
+
+function node(id: string, x: number, properties: Record<string, unknown> = {}): Feature {
+  const geometry: Feature["geometry"] = { type: "Point", coordinates: [x, 0] };
+  const all = { kind: "node", ...properties };
+  return { id, layer: "topology", level: "ground", part: "network", geometry, properties: all };
+}
+
+/** A site that shows features as version 1. */
+function siteOf(features: Feature[], partial: string[] = []) {
+  return {
+    name: "yard",
+    features: signal(features),
+    version: signal<object>({ version: 1, message: "" }),
+    environment: signal({ version: 1 }),
+    partial: signal(partial),
+    parts: signal([]),
+    level: signal("ground"),
+    problem: signal(null),
+    path: (...parts: (string | number)[]) => ["environments", "yard", ...parts],
+    refresh: async () => undefined,
+  };
+}
+
+type TestSite = ReturnType<typeof siteOf>;
+
+/** Ben saves version 2. */
+function saveOfBen(site: TestSite, features: Feature[]): void {
+  site.environment.value = { version: 2 };
+  site.version.value = { version: 2, author: "ben", message: "" };
+  site.features.value = features;
+}
+
+async function open(site: TestSite): Promise<Editor> {
+  const editor = new Editor(site as unknown as Site, { shown: signal(null) } as unknown as SiteMap, "latest");
+  while (!editor.ready.value) await new Promise((resolve) => setTimeout(resolve));
+  return editor;
+}
+
+const A = keyOf(node("a", 0));
+const B = keyOf(node("b", 0));
+
+function move(editor: Editor, key: string, x: number): boolean {
+  const feature = editor.draft.get(key);
+  return feature !== undefined && editor.run(operations.place(editor.draft, feature, x, 0));
+}
+
+function placeOf(editor: Editor, key: string): unknown {
+  return (editor.draft.get(key)?.geometry as { coordinates: number[] } | undefined)?.coordinates[0];
+}
+
+async function checkWhileSaving(): Promise<void> {
+  const editor = await open(siteOf([node("a", 0), node("b", 10)]));
+  move(editor, A, 5);
+  let isMoved = true;
+  answerWith(async () => {
+    isMoved = move(editor, B, 77);
+    editor.undo();
+    return { status: 201, body: { version: 2, warnings: [] } };
+  });
+  await editor.whileSending(async () => void (await save(editor, () => undefined)));
+  require(!isMoved, "an edit during a save is refused");
+  require(placeOf(editor, B) === 10, "what is drawn as saved is saved");
+  require(placeOf(editor, A) === 5, "an undo during a save is refused");
+  require(move(editor, B, 77) && editor.count.value === 1, "after the save edits go on");
+}
+
+async function checkWhileDeciding(): Promise<void> {
+  const site = siteOf([node("a", 0), node("b", 10)]);
+  const editor = await open(site);
+  move(editor, A, 1);
+  saveOfBen(site, [node("a", 2), node("b", 10)]);
+  require(!editor.head.merge(null), "the same node is a conflict");
+  require(!move(editor, B, 77), "an edit while conflicts are listed is refused");
+  editor.undo();
+  const [conflict] = editor.head.pending.value?.merge.conflicts ?? [];
+  require(conflict !== undefined, "the conflict is listed");
+  editor.head.choose(conflict, "mine");
+  require(editor.head.pending.value !== null, "the decision is kept");
+  editor.head.finish(editor.head.pending.value);
+  require(placeOf(editor, A) === 1, "mine is kept");
+  require(move(editor, B, 77) && editor.count.value === 2, "after the decision edits go on");
+}
+
+await checkWhileSaving();
+await checkWhileDeciding();
