@@ -64,8 +64,7 @@ export class Head {
     const features = editor.site.features.peek();
     const version = editor.target.number ?? 0;
     editor.message.value = head.message;
-    const older = head.version === version ? features : featuresBefore(features, log);
-    editor.setDraft(editor.newDraft(older, log, head.position), head.version);
+    editor.setDraft(editor.newDraft(featuresBefore(features, log), log, head.position), head.version);
     const total = editor.count.value;
     const made = head.version === version ? "" : `, made on ${editor.target.olderWords(head.version)}`;
     if (total) editor.note("restored", `Restored ${count(total, "change")}, kept on this device${made}.`);
@@ -140,7 +139,7 @@ export class Head {
   }
 }
 
-/** Returns the features that a log of changes began with: those of an older version are known from it. */
+/** Returns the features that a log of changes began with: those of an older version, or not loaded yet, are known from it. */
 function featuresBefore(features: readonly Feature[], log: readonly Command[]): Iterable<Feature> {
   const older = new Map(features.map((feature) => [keyOf(feature), feature]));
   const first = new Map<string, Feature | null>();

@@ -98,5 +98,24 @@ async function checkWhileDeciding(): Promise<void> {
   require(move(editor, B, 77) && editor.count.value === 2, "after the decision edits go on");
 }
 
+/** A layer that is shown by extent: what was edited is in another extent, or not loaded yet. */
+async function checkRestoredElsewhere(): Promise<void> {
+  const first = await open(siteOf([node("a", 0), node("b", 10)], ["topology"]));
+  first.run(operations.remove(first.draft, [node("a", 0)]));
+  move(first, B, 20);
+  stored = {
+    head: { id: "", site: "yard", version: 1, position: 2, message: "", time: 0 },
+    log: structuredClone(first.draft.log),
+  };
+  const site = siteOf([node("far", 9000)], ["topology"]);
+  const second = await open(site);
+  stored = null;
+  require(second.count.value === 2, "both changes are restored");
+  site.features.value = [node("a", 0), node("b", 10)];
+  require(second.count.value === 2, "both changes are there when their extent is loaded");
+  require(placeOf(second, A) === undefined && placeOf(second, B) === 20, "the map shows them");
+}
+
+await checkRestoredElsewhere();
 await checkWhileSaving();
 await checkWhileDeciding();
