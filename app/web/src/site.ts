@@ -26,6 +26,10 @@ export const VECTOR_LAYERS: LayerName[] = ["zones", "objects", "topology", "loca
 /** Features above which a layer is loaded by extent only. */
 export const MAX_FEATURES = 60_000;
 const PAGE = 10_000;
+/** Ids that are read at once; the address of the request must not be too long. */
+const MAX_IDS = 100;
+
+type Query = Record<string, string | number>;
 
 /** A version as addresses name it. */
 export function refOf(version: Version | DryRun): string {
@@ -213,9 +217,23 @@ export class Site {
 
   private async loadLayer(version: string, layer: LayerName, stop: AbortSignal, bbox?: Box): Promise<Feature[]> {
     const query = bbox ? { crs: "local", bbox: bbox.join(","), limit: PAGE } : { crs: "local" };
+    return this.readLayer(version, layer, query, stop);
+  }
+
+  private async readLayer(version: string, layer: LayerName, query: Query, stop?: AbortSignal): Promise<Feature[]> {
     const path = apiPath(this.path("versions", version, "layers", layer), query);
     const { features } = await requestJson<{ features: WireFeature[] }>(path, { signal: stop });
     return features.map((wire) => fromWire(layer, wire)).filter((feature) => feature !== null);
+  }
+
+  /** Returns those of the features with some ids that the version shown has, wherever they are. Throws ApiError. */
+  async readFeatures(layer: LayerName, ids: readonly string[]): Promise<Feature[]> {
+    const out: Feature[] = [];
+    for (let at = 0; at < ids.length; at += MAX_IDS) {
+      const query = { crs: "local", ids: ids.slice(at, at + MAX_IDS).join(",") };
+      out.push(...(await this.readLayer(this.exact, layer, query)));
+    }
+    return out;
   }
 
   private async loadByExtent(extent: Box | null): Promise<void> {

@@ -38,7 +38,7 @@ export class Editor {
   /** Where the draft is: on this device, or not (the device has no room). */
   readonly stored = signal<"kept" | "saving" | "failed">("kept");
   readonly ready = signal(false);
-  /** Whether a request that sends the draft is under way. */
+  /** Whether the draft is being sent or merged. */
   readonly sending = signal(false);
   copied: Feature[] = [];
 
@@ -140,7 +140,7 @@ export class Editor {
 
   /** Why the draft must stay as it is: what is changed now would be in no request and in no merge. Empty: it may change. */
   get hold(): string {
-    if (this.sending.peek()) return "Your changes are being saved: wait for the answer of the server";
+    if (this.sending.peek()) return "Your changes are being saved or merged: wait for the answer of the server";
     return this.head.pending.peek() ? "Decide the conflicts first, or choose “Later”" : "";
   }
 
@@ -159,7 +159,7 @@ export class Editor {
     return true;
   }
 
-  /** Keeps the draft as it is while it is sent. */
+  /** Keeps the draft as it is while it is sent or merged. */
   async whileSending(work: () => Promise<void>): Promise<void> {
     this.sending.value = true;
     try {

@@ -4,7 +4,8 @@ import type { DryRun, Version } from "../../api/client";
 import type { Feature, LayerName } from "../../map/features";
 import { sentence } from "../../ui/states";
 import { count } from "../../ui/text";
-import { type Command, type Draft, EDITED_LAYERS, keyOf } from "./draft";
+import type { Site } from "../../site";
+import { type Command, type Draft, EDITED_LAYERS, isEdge, keyOf } from "./draft";
 import type { Editor } from "./editor";
 import { type Choice, type Conflict, compare, type Merge, merged, twinOf, withFreshIds } from "./merge";
 import type { StoredDraft } from "./storage";
@@ -85,19 +86,21 @@ export class Head {
     }
   }
 
-  /** Merges the draft with the site's newest version; asks where both changed the same. Returns whether it is done. */
-  merge(resume: (() => void) | null): boolean {
+  /** Merges the draft with the site's newest version; asks where both changed the same. Returns whether it is done.
+   *
+   * Throws ApiError if what is beyond the loaded extent cannot be read. */
+  async merge(resume: (() => void) | null): Promise<boolean> {
     const { site, target, draft, base } = this.editor;
     const version = target.number;
     if (version === null || version === base.peek()) return true;
+    const author = this.authorOf(target.content);
     const theirs = site.features.peek().filter(({ layer }) => EDITED_LAYERS.includes(layer as LayerName));
     const byKey = new Map(theirs.map((feature) => [keyOf(feature), feature]));
-    for (const layer of site.partial.peek()) addUnseen(byKey, draft, layer);
+    await addUnseen(byKey, site, draft);
     const changes = draft.changes();
     const fresh = withFreshIds(changes, byKey);
     const merge = compare(fresh, byKey);
     if (fresh.some((change, index) => change !== changes[index])) merge.keepsHistory = false;
-    const author = this.authorOf(target.content);
     const pending: Pending = { merge, version, theirs: [...byKey.values()], author, choices: new Map(), resume };
     if (merge.conflicts.length) {
       this.pending.value = pending;
@@ -151,9 +154,17 @@ function featuresBefore(features: readonly Feature[], log: readonly Command[]): 
   return older.values();
 }
 
-/** Features beyond the loaded extent count as unchanged. */
-function addUnseen(theirs: Map<string, Feature>, draft: Draft, layer: LayerName): void {
-  for (const { key, before } of draft.changes()) {
-    if (before && before.layer === layer && !theirs.has(key)) theirs.set(key, before);
+/** Reads what a draft has changed, and the nodes of its lanes, where they are beyond the loaded extent. Throws ApiError. */
+async function addUnseen(theirs: Map<string, Feature>, site: Site, draft: Draft): Promise<void> {
+  for (const layer of site.partial.peek()) {
+    const ids = new Set<string>();
+    for (const { edits } of draft.log) {
+      for (const feature of edits.flatMap(({ from, to }) => [from, to])) {
+        if (feature?.layer !== layer) continue;
+        const ends = isEdge(feature) ? [feature.properties.source, feature.properties.target] : [];
+        for (const id of [feature.id, ...ends.map(String)]) if (!theirs.has(keyOf({ ...feature, id }))) ids.add(id);
+      }
+    }
+    for (const feature of await site.readFeatures(layer, [...ids])) theirs.set(keyOf(feature), feature);
   }
 }

@@ -11,6 +11,7 @@ import { can } from "../../session";
 import { Button } from "../../ui/button";
 import { Bars, Empty } from "../../ui/states";
 import { count } from "../../ui/text";
+import { attempt } from "../../ui/toast";
 import type { ViewProps } from "../registry";
 import { Checks } from "./checks";
 import { Conflicts } from "./conflicts";
@@ -110,6 +111,11 @@ function Status({ desk }: { desk: Desk }) {
   );
 }
 
+function mergeNow(editor: Editor): void {
+  if (editor.refuse()) return;
+  void attempt(() => editor.whileSending(async () => void (await editor.head.merge(null))));
+}
+
 function Notes({ editor }: { editor: Editor }) {
   const partial = editor.site.partial.value;
   return (
@@ -122,7 +128,7 @@ function Notes({ editor }: { editor: Editor }) {
               <small key={detail}>{detail}</small>
             ))}
           </p>
-          {id === "moved" && <Button onClick={() => editor.head.merge(null)}>Merge now</Button>}
+          {id === "moved" && <Button onClick={() => mergeNow(editor)}>Merge now</Button>}
           <Button quiet icon={X} label="Dismiss" onClick={() => editor.dismiss(id)} />
         </div>
       ))}

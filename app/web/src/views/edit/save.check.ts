@@ -22,8 +22,8 @@ function node(id: string, x: number, properties: Record<string, unknown> = {}): 
   return { id, layer: "topology", level: "ground", part: "network", geometry, properties: all };
 }
 
-/** A site that shows features as version 1. */
-function siteOf(features: Feature[], partial: string[] = []) {
+/** A site that shows features as version 1. elsewhere: those beyond the loaded extent. */
+function siteOf(features: Feature[], partial: string[] = [], elsewhere: Feature[] = []) {
   return {
     name: "yard",
     features: signal(features),
@@ -35,6 +35,7 @@ function siteOf(features: Feature[], partial: string[] = []) {
     problem: signal(null),
     path: (...parts: (string | number)[]) => ["environments", "yard", ...parts],
     refresh: async () => undefined,
+    readFeatures: async (_: string, ids: string[]) => elsewhere.filter(({ id }) => ids.includes(id)),
   };
 }
 
@@ -86,7 +87,7 @@ async function checkWhileDeciding(): Promise<void> {
   const editor = await open(site);
   move(editor, A, 1);
   saveOfBen(site, [node("a", 2), node("b", 10)]);
-  require(!editor.head.merge(null), "the same node is a conflict");
+  require(!(await editor.head.merge(null)), "the same node is a conflict");
   require(!move(editor, B, 77), "an edit while conflicts are listed is refused");
   editor.undo();
   const [conflict] = editor.head.pending.value?.merge.conflicts ?? [];
@@ -116,6 +117,29 @@ async function checkRestoredElsewhere(): Promise<void> {
   require(placeOf(second, A) === undefined && placeOf(second, B) === 20, "the map shows them");
 }
 
+/** What Ben has changed beyond the loaded extent is his. */
+async function checkMergedElsewhere(): Promise<void> {
+  const elsewhere = [node("a", 0, { speed_limit: 0.3 })];
+  const site = siteOf([node("a", 0), node("b", 10)], ["topology"], elsewhere);
+  const editor = await open(site);
+  editor.run(operations.setProperty(editor.draft, [node("a", 0)], "name", "Gate"));
+  saveOfBen(site, [node("far", 9000)]);
+  require(await editor.head.merge(null), "different properties are joined");
+  const { name, speed_limit } = editor.draft.get(A)?.properties ?? {};
+  require(name === "Gate" && speed_limit === 0.3, "the properties of both are kept");
+  require(editor.notes.value.some(({ details }) => details?.length === 1), "the note says so");
+}
+
+async function checkDeletedElsewhere(): Promise<void> {
+  const site = siteOf([node("a", 0)], ["topology"]);
+  const editor = await open(site);
+  move(editor, A, 5);
+  saveOfBen(site, [node("far", 9000)]);
+  require(!(await editor.head.merge(null)), "what they have deleted elsewhere is a conflict");
+}
+
 await checkRestoredElsewhere();
+await checkMergedElsewhere();
+await checkDeletedElsewhere();
 await checkWhileSaving();
 await checkWhileDeciding();

@@ -27,7 +27,7 @@ export async function save(editor: Editor, resume: () => void): Promise<Saved> {
       await editor.site.refresh();
       const { head, site, target } = editor;
       if (!head.isBehind) throw site.problem.peek() ?? error;
-      if (!head.merge(resume)) return "conflict";
+      if (!(await head.merge(resume))) return "conflict";
       if (editor.count.peek() === 0) return { number: target.number ?? 0, warnings: 0 }; // others have saved the same
     }
   }
