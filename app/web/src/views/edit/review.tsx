@@ -45,9 +45,10 @@ export function Review({ desk }: { desk: Desk }) {
       const warnings = result.warnings ? `, with ${count(result.warnings, "warning")}` : "";
       notify(draft === null ? `Saved as v${result.number}${warnings}` : `Saved in ${words}`);
     });
-  const keep = () =>
+  const keep = (): Promise<void> =>
     run(async () => {
-      const kept = await saveAsDraft(editor, editor.message.peek().trim().slice(0, 100));
+      const kept = await saveAsDraft(editor, editor.message.peek().trim().slice(0, 100), () => void keep());
+      if (kept === "conflict") return;
       editor.discard();
       close();
       notify(`Kept as the draft ${kept.name}`, { action: { label: "Drafts", run: () => go({ view: "history" }) } });

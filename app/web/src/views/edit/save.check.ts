@@ -7,7 +7,7 @@ import type { Site } from "../../site";
 import { keyOf } from "./draft";
 import { Editor } from "./editor";
 import * as operations from "./operations";
-import { save } from "./save";
+import { save, saveAsDraft } from "./save";
 import { DraftStore, type StoredDraft } from "./storage";
 
 /** What the device keeps. */
@@ -138,6 +138,28 @@ async function checkDeletedElsewhere(): Promise<void> {
   require(!(await editor.head.merge(null)), "what they have deleted elsewhere is a conflict");
 }
 
+/** The server's draft begins with a version that the page does not show yet. */
+async function checkKeptAsDraft(): Promise<void> {
+  const site = siteOf([node("a", 0), node("b", 10)]);
+  const editor = await open(site);
+  editor.run(operations.setProperty(editor.draft, [node("a", 0)], "name", "Gate"));
+  site.refresh = async () => saveOfBen(site, [node("a", 0, { speed_limit: 0.3 }), node("b", 10)]);
+  const sent: string[] = [];
+  let edits = "";
+  answerWith(async (request) => {
+    const { pathname } = new URL(request.url);
+    sent.push(`${request.method} ${pathname.split("/yard/")[1]}`);
+    if (pathname.endsWith("edits")) edits = await request.text();
+    return { body: { id: `d${sent.length}`, base: 2, name: "draft 1" } };
+  });
+  const kept = await saveAsDraft(editor, "", () => undefined);
+  require(kept !== "conflict", "different properties are no conflict");
+  require(String(sent) ===
+    "POST drafts,DELETE drafts/d1,POST drafts,POST drafts/d3/edits", `the draft is made again after the merge: ${String(sent)}`);
+  require(edits.includes("0.3") && edits.includes("Gate"), `the properties of both are kept: ${edits}`);
+}
+
+await checkKeptAsDraft();
 await checkRestoredElsewhere();
 await checkMergedElsewhere();
 await checkDeletedElsewhere();

@@ -24,13 +24,18 @@ export async function save(editor: Editor, resume: () => void): Promise<Saved> {
       return saved;
     } catch (error) {
       if (asApiError(error).status !== 412 || round >= MAX_ROUNDS) throw error;
-      await editor.site.refresh();
-      const { head, site, target } = editor;
-      if (!head.isBehind) throw site.problem.peek() ?? error;
-      if (!(await head.merge(resume))) return "conflict";
-      if (editor.count.peek() === 0) return { number: target.number ?? 0, warnings: 0 }; // others have saved the same
+      if (!(await mergeNewest(editor, resume, error))) return "conflict";
+      if (editor.count.peek() === 0) return { number: editor.target.number ?? 0, warnings: 0 }; // others saved the same
     }
   }
+}
+
+/** Returns whether nothing is left to decide. Throws an error if nothing newer can be read. */
+async function mergeNewest(editor: Editor, resume: () => void, error: unknown): Promise<boolean> {
+  const { head, site } = editor;
+  await site.refresh();
+  if (!head.isBehind) throw site.problem.peek() ?? error;
+  return head.merge(resume);
 }
 
 /** What the server would say of the draft, without storing it. */
@@ -79,16 +84,28 @@ export async function rebaseDraft(editor: Editor, draft: string, prefer?: Prefer
   await editor.site.refresh();
 }
 
-/** Stores the changes as a draft on the server, to go on with on another machine. Throws ApiError. */
-export async function saveAsDraft(editor: Editor, name: string): Promise<ServerDraft> {
+/** Stores the changes as a draft on the server, to go on with on another machine. Throws ApiError.
+ *
+ * The server's draft begins with the newest version; the changes are merged with it first. */
+export async function saveAsDraft(editor: Editor, name: string, resume: () => void): Promise<ServerDraft | "conflict"> {
   const drafts = editor.site.path("drafts");
-  const made = await post<ServerDraft>(apiPath(drafts), name ? { name } : {});
-  try {
-    const changes = toWire(editor.draft.changes(), editor.draft.cells());
-    return await post<ServerDraft>(apiPath([...drafts, made.id, "edits"]), { changes });
-  } catch (error) {
-    await request(apiPath([...drafts, made.id]), { method: "DELETE" }).catch(() => undefined);
-    throw error;
+  for (let round = 0; ; round++) {
+    const made = await post<ServerDraft>(apiPath(drafts), name ? { name } : {});
+    const remove = () => request(apiPath([...drafts, made.id]), { method: "DELETE" }).catch(() => undefined);
+    if (made.base !== editor.base.peek()) {
+      await remove();
+      const error = new Error(`v${made.base} was saved in the meantime: try again`);
+      if (round >= MAX_ROUNDS) throw error;
+      if (!(await mergeNewest(editor, resume, error))) return "conflict";
+      continue;
+    }
+    try {
+      const changes = toWire(editor.draft.changes(), editor.draft.cells());
+      return await post<ServerDraft>(apiPath([...drafts, made.id, "edits"]), { changes });
+    } catch (error) {
+      await remove();
+      throw error;
+    }
   }
 }
 
