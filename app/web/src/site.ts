@@ -29,7 +29,7 @@ const PAGE = 10_000;
 /** Ids that are read at once; the address of the request must not be too long. */
 const MAX_IDS = 100;
 
-type Query = Record<string, string | number>;
+type Query = Parameters<typeof apiPath>[1];
 
 /** A version as addresses name it. */
 export function refOf(version: Version | DryRun): string {

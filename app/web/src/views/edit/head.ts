@@ -5,7 +5,7 @@ import type { Feature, LayerName } from "../../map/features";
 import { sentence } from "../../ui/states";
 import { count } from "../../ui/text";
 import type { Site } from "../../site";
-import { type Command, type Draft, EDITED_LAYERS, isEdge, keyOf } from "./draft";
+import { type Command, type Draft, EDITED_LAYERS, isEdge, keyOf, same } from "./draft";
 import type { Editor } from "./editor";
 import { type Choice, type Conflict, compare, type Merge, merged, twinOf, withFreshIds } from "./merge";
 import type { StoredDraft } from "./storage";
@@ -15,6 +15,8 @@ import { titleOf } from "./words";
 /** What was found when the site moved on, and waits for decisions. */
 export interface Pending {
   merge: Merge;
+  /** Whether they have changed nothing that the draft's history touches: then it stays as it is. */
+  keepsHistory: boolean;
   version: number;
   theirs: Feature[];
   author: string;
@@ -100,8 +102,13 @@ export class Head {
     const changes = draft.changes();
     const fresh = withFreshIds(changes, byKey);
     const merge = compare(fresh, byKey);
-    if (fresh.some((change, index) => change !== changes[index])) merge.keepsHistory = false;
-    const pending: Pending = { merge, version, theirs: [...byKey.values()], author, choices: new Map(), resume };
+    // What was changed back counts, too: the log would set it to what it was.
+    const isUntouched = draft.log.every(({ edits }) =>
+      edits.every(({ key }) => same(draft.before(key) ?? null, byKey.get(key) ?? null)),
+    );
+    const keepsHistory = isUntouched && fresh.every((change, index) => change === changes[index]);
+    const all = [...byKey.values()];
+    const pending: Pending = { merge, keepsHistory, version, theirs: all, author, choices: new Map(), resume };
     if (merge.conflicts.length) {
       this.pending.value = pending;
       return false;
@@ -120,14 +127,13 @@ export class Head {
     this.pending.value = { ...pending, choices };
   }
 
-  finish({ merge, version, theirs, choices, author }: Pending): void {
+  finish({ merge, keepsHistory, version, theirs, choices, author }: Pending): void {
     const { editor } = this;
     const old = editor.draft;
     const words = editor.target.words(version);
     const title = `Your changes, merged with ${words}`;
     let details: string[] = [];
-    if (merge.keepsHistory && !merge.conflicts.length)
-      editor.setDraft(editor.newDraft(theirs, old.log, old.position), version);
+    if (keepsHistory) editor.setDraft(editor.newDraft(theirs, old.log, old.position), version);
     else {
       const { command, notes } = merged(theirs, merge, choices, (key) => old.before(key), title);
       details = [...merge.joined.map((feature) => `${titleOf(feature)} has the changes of both`), ...notes];

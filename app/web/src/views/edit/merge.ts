@@ -24,8 +24,6 @@ export interface Merge {
   conflicts: Conflict[];
   /** Features that both have changed, in different fields: they hold the changes of both. */
   joined: Feature[];
-  /** Whether all history of the draft stays valid. */
-  keepsHistory: boolean;
 }
 
 /** Compares a draft's changes with the features of the newer version. */
@@ -33,17 +31,14 @@ export function compare(changes: readonly Change[], theirs: ReadonlyMap<string, 
   const clean: Change[] = [];
   const conflicts: Conflict[] = [];
   const joined: Feature[] = [];
-  let keepsHistory = true;
   for (const { key, before, after } of changes) {
     const their = theirs.get(key) ?? null;
     const [base, ours, other] = [core(before), core(after), core(their)];
     if (same(base, other)) {
       // Only the ends of a lane may differ: they follow its nodes.
-      if (!same(before, their)) keepsHistory = false;
       if (!same(base, ours) || after === null) clean.push({ key, before: their, after });
       continue;
     }
-    keepsHistory = false;
     if (same(base, ours) || same(ours, other)) continue; // theirs, or the same as ours
     if (!before || !after || !their) {
       conflicts.push({ key, before, mine: after, theirs: their, fields: [] });
@@ -56,7 +51,7 @@ export function compare(changes: readonly Change[], theirs: ReadonlyMap<string, 
       clean.push({ key, before: their, after: both.mine });
     }
   }
-  return { clean, conflicts, joined, keepsHistory };
+  return { clean, conflicts, joined };
 }
 
 /** Stands among the names of fields for where something is and how it is bent or turned. */

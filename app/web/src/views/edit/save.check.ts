@@ -34,7 +34,7 @@ function siteOf(features: Feature[], partial: string[] = [], elsewhere: Feature[
     level: signal("ground"),
     problem: signal(null),
     path: (...parts: (string | number)[]) => ["environments", "yard", ...parts],
-    refresh: async () => undefined,
+    refresh: async (): Promise<void> => undefined,
     readFeatures: async (_: string, ids: string[]) => elsewhere.filter(({ id }) => ids.includes(id)),
   };
 }
@@ -159,6 +159,31 @@ async function checkKeptAsDraft(): Promise<void> {
   require(edits.includes("0.3") && edits.includes("Gate"), `the properties of both are kept: ${edits}`);
 }
 
+/** What I have changed and changed back is theirs. */
+async function checkChangedBack(): Promise<void> {
+  const site = siteOf([node("a", 0), node("b", 10)]);
+  const editor = await open(site);
+  move(editor, A, 5);
+  move(editor, A, 0);
+  move(editor, B, 20);
+  saveOfBen(site, [node("a", 2), node("b", 10)]);
+  require(await editor.head.merge(null), "different nodes are no conflict");
+  require(placeOf(editor, A) === 2 && placeOf(editor, B) === 20, "each has the place that one of them gave it");
+}
+
+async function checkHistoryStays(): Promise<void> {
+  const site = siteOf([node("a", 0), node("b", 10)]);
+  const editor = await open(site);
+  move(editor, A, 5);
+  move(editor, A, 6);
+  saveOfBen(site, [node("a", 0), node("b", 11)]);
+  require(await editor.head.merge(null), "different nodes are no conflict");
+  editor.undo();
+  require(placeOf(editor, A) === 5 && placeOf(editor, B) === 11, "single steps can be undone after a merge");
+}
+
+await checkChangedBack();
+await checkHistoryStays();
 await checkKeptAsDraft();
 await checkRestoredElsewhere();
 await checkMergedElsewhere();
