@@ -39,17 +39,23 @@ async function fromCache(request) {
 }
 
 async function fromServer(request, name, key) {
-  try {
-    const response = await fetch(request);
+  const response = await fetch(request).catch((error) => error);
+  const isResponse = response instanceof Response;
+  if (isResponse && !isOfProxy(response)) {
     if (response.ok) void keep(name, key, response.clone());
     return response;
-  } catch (error) {
-    const hit = await (await caches.open(name)).match(key, { ignoreVary: true });
-    if (!hit) throw error;
-    const headers = new Headers(hit.headers);
-    headers.set("fleetmap-offline", "1"); // the page says so
-    return new Response(hit.body, { status: hit.status, headers });
   }
+  const hit = await (await caches.open(name)).match(key, { ignoreVary: true });
+  if (!hit && isResponse) return response;
+  if (!hit) throw response;
+  const headers = new Headers(hit.headers);
+  headers.set("fleetmap-offline", "1"); // the page says so
+  return new Response(hit.body, { status: hit.status, headers });
+}
+
+// Whether a proxy says that the server does not answer: errors of the server itself are problem documents.
+function isOfProxy({ status, headers }) {
+  return [502, 503, 504].includes(status) && !headers.get("content-type")?.startsWith("application/problem+json");
 }
 
 async function keep(name, key, response) {

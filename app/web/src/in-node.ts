@@ -11,11 +11,15 @@ function storage() {
 
 const nothing = () => undefined;
 
+/** Listeners of the window, or of the service worker, by type of event. */
+export const listeners = new Map<string, (event: never) => void>();
+
 Object.assign(globalThis, {
   window: globalThis,
   location: { search: "?site=yard", hash: "", pathname: "/", origin: "http://page" },
   history: { replaceState: nothing, pushState: nothing },
-  addEventListener: nothing,
+  self: globalThis,
+  addEventListener: (type: string, listener: (event: never) => void) => listeners.set(type, listener),
   removeEventListener: nothing,
   localStorage: storage(),
   sessionStorage: storage(),

@@ -110,6 +110,11 @@ export function isAbort(error: unknown): boolean {
   return error instanceof DOMException && error.name === "AbortError";
 }
 
+/** Whether a proxy says that the server does not answer: errors of the server itself are problem documents. */
+export function isOfProxy(status: number, mediaType: string | null): boolean {
+  return [502, 503, 504].includes(status) && !mediaType?.startsWith("application/problem+json");
+}
+
 /** Counts a 401 response, unless a session began after its request was sent. since: `returns` at that time. */
 export function countRefusal(status: number, since: number): void {
   if (status === 401 && returns.peek() === since) unauthenticated.value += 1;
@@ -117,11 +122,11 @@ export function countRefusal(status: number, since: number): void {
 
 async function watchedFetch(input: Request): Promise<Response> {
   const since = returns.peek();
-  let response: Response;
-  try {
-    response = await fetch(input);
-  } catch (error) {
+  const response = await fetch(input).catch((error) => {
     if (isAbort(error)) throw error;
+    return null;
+  });
+  if (!response || isOfProxy(response.status, response.headers.get("content-type"))) {
     online.value = false;
     throw ApiError.offline();
   }

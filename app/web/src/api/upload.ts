@@ -1,5 +1,5 @@
 /** Uploads with progress, which `fetch` does not report. */
-import { ApiError, asProblem, countRefusal, online, returns } from "./client";
+import { ApiError, asProblem, countRefusal, isOfProxy, online, returns } from "./client";
 
 interface SendOptions {
   headers?: Record<string, string>;
@@ -20,11 +20,13 @@ export function sendForm<T>(path: string, form: FormData, { headers, signal, onP
     call.upload.onprogress = ({ loaded, total }) => onProgress?.(total ? loaded / total : 0);
     call.upload.onload = () => onProgress?.(1);
     call.onabort = () => reject(new DOMException("cancelled", "AbortError"));
-    call.onerror = () => {
+    const fail = () => {
       online.value = false;
       reject(ApiError.offline());
     };
+    call.onerror = fail;
     call.onload = () => {
+      if (isOfProxy(call.status, call.getResponseHeader("content-type"))) return fail();
       countRefusal(call.status, since);
       online.value = true;
       if (call.status >= 200 && call.status < 300) resolve(call.response as T);

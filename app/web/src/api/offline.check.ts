@@ -1,0 +1,72 @@
+/** A proxy that answers in the server's place counts as no answer (run by tests/web/test_modules.py). */
+import { listeners, require } from "../in-node";
+import "../../public/service-worker.js";
+import { asApiError, online, request } from "./client";
+
+const ENVIRONMENTS = "http://page/api/v1/environments";
+
+/** What the server or the proxy before it answers; null: the connection fails. */
+let answer: (() => Response) | null = null;
+
+globalThis.fetch = async () => {
+  if (!answer) throw new TypeError("no connection");
+  return answer();
+};
+
+const kept = new Map<string, Response>();
+const cache = {
+  match: async ({ url }: Request) => kept.get(url)?.clone(),
+  put: async ({ url }: Request, response: Response) => void kept.set(url, response),
+  keys: async () => [],
+};
+Object.assign(globalThis, { caches: { open: async () => cache } });
+
+const ofServer = () => new Response("content");
+const ofProxy = () => new Response("", { status: 502 });
+const overloaded = () =>
+  new Response('{"status": 503, "detail": "busy"}', {
+    status: 503,
+    headers: { "content-type": "application/problem+json" },
+  });
+
+/** Asks the service worker. Returns undefined for what it leaves alone. */
+function ask(url: string): Promise<Response> | undefined {
+  let response: Promise<Response> | undefined;
+  const respondWith = (given: Promise<Response>) => {
+    response = given;
+  };
+  listeners.get("fetch")?.({ request: { method: "GET", mode: "cors", url }, respondWith } as never);
+  return response;
+}
+
+async function checkWorker(): Promise<void> {
+  const url = `${ENVIRONMENTS}/yard/versions/latest/layers/topology`;
+  answer = ofServer;
+  await ask(url);
+  while (!kept.has(url)) await new Promise((resolve) => setTimeout(resolve));
+  for (const failing of [null, ofProxy]) {
+    answer = failing;
+    const response = await ask(url);
+    require(response?.headers.get("fleetmap-offline") === "1", `kept is read at ${failing?.name}`);
+    require((await response.text()) === "content", "with its content");
+  }
+  require((await ask(`${url}2`))?.status === 502, "what is not kept is the proxy's error");
+  answer = overloaded;
+  require((await ask(url))?.status === 503, "the server's own error is shown");
+  answer = null;
+  const failure = await ask(`${url}2`)?.catch((error) => error);
+  require(failure instanceof TypeError, "without a connection and what is kept it fails");
+}
+
+async function checkPage(): Promise<void> {
+  const problemOf = async () => asApiError(await request("/api/v1/environments").catch((error) => error));
+  for (const failing of [null, ofProxy]) {
+    answer = failing;
+    require((await problemOf()).isOffline && !online.value, `the server does not answer at ${failing?.name}`);
+    answer = overloaded;
+    require((await problemOf()).status === 503 && online.value, "the server's own error is no silence");
+  }
+}
+
+await checkWorker();
+await checkPage();
