@@ -4,7 +4,7 @@ const SHELL = "shell-1";
 const MAPS = "maps-1";
 const MAX_ENTRIES = 3000;
 const KEPT = /^\/api\/v1\/(session$|environments(\/|$)|robots$|formats$)/;
-const NOT_KEPT = /\/(maps\/[^/]+|sources\/|manifest|reports\/)/;
+const NOT_KEPT = /\/versions\/[^/]+\/(maps\/[^/]+|sources\/|manifest|reports\/)/;
 
 self.addEventListener("install", (event) => {
   event.waitUntil(

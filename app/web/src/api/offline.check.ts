@@ -58,6 +58,17 @@ async function checkWorker(): Promise<void> {
   require(failure instanceof TypeError, "without a connection and what is kept it fails");
 }
 
+/** Maps and files are large, and are not kept; environments may have any name. */
+function checkKept(): void {
+  const isKept = (path: string) => ask(`${ENVIRONMENTS}/${path}`) !== undefined;
+  answer = ofServer;
+  for (const name of ["yard", "maps", "sources", "reports", "manifest-hall"]) {
+    require(isKept(`${name}/versions/latest`), `the environment ${name} is kept`);
+    for (const path of ["maps/kml", "sources/a.pgm", "manifest", "reports/kml"])
+      require(!isKept(`${name}/versions/latest/${path}`), `${path} is not kept`);
+  }
+}
+
 async function checkPage(): Promise<void> {
   const problemOf = async () => asApiError(await request("/api/v1/environments").catch((error) => error));
   for (const failing of [null, ofProxy]) {
@@ -69,4 +80,5 @@ async function checkPage(): Promise<void> {
 }
 
 await checkWorker();
+checkKept();
 await checkPage();
