@@ -342,3 +342,21 @@ def occupied(server: WebServer, site: str) -> int:
         headers={"accept": "application/json"},
     )
     return int(answer.json()["counts"]["occupied"])
+
+
+def test_draft_that_is_left_waits_for_its_user(server: WebServer, edit: Edit) -> None:
+    site = make_network(server, "left", a=(10, 10), b=(20, 10))
+    anna, ben = (server.make_token("editor", name=name)["token"] for name in ("Anna", "Ben"))
+    editing = edit(site, token=anna)
+    page, address = editing.page, editing.page.url
+    editing.tool("Draw lanes")
+    editing.click(12, 18)
+    editing.changes("1 change")
+    expect(page.get_by_text("kept on this device")).to_be_visible()
+    for token, changes in ((ben, "No changes"), (anna, "1 change")):
+        page.get_by_role("button", name="Sign out").click()
+        page.get_by_label("Token").fill(token)
+        page.get_by_role("button", name="Sign in", exact=True).click()
+        expect(page.get_by_role("heading", name="Sites")).to_be_visible()  # not what the last user had open
+        page.goto(address)
+        editing.changes(changes)

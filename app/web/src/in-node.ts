@@ -6,17 +6,27 @@ function storage() {
     getItem: (name: string) => kept.get(name) ?? null,
     setItem: (name: string, value: string) => kept.set(name, value),
     removeItem: (name: string) => kept.delete(name),
+    clear: () => kept.clear(),
   };
 }
 
 const nothing = () => undefined;
+
+/** Addresses that the page has gone to. */
+export const visited: string[] = [];
 
 /** Listeners of the window, or of the service worker, by type of event. */
 export const listeners = new Map<string, (event: never) => void>();
 
 Object.assign(globalThis, {
   window: globalThis,
-  location: { search: "?site=yard", hash: "", pathname: "/", origin: "http://page" },
+  location: {
+    search: "?site=yard",
+    hash: "",
+    pathname: "/",
+    origin: "http://page",
+    assign: (to: string) => visited.push(to),
+  },
   history: { replaceState: nothing, pushState: nothing },
   self: globalThis,
   addEventListener: (type: string, listener: (event: never) => void) => listeners.set(type, listener),

@@ -40,14 +40,19 @@ export async function signIn(credentials: { token: string } | { code: string }):
   return true;
 }
 
-/** Throws if the server cannot end the session: its cookie would sign in whoever comes next. */
+/** Leaves nothing of this user in the page for the next one, and begins anew.
+ *
+ * Throws if the server cannot end the session: its cookie would sign in whoever comes next. */
 export async function signOut(): Promise<void> {
   await ask(api.DELETE("/api/v1/session")).catch((error: unknown) => {
     if (error instanceof ApiError && error.status === 401) return;
     throw new Error(`you are still signed in: ${asApiError(error).message}`);
   });
-  for (const name of await caches.keys().catch(() => [])) await caches.delete(name);
-  session.value = null;
+  session.value = undefined;
+  sessionStorage.clear();
+  // Over plain HTTP from another host browsers have no caches.
+  if ("caches" in window) for (const name of await caches.keys().catch(() => [])) await caches.delete(name);
+  location.assign("/");
 }
 
 /** Whether the user has at least this role. It decides what is shown; the server decides what is allowed. */

@@ -1,11 +1,14 @@
 /** Keeps drafts on the device, command by command, so that a reload, a crash or a lost network costs nothing.
  *
- * Each tab has a draft of its own; the draft of a tab that is gone is taken over by the next one. */
+ * Each tab has a draft of its own; the draft of a tab that is gone is taken over by the next one of the same user. */
+import { session } from "../../session";
 import type { Command } from "./draft";
 
 export interface DraftHead {
   id: string;
   site: string;
+  /** Name of the token of whoever made it; drafts of earlier releases have none. */
+  user?: string;
   /** Version that the draft builds on. */
   version: number;
   position: number;
@@ -82,7 +85,8 @@ export class DraftStore {
       head = undefined;
     }
     for (const candidate of head ? [] : mine) {
-      if (candidate.id !== this.id && !(await this.isAlive(candidate.id))) {
+      const isOurs = candidate.user === undefined || candidate.user === session.peek()?.name;
+      if (isOurs && candidate.id !== this.id && !(await this.isAlive(candidate.id))) {
         head = candidate;
         break;
       }
@@ -96,13 +100,17 @@ export class DraftStore {
   }
 
   /** Stores where the draft is; and its commands from one on, if the log has changed. */
-  save(head: Omit<DraftHead, "id" | "site" | "time">, log: readonly Command[], from: number | null): Promise<void> {
-    const id = this.id;
+  save(
+    head: Omit<DraftHead, "id" | "site" | "user" | "time">,
+    log: readonly Command[],
+    from: number | null,
+  ): Promise<void> {
+    const [id, user] = [this.id, session.peek()?.name];
     const commands = from === null ? [] : log.slice(from);
     return this.enqueue(async () => {
       const db = await database();
       const work = db.transaction(["drafts", "commands"], "readwrite");
-      work.objectStore("drafts").put({ ...head, id, site: this.site, time: Date.now() } satisfies DraftHead);
+      work.objectStore("drafts").put({ ...head, id, site: this.site, user, time: Date.now() } satisfies DraftHead);
       const store = work.objectStore("commands");
       if (from !== null) {
         store.delete(IDBKeyRange.bound([id, from], [id, Number.MAX_SAFE_INTEGER]));
