@@ -263,8 +263,9 @@ def sandbox_policy(settings: Settings) -> SandboxPolicy:
     """Return the sandbox policy of worker processes: access to the database only."""
     if settings.database.startswith("sqlite"):
         file = make_url(settings.database).database
-        # Readers of SQLite's write-ahead log write to a shared-memory file beside the database.
-        return SandboxPolicy(overwrite=(Path(file).resolve().parent,) if file else ())
+        # Readers of SQLite's write-ahead log mark in its shared memory what they read. The server's connections keep
+        # the file; if it is newer than a worker all the same, SQLite there uses the marks of others.
+        return SandboxPolicy(overwrite=(Path(f"{Path(file).resolve()}-shm"),) if file else ())
     return SandboxPolicy(ports=(make_url(settings.database).port or 5432,))
 
 

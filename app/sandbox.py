@@ -1,4 +1,4 @@
-"""Confine a process that parses untrusted files: no programs, no network, writes only to allowed folders.
+"""Confine a process that parses untrusted files: no programs, no network, writes only where it is allowed.
 
 Uses Linux Landlock, which needs no privileges and cannot be undone. On a kernel without it the limits on memory and
 time still apply. Layout of the structures: linux/landlock.h.
@@ -26,8 +26,8 @@ _BIND, _CONNECT = 1 << 0, 1 << 1
 class SandboxPolicy:
     """Permissions of a confined process besides computing and reading.
 
-    scratch: folders with full access. overwrite: folders in which it may write to existing files (SQLite's shared
-    memory beside the database). ports: TCP ports that it may connect to (the database's).
+    scratch: folders with full access. overwrite: existing files that it may write to (SQLite's shared memory). ports:
+    TCP ports that it may connect to (the database's).
     """
 
     scratch: tuple[Path, ...] = ()
@@ -55,8 +55,8 @@ def confine(allowed: SandboxPolicy) -> bool:
     try:
         for folder in (*allowed.scratch, Path(os.devnull)):
             _allow(ruleset, folder, files & ~_EXECUTE)
-        for folder in allowed.overwrite:
-            _allow(ruleset, folder, files & (_WRITE_FILE | _TRUNCATE))
+        for file in allowed.overwrite:
+            _allow(ruleset, file, files & (_WRITE_FILE | _TRUNCATE))
         for port in allowed.ports if network else ():
             _syscall(_ADD, ruleset, _PORT, struct.pack("<QQ", _CONNECT, port), 0)
         ctypes.CDLL(None, use_errno=True).prctl(_NO_NEW_PRIVS, 1, 0, 0, 0)

@@ -302,7 +302,8 @@ def confined(tmp_path: Path) -> Iterator[Pool]:
     (tmp_path / "scratch").mkdir()
     (tmp_path / "database").mkdir()
     (tmp_path / "database" / "a-shm").write_text("old")
-    new_pool = Pool(1, allowed=SandboxPolicy((tmp_path / "scratch",), (tmp_path / "database",), ()))
+    (tmp_path / "database" / "key").write_text("private")
+    new_pool = Pool(1, allowed=SandboxPolicy((tmp_path / "scratch",), (tmp_path / "database" / "a-shm",), ()))
     yield new_pool
     new_pool.close()
 
@@ -313,13 +314,16 @@ needs_landlock = pytest.mark.skipif(
 
 
 @needs_landlock
-def test_confined_worker_writes_only_to_allowed_folders(confined: Pool, tmp_path: Path) -> None:
+def test_confined_worker_writes_only_to_allowed_places(confined: Pool, tmp_path: Path) -> None:
     assert confined.run(work_write, str(tmp_path / "scratch" / "a"), "x") == "x"
     assert confined.run(work_write, str(tmp_path / "database" / "a-shm"), "new") == "new"
     for forbidden in ("database/other", "elsewhere"):
         with pytest.raises(RuntimeError, match="PermissionError"):
             confined.run(work_write, str(tmp_path / forbidden), "x")
         assert not (tmp_path / forbidden).exists()
+    with pytest.raises(RuntimeError, match="PermissionError"):
+        confined.run(work_write, str(tmp_path / "database" / "key"), "x")
+    assert (tmp_path / "database" / "key").read_text() == "private"
 
 
 @needs_landlock

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import zipfile
@@ -13,10 +14,16 @@ import pytest
 import yaml
 from sqlalchemy import update
 
+from app import sandbox
+from app.main import sandbox_policy
+from app.pool import Pool
 from app.store import tables
+from app.store.in_worker import open_store
+from app.store.store import Store
 from tests.api import samples
-from tests.api.conftest import ADMIN, API, Api, parts, problem, running, settings_for
+from tests.api.conftest import ADMIN, API, Api, create_farm, empty_database, parts, problem, running, settings_for
 from tests.events.conftest import eventually
+from tests.test_pool import work_double, work_write
 
 # --- channels ---
 
@@ -505,3 +512,44 @@ def test_settings_reach_the_pool(tmp_path: Path) -> None:
         answer = api.upload("farm", {"n.tmap2.yaml": samples.tmap2()}, expect=413)
         assert "5" in problem(answer)["detail"]
     assert API == "/api/v1"
+
+
+@pytest.mark.skipif(sandbox.landlock_version() < 1, reason="the kernel has no Landlock")
+def test_workers_read_the_live_database_and_write_no_file_of_the_server(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path)) as api:
+        create_farm(api, "farm")
+        services = api.app.state.services
+        names = {p.relative_to(tmp_path).parts[0]: p for p in tmp_path.rglob("*") if p.is_file() and p.stat().st_size}
+        assert {"keys", "blobs", "fleetmap.sqlite3", "fleetmap.sqlite3-wal"} <= names.keys()
+        for path in names.values():
+            if path.name.endswith("-shm"):
+                continue
+            before = path.read_bytes()
+            with pytest.raises(RuntimeError, match="PermissionError"):
+                services.pool.run(work_write, str(path), "x")
+            assert path.read_bytes() == before
+
+
+def head_of(url: str, blob_dir: str, environment: str) -> int:
+    """Run in a worker."""
+    return open_store(url, blob_dir).environments.get(environment).head
+
+
+@pytest.mark.skipif(sandbox.landlock_version() < 1, reason="the kernel has no Landlock")
+def test_worker_reads_a_database_whose_shared_memory_is_newer_than_the_worker(tmp_path: Path) -> None:
+    """SQLite removes the file when the last connection closes. A worker may write to the file it started with only."""
+    settings = settings_for(tmp_path)
+    file, blob_dir = tmp_path / "fleetmap.sqlite3", str(settings.blob_dir)
+    file.write_bytes(empty_database())
+    pool = Pool(1, allowed=sandbox_policy(settings))
+    try:
+        assert pool.run(work_double, 1) == 2, "it runs, confined"
+        assert not Path(f"{file}-shm").exists()
+        with contextlib.closing(Store(settings.database, settings.blob_dir)) as store:
+            for name in ("a", "b", "c"):
+                store.environments.create(name)
+                assert pool.run(head_of, settings.database, blob_dir, name) == 0
+            with pytest.raises(RuntimeError, match="PermissionError"):
+                pool.run(work_write, f"{file}-shm", "x")
+    finally:
+        pool.close()
