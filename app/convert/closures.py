@@ -109,6 +109,8 @@ def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dic
     out: dict[str, Any] = {}
     if closures.items and (network or masked):
         out["closures"] = closures.digest
+        if fmt.traits.is_container:
+            out["masks"] = "closed"  # caches may have packages whose masks lack the closed areas
     if network and closures.mode != "apply":
         out["closure_mode"] = closures.mode
     return out
@@ -238,13 +240,15 @@ class ClosureReport:
     """Effects of closures on one map.
 
     lines: one for each closure with an effect. omitted: number of removed edges. kept: number of blocked edges that
-    stay in a format that cannot mark them. emptied: whether no edge would have been left.
+    stay in a format that cannot mark them. emptied: whether no edge would have been left. unmasked: levels of a
+    container that have grids and closed areas, but no keepout mask.
     """
 
     lines: list[ClosureLine] = field(default_factory=list)
     omitted: int = 0
     kept: int = 0
     emptied: bool = False
+    unmasked: list[str] = field(default_factory=list)
 
 
 def close(
@@ -264,13 +268,8 @@ def close(
     for key, part in layers.parts.items():
         if isinstance(part, Features) and key.layer == "topology":
             parts[key] = _close_edges(key, part, items, layers.frame, mark=mark, effects=effects, report=report)
-        elif isinstance(part, OccupancyGrid) and _may_be_keepout(key) and masks.is_keepout(key.name, part.properties):
-            areas = [c for c in items if c.polygon is not None and c.level == key.level]
-            complete = True
-            if key not in drawn and areas:
-                parts[key], complete = _burn(part, areas, layers.frame)
-            for area in areas:
-                effects[area.id].note_cells(complete=complete)
+        elif isinstance(part, OccupancyGrid):
+            parts[key] = _close_mask(key, part, items, layers.frame, drawn=key in drawn, effects=effects)
         elif isinstance(part, Features) and key.layer == "zones":
             for overlay_id in (zones[i] for i in part.ids if i in zones):
                 effects[overlay_id].zone = True
@@ -280,6 +279,20 @@ def close(
         )
     report.lines = [line(c, effects[c.id], mark=mark) for c in items if effects[c.id].text(mark=mark) != NO_EFFECT]
     return replace(layers, parts=parts), report
+
+
+def close_masks(layers: Layers, closures: Closures | None) -> tuple[Layers, ClosureReport]:
+    """Apply closed areas to the keepout masks of a container, which writes grids under other names."""
+    items = () if closures is None else closures.items
+    effects = {closure.id: _Effect() for closure in items}
+    grids = {key: part for key, part in layers.parts.items() if isinstance(part, OccupancyGrid)}
+    closed = {
+        key: _close_mask(key, grid, items, layers.frame, drawn=False, effects=effects) for key, grid in grids.items()
+    }
+    unmasked = {c.level for c in items if c.polygon is not None and not effects[c.id].cells}
+    report = ClosureReport([line(c, effects[c.id]) for c in items if effects[c.id].cells])
+    report.unmasked = sorted(unmasked & {key.level for key in grids})
+    return replace(layers, parts={**layers.parts, **closed}), report
 
 
 @dataclass(slots=True)
@@ -411,6 +424,25 @@ def _area_in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
 def _may_be_keepout(key: PartKey) -> bool:
     """Return whether a part can be a keepout mask by its name: recipes are planned without the grids' properties."""
     return key.layer == "occupancy" and key.name != MAP and key.name not in masks.MASKS - masks.KEEPOUT_MASKS
+
+
+def _close_mask(
+    key: PartKey,
+    grid: OccupancyGrid,
+    items: Sequence[Closure],
+    frame: LocalFrame | None,
+    *,
+    drawn: bool,
+    effects: Mapping[str, _Effect],
+) -> OccupancyGrid:
+    """Draw the closed areas of its level in a grid, if it is a keepout mask. drawn: it contains them already."""
+    areas = [c for c in items if c.polygon is not None and c.level == key.level]
+    if not areas or not _may_be_keepout(key) or not masks.is_keepout(key.name, grid.properties):
+        return grid
+    grid, complete = (grid, True) if drawn else _burn(grid, areas, frame)
+    for area in areas:
+        effects[area.id].note_cells(complete=complete)
+    return grid
 
 
 def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | None) -> tuple[OccupancyGrid, bool]:

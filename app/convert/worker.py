@@ -209,8 +209,9 @@ def _write_one(
         context.make = partial(_inner, source, inner, inner_closures)
     chosen = fmt.selection.choose(sorted(k for k in derived_layers.parts if k.layer in fmt.layers), context.options)
     used = Layers({k: derived_layers.parts[k] for k in chosen}, derived_layers.datum, derived_layers.levels)
-    closed = applied_closures.ClosureReport()
-    if not fmt.traits.is_container:  # nested maps apply closures themselves
+    if fmt.traits.is_container:  # nested maps apply the other closures themselves
+        used, closed = applied_closures.close_masks(used, closures)
+    else:
         drawn = derived_layers.parts.keys() - layers.parts.keys()
         applied, closed = applied_closures.close(fmt, used, closures, drawn)
         if closed.emptied and _has_no_edges(fmt, applied):
@@ -219,8 +220,8 @@ def _write_one(
     lines = _report_layers(used, layers, chain, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(all_credits(lines)))  # sorted: equal content gives equal bytes
     files = formats.write(fmt, used, context)
-    _report_blocked_edges(fmt, closed, context)
-    if not fmt.traits.is_container:  # as above
+    _report_closures(fmt, closed, context)
+    if not fmt.traits.is_container:  # nested maps check their edges themselves
         context.warnings += crossing_edges(
             fmt, used, replace(derived_layers, parts={**source.around.parts, **derived_layers.parts})
         )
@@ -250,13 +251,18 @@ def _has_no_edges(fmt: Format, layers: Layers) -> bool:
     return fmt.needs.missing_content is not None and fmt.needs.missing_content(layers) is not None
 
 
-def _report_blocked_edges(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
-    """Report blocked edges: omitted ones, and those that planners can still use."""
+def _report_closures(fmt: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
+    """Report blocked edges, omitted ones and those that planners can still use, and areas that no mask contains."""
     context.drop("blocked edges", closed.omitted, f"{fmt.name} cannot mark an edge as blocked for its planners")
     if closed.kept:
         edges = "1 blocked edge stays" if closed.kept == 1 else f"{closed.kept} blocked edges stay"
         why = "requested with closures=mark, or no edge would be left"
         context.warn(f"{edges} in this map ({why}); planners of {fmt.name} use them unless closed otherwise")
+    for level in closed.unmasked:
+        context.warn(
+            f"no grid of this package contains the closed areas of the level {level!r}, which has no stored keepout "
+            "mask: get keepout.yaml of occupancy_grid"
+        )
 
 
 def from_layers(

@@ -392,6 +392,35 @@ def test_environment_package_report_lists_effects_of_closures(api: Api, farm: st
     assert (line["id"], line["edges"]) == (closure["id"], ["gate_barn"])
 
 
+@pytest.mark.parametrize("name", ["keepout", "nogo"])
+def test_environment_package_has_closed_areas_in_its_masks(api: Api, farm: str, name: str) -> None:
+    api.upload(farm, samples.grid(name), grid=name)
+    before = package(api, farm)[f"config/metric/{name}/map.pgm"]
+    closure = close(api, farm, polygon=SQUARE, crs="local")
+    after = package(api, farm)[f"config/metric/{name}/map.pgm"]
+    assert after == api.get(f"/maps/{farm}/occupancy_grid/{name}.pgm").content
+    assert (pgm(after) == 0).sum() > (pgm(before) == 0).sum()
+    report = api.get(f"environments/{farm}/versions/latest/reports/environment").json()
+    (line,) = report["closures"]
+    assert line["id"] == closure["id"]
+    assert "keepout cells" in line["effect"].split(", ")
+    assert not [w for w in report["warnings"] if "keepout" in w["problem"]]
+
+
+def test_environment_package_without_a_mask_says_so(api: Api, farm: str) -> None:
+    place = f"environments/{farm}/versions/latest/reports/environment"
+    before = api.get(place).json()["warnings"]
+    close(api, farm, polygon=SQUARE, crs="local")
+    (warning,) = [w for w in api.get(place).json()["warnings"] if w not in before]
+    assert "no grid of this package contains the closed areas of the level 'ground'" in warning["problem"]
+
+
+def package(api: Api, env: str) -> dict[str, bytes]:
+    """Return the files of the environment package."""
+    archive = zipfile.ZipFile(BytesIO(api.get(f"/maps/{env}/environment").content))
+    return {name: archive.read(name) for name in archive.namelist()}
+
+
 def test_large_area_keeps_the_mask_of_a_site_without_a_map(api: Api, bare: str) -> None:
     ring = [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
     zone = {"type": "Feature", "id": "z", "properties": {"kind": "keepout"},
