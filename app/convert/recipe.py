@@ -220,9 +220,10 @@ def _pinned_layers(version: Version, entries: Sequence[PartEntry]) -> dict[Layer
     """Find the layers whose parts are all derived and stale: they are derived again with the same steps.
 
     Layers with edited or uploaded parts stay as they are (the version lists them as stale), and so do names that a
-    derivation takes over from the parts that it replaces: only to store its result brings new ones.
+    derivation takes over from the parts that it replaces: only to store its result brings new ones. Closed areas make
+    nothing stale: they are applied to what is stored.
     """
-    stale = version.stale
+    stale = applied_closures.drop_areas(version).stale
     derivations = derive.all_derivations()
     out: dict[Layer, Mapping[str, Mapping[str, Any]]] = {}
     for layer in {key.layer for key in stale}:

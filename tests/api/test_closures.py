@@ -325,6 +325,39 @@ def test_closing_the_last_edge_marks_it_where_a_graph_must_have_one(api: Api, fr
     api.get(f"environments/{env}/versions/latest/manifest?formats=nav2_route,tmap2,rmf_nav_graph")
 
 
+def test_closed_area_leaves_a_stored_derived_network_as_it_is(api: Api, fresh: Any) -> None:
+    """Zones are among its inputs, and closed areas are zones of maps; it is not derived again for them."""
+    env = fresh()
+    api.post("environments", {"name": env})
+    api.upload(env, samples.grid(width=40, height=40))
+    api.post(f"environments/{env}/derivations", {"method": "occupancy_to_topology"})
+    place = f"environments/{env}/versions/latest/maps/tmap2?derive=false"
+    before = api.get(place).text
+    assert edges(before)
+    ring = [[900, 900], [901, 900], [901, 901], [900, 900]]
+    close(api, env, polygon={"type": "Polygon", "coordinates": [ring]}, crs="local")
+    assert api.get(place).text == before
+    report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
+    assert [line["information"] for line in report["layers"] if line["layer"] == "topology"] == ["derived"]
+    assert api.get(f"/maps/{env}/tmap2").text == before
+
+
+def test_stored_derived_mask_gets_closed_areas(api: Api, farm: str) -> None:
+    zone = {"type": "Feature", "id": "z", "properties": {"kind": "keepout"},
+            "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}}  # fmt: skip
+    put = {"op": "put", "layer": "zones", "crs": "local", "feature": zone}
+    api.post(f"environments/{farm}/edits", {"changes": [put]})
+    api.post(f"environments/{farm}/derivations", {"method": "zones_to_occupancy"})
+    mask = f"/maps/{farm}/occupancy_grid/keepout.pgm"
+    before = pgm(api.get(mask).content)
+    ring = [[0, -1], [2, -1], [2, -0.5], [0, -1]]
+    close(api, farm, polygon={"type": "Polygon", "coordinates": [ring]}, crs="local")
+    after = pgm(api.get(mask).content)
+    assert after.shape == before.shape
+    assert (after[before == 0] == 0).all()
+    assert (after == 0).sum() > (before == 0).sum()
+
+
 def test_reports_name_the_closures_of_their_own_environment(api: Api, farm: str, fresh: Any) -> None:
     """Maps are cached by content, and closures often change none of their bytes."""
     other = fresh()
