@@ -207,7 +207,9 @@ def _list_response(services: Services, env: str, request: Request, robots: bool)
 
 
 @router.put(
-    "/{channel}", responses=problem_responses(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan a move"
+    "/{channel}",
+    responses=problem_responses(ChannelOut, 400, 404, 409, 415),
+    summary="Promote, roll back, or plan a move",
 )
 def move_channel(
     env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, services: ServicesDep, principal: Editor
@@ -220,7 +222,8 @@ def move_channel(
     and report `ready`. The channel moves when the share `ready` of its online robots has the version, but not before
     `activate_at`. If the share `failed` reports `failed` before the move, the move is cancelled. If it does within
     `window` seconds after the move, the channel moves back, with a higher sequence and `rollback: true`. The move is
-    also cancelled at `deadline`.
+    also cancelled at `deadline`. While robots are watched after the move, no other move can be planned (409); a move at
+    once ends the watch.
     """
     if channel == LATEST:
         raise Invalid(

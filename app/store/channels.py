@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, bindparam, insert, select, update
 
-from app.errors import Invalid, NotFound
+from app.errors import Conflict, Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
 from app.store.base import CHANNEL_NAME, checked_text, environment_row, nearest_channel
@@ -139,7 +139,10 @@ class Channels:
 
         Args:
             activate_at: time of the planned move, aware.
-            rollout: makes it a two-stage rollout; its version and root are set here. Any open rollout ends.
+            rollout: makes it a two-stage rollout; its version and root are set here.
+
+        A move at once ends any open rollout; a plan replaces one that still waits. Raises Conflict if a move is planned
+        while robots are watched: the plan would end the watch unnoticed.
 
         The event has ``rollback: true`` if the version is lower than the channel's. Moving a channel to its current
         version changes nothing except that a plan is cancelled, with its event. ``latest`` cannot be moved.
@@ -387,6 +390,10 @@ def _plan(write: _ChannelWrite, number: int, author: str, at: datetime | None, r
     before = None
     if channel_row is not None and channel_row.version is not None:
         before = write.read_version(channel_row.version)
+    if channel_row is not None and channel_row.rollout_state == "watching":
+        watched = Rollout.from_row(channel_row.rollout)
+        until = "" if watched.moved is None else f" until {rfc3339(watched.moved + timedelta(seconds=watched.window))}"
+        raise Conflict(f"version {watched.version} is watched for failures{until}: plan after that, or move now")
     if rollout is not None:
         rollout = _with_prior_failures(write, rollout)
     plan: dict[str, Any] = {"planned_version": number, "planned_at": at, "planned_author": author}

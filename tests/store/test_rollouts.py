@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -9,11 +10,13 @@ from typing import Any
 import pytest
 from sqlalchemy import event, text
 
+from app.errors import Conflict
 from app.fleet import next_step
 from app.store import rollout_robots
 from app.store.changes import Replace
 from app.store.fleet_values import Channel, FailedRobot, OnlineCounts, ReceivedReport, RobotReport, Rollout
 from app.store.store import Store
+from app.store.values import rfc3339
 from tests.store.samples import GRID, grid, save
 
 
@@ -260,6 +263,20 @@ def test_another_move_ends_rollout(fleet: Fleet):
     fleet.store.channels.move("farm", "production", 1, author="ann", activate_at=fleet.at(10))
     assert fleet.tick(9) == (3, "")
     assert fleet.tick(10) == (1, "")
+
+
+@pytest.mark.parametrize("stage", [None, {"ready": 1.0}])
+def test_planning_another_move_does_not_end_the_watch(fleet: Fleet, stage: dict[str, Any] | None):
+    fleet.report("a", 1, "active")
+    moved = fleet.roll(failed=0.1, window=60.0)
+    rollout = None if stage is None else Rollout(0, "", fleet.start, **stage)
+    with pytest.raises(Conflict, match=re.escape(f"version 2 is watched for failures until {rfc3339(fleet.at(60))}")):
+        fleet.store.channels.move("farm", "production", 3, author="ann", activate_at=fleet.at(900), rollout=rollout)
+    assert fleet.channel() == moved
+    fleet.report("a", 2, "failed", 2)
+    assert fleet.tick(3) == (1, "rolled_back")
+    fleet.store.channels.move("farm", "production", 3, author="ann", activate_at=fleet.at(900), rollout=rollout)
+    assert fleet.channel().planned is not None
 
 
 def test_first_move_has_no_version_to_move_back_to(fleet: Fleet):
