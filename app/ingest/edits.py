@@ -116,42 +116,59 @@ class _Session:
         A lift's edge may end in another level's network. Edges that dangled before are not listed: the upload that
         brought them warned about them.
         """
-        out = []
-        for key, draft in list(self._drafts.items()):
-            if key.layer != "topology":
-                continue
-            put = {i for i, (_, p, _) in draft.puts.items() if p.get("kind") == "edge"}
-            cut = {i for node in draft.deletes for i in draft.connected_edges(node) if draft.has_item(i)}
-            ends = (draft.row(i)[1].get(end) for i in put | cut for end in ("source", "target"))
+        out: list[Problem] = []
+        if not any(key.layer == "topology" for key in self._drafts):
+            return out
+        networks = self._networks()
+        gone = {
+            i
+            for draft in networks
+            for i in draft.deletes | _put_edges(draft)
+            if self._network_of(draft, i, stored=True) is not None
+        }
+        for draft in networks:
+            cut = {i for node in gone for i in draft.connected_edges(node) if draft.has_item(i)}
+            edges = _put_edges(draft) | cut
+            ends = (draft.row(i)[1].get(end) for i in edges for end in ("source", "target"))
             draft.read(end for end in ends if isinstance(end, str))
-            for item in sorted(put | cut):
+            for item in sorted(edges):
                 properties = draft.row(item)[1]
                 if properties.get("kind") != "edge":
                     continue
                 for end in ("source", "target"):
                     node = properties.get(end)
-                    if not self._is_node(draft, node) and not (
-                        item in put and self._was_dangling(draft, item, end, node)
-                    ):
+                    if self._network_of(draft, node) is None and not self._was_dangling(draft, item, end, node):
                         problem = f"{end} {node!r} of edge {item} is not a node: put the node or delete the edge"
                         out.append(Problem(problem, where=item))
         return out
 
-    def _is_node(self, draft: EditedPart, item: Any) -> bool:
-        """Return whether this network, or that of another level, has a node with this id."""
-        if not isinstance(item, str):
-            return False
-        if draft.has_item(item):
-            return draft.row(item)[1].get("kind") == "node"
-        networks = [key for key in sorted({*self._keys, *self._drafts}) if key.layer == "topology"]
-        return any(
-            self._draft(key).has_item(item) and self._draft(key).row(item)[1].get("kind") == "node" for key in networks
-        )
+    def _networks(self) -> list[EditedPart]:
+        """Return the networks of all levels."""
+        return [self._draft(key) for key in sorted({*self._keys, *self._drafts}) if key.layer == "topology"]
 
-    @staticmethod
-    def _was_dangling(draft: EditedPart, item: str, end: str, node: Any) -> bool:
+    def _network_of(self, draft: EditedPart, item: Any, *, stored: bool = False) -> EditedPart | None:
+        """Return the network with the node that an edge of ``draft`` names; None if it is not a node.
+
+        It is the edge's own if that has the id, else that of another level. stored: as it was before these edits.
+        """
+        if not isinstance(item, str):
+            return None
+        for network in (draft, *self._networks()):
+            if network.is_stored(item) if stored else network.has_item(item):
+                row = network.before(item) if stored else network.row(item)
+                if row[1].get("kind") == "node":
+                    return network
+                if network is draft:
+                    return None
+        return None
+
+    def _was_dangling(self, draft: EditedPart, item: str, end: str, node: Any) -> bool:
         """Return whether the stored edge had this dangling end before these edits."""
-        return draft.is_stored(item) and draft.before(item)[1].get(end) == node and node not in draft.deletes
+        return (
+            draft.is_stored(item)
+            and draft.before(item)[1].get(end) == node
+            and self._network_of(draft, node, stored=True) is None
+        )
 
     def loosen(self) -> None:
         """Unlink network features from the drawn line they were read from if either was edited.
@@ -303,14 +320,15 @@ class _Session:
         """Move the ends of connected edges with a moved node, unless these edits put the edge itself."""
         if before[0].equals_exact(now[0], 0.0):
             return
-        for item in draft.connected_edges(node):
-            if item in draft.deletes or (item in draft.puts and item not in draft.dragged):
+        edges = [(network, item) for network in self._networks() for item in network.connected_edges(node)]
+        for network, item in edges:
+            if item in network.deletes or (item in network.puts and item not in network.dragged):
                 continue
-            line, properties, local = draft.row(item)  # its other end may have been dragged before
+            line, properties, local = network.row(item)  # its other end may have been dragged before
+            if line.geom_type != "LineString" or self._network_of(network, node) is not draft:
+                continue
             place = now[0] if now[1] == local else self._other(now[0], now[1])
-            if line.geom_type != "LineString":
-                continue
-            draft.dragged.add(item)
+            network.dragged.add(item)
             vertices = shapely.get_coordinates(line, include_z=line.has_z)
             target = shapely.get_coordinates(place, include_z=bool(line.has_z))[0]
             target = np.nan_to_num(target, nan=0.0)
@@ -318,7 +336,7 @@ class _Session:
                 vertices[0] = target
             if properties.get("target") == node:
                 vertices[-1] = target
-            draft.puts[item] = (shapely.LineString(vertices), properties, local)
+            network.puts[item] = (shapely.LineString(vertices), properties, local)
 
     def _apply_delete(self, change: Mapping[str, Any]) -> None:
         layer, item = self._layer(change), change.get("id")
@@ -412,6 +430,10 @@ class _Session:
         if name is None and len(by_name["map"]) == 1:
             return by_name["map"][0]
         raise Invalid(f"several grids match ({', '.join(k.name for k in fitting)}): name one with 'grid' (and 'level')")
+
+
+def _put_edges(draft: EditedPart) -> set[str]:
+    return {i for i, (_, properties, _) in draft.puts.items() if properties.get("kind") == "edge"}
 
 
 def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[np.bool_]]:

@@ -189,6 +189,10 @@ def edge(name: str, source: str, target: str, level: str | None = "ground", **pr
     return change if level is None else {**change, "level": level}
 
 
+def delete(item: str) -> Json:
+    return {"op": "delete", "layer": "topology", "id": item}
+
+
 @pytest.fixture
 def storeys(api: Api, bare: str) -> str:
     """Create an environment with networks on two levels. A lift leads from one to the other; both have a `door`."""
@@ -201,3 +205,39 @@ def storeys(api: Api, bare: str) -> str:
 def test_edge_to_another_level_is_edited_on_its_level(api: Api, storeys: str) -> None:
     edit(api, storeys, edge("lift", "hall", "loft", action="lift"))
     assert features(api, storeys, "topology")["lift"]["properties"]["action"] == "lift"
+
+
+def test_edge_of_another_level_follows_its_node(api: Api, storeys: str) -> None:
+    edit(api, storeys, node("loft", 3, 4, "upper"))
+    places = {i: f["place"]["coordinates"] for i, f in features(api, storeys, "topology", crs="local").items()}
+    assert places["lift"] == [[0, 0], [3, 4]]
+    edit(api, storeys, node("door", 7, 7, "upper"))
+    places = {i: f["place"]["coordinates"] for i, f in features(api, storeys, "topology", crs="local").items()}
+    assert places["walk"] == [[0, 0], [1, 1]], "it ends at the door of its own level"
+    assert places["way"] == [[3, 4], [7, 7]]
+
+
+@pytest.mark.parametrize(
+    ("change", "cut"),
+    [
+        (delete("loft"), {"lift", "way"}),
+        (delete("hall"), {"lift", "walk"}),
+        (edge("loft", "hall", "hall", "upper"), {"lift", "way"}),
+        (edge("hall", "door", "door"), {"lift", "walk"}),
+        (edge("loft", "door", "door"), {"lift"}),
+    ],
+)
+def test_edges_of_all_levels_keep_their_nodes(api: Api, storeys: str, change: Json, cut: set[str]) -> None:
+    """A node is neither deleted nor becomes an edge while an edge of any level ends there."""
+    answer = api.problem("POST", f"environments/{storeys}/edits", 422, json={"changes": [change]})
+    assert {problem["where"] for problem in answer["errors"]} == cut
+    with_edges = [change, *(delete(item) for item in cut)]
+    edit(api, storeys, *with_edges)
+
+
+def test_edge_that_dangled_before_hinders_no_edit(api: Api, bare: str) -> None:
+    """An upload may leave an edge without a node; edits of its other end, and of other nodes, are not about it."""
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"), ("barn", "moon")))})
+    edit(api, bare, node("barn", 11, 1), delete("field"))
+    answer = api.problem("POST", f"environments/{bare}/edits", 422, json={"changes": [delete("barn")]})
+    assert {problem["where"] for problem in answer["errors"]} == {"gate_barn"}
