@@ -6,7 +6,7 @@ conflict. Ends of edges are compared on their own, since they follow nodes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, NamedTuple
 
@@ -98,14 +98,18 @@ def merge(
     merged: dict[PartKey, _PartMerge] = {}
     their_features = {delta.key: delta for delta in theirs.features}
     our_features = {delta.key: delta for delta in ours.features}
-    for key in sorted(our_features):
-        part = _PartMerge(work, key, _side(our_features[key]), _side(their_features.get(key)))
+    keys = set(our_features)
+    if any(key.layer == "topology" for key in keys):  # edges of a lift end at nodes of another level
+        keys |= {key for key in their_features if key.layer == "topology"}
+    for key in sorted(keys):
+        part = _PartMerge(work, key, _side(our_features.get(key)), _side(their_features.get(key)))
         part.merge_items()
         merged[key] = part
-    for part in merged.values():
-        if part.key.layer == "topology":
-            part.tie_ends(datum)
-            part.check_ends(merged)
+    networks = [part for part in merged.values() if part.key.layer == "topology"]
+    for part in networks:
+        part.tie_ends(networks, datum)
+    for part in networks:
+        part.check_ends(networks)
     their_grids = {delta.key: delta for delta in theirs.grids}
     replaced = [work.merge_grid(delta, their_grids.get(delta.key)) for delta in ours.grids]
     operations: list[Operation] = [operation for part in merged.values() for operation in part.operations()]
@@ -150,6 +154,12 @@ class _Merge:
         place = PartKey("location", "ground", "site")
         reason = f"the draft and version {self.head.number} set different datums"
         return ours if self.takes_draft(place, None, ["datum"], reason) else theirs
+
+    def has_unchanged_node(self, item: str, changed: Collection[PartKey]) -> bool:
+        """Return whether a network of the head, beside the changed ones, has a node with this id."""
+        keys = [e.key for e in self.head.parts if e.key.layer == "topology" and e.key not in changed]
+        rows = [_rows(self.store.content.features(self.head, key, ids=[item])).get(item) for key in keys]
+        return any(row is not None and not row.is_edge for row in rows)
 
     def merge_grid(self, ours: GridDelta, theirs: GridDelta | None) -> Replace | None:
         """Merge the cells of a grid; None to keep those of the head."""
@@ -240,9 +250,10 @@ class _PartMerge:
             self._work.refuse(self.key, item, fields, reason)
         self.put[item] = _Row(shape[0], properties, shape[1])
 
-    def tie_ends(self, datum: Datum | None) -> None:
+    def tie_ends(self, networks: Sequence[_PartMerge], datum: Datum | None) -> None:
         """Move ends of one side's edges to the nodes that the other side moved."""
-        ours, theirs = self._moved(self._ours), self._moved(self._theirs)
+        ours = {network.key: network.moved_nodes(network._ours) for network in networks}
+        theirs = {network.key: network.moved_nodes(network._theirs) for network in networks}
         candidates = [(i, row, theirs) for i, row in self._ours.put.items() if row.is_edge and i in self.put]
         candidates += [(i, row, ours) for i, row in self._theirs.put.items() if row.is_edge and i not in self.deleted]
         for item, _, moved in candidates:
@@ -252,19 +263,23 @@ class _PartMerge:
             vertices = shapely.get_coordinates(row.geometry, include_z=row.geometry.has_z)
             tied = vertices.copy()
             for end, k in (("source", 0), ("target", -1)):
-                node = self.row(str(row.properties.get(end)))
-                if row.properties.get(end) in moved and node is not None:
+                name = str(row.properties.get(end))
+                network = self._network_of(name, networks)
+                node = None if network is None or name not in moved[network.key] else network.row(name)
+                if node is not None:
                     place = shapely.get_coordinates(_in_anchor(node, row.local, datum))[0]
                     tied[k, :2] = place
             if not np.array_equal(vertices, tied, equal_nan=True):
                 self.put[item] = row._replace(geometry=shapely.LineString(tied))
 
-    def check_ends(self, networks: Mapping[PartKey, _PartMerge]) -> None:
-        """Note edges that would lose a node which the other side deleted."""
+    def check_ends(self, networks: Sequence[_PartMerge]) -> None:
+        """Note edges that would lose a node which the other side deleted, or made an edge, on any level."""
+        ours = {node for network in networks for node in network.lost_nodes(network._ours)}
+        theirs = {node for network in networks for node in network.lost_nodes(network._theirs)}
         for item, row in self.put.items():
             for end in ("source", "target") if row.is_edge else ():
                 node = row.properties.get(end)
-                if node in self._theirs.deleted and not self._has_node(node, networks):
+                if node in theirs and not self._has_node(node, networks):
                     reason = (
                         f"version {self._work.head.number} deleted its {end} {node!r}: delete the edge from the draft, "
                         "or put the node into it"
@@ -274,10 +289,11 @@ class _PartMerge:
             if not row.is_edge or item in self.deleted or item in self.put:
                 continue
             for end in ("source", "target"):
-                if row.properties.get(end) in self.deleted:
+                node = row.properties.get(end)
+                if node in ours and not self._has_node(node, networks):
                     reason = (
-                        f"the draft deleted its {end} {row.properties[end]!r}, which version {self._work.head.number} "
-                        "connects: put the node back into the draft"
+                        f"the draft deleted its {end} {node!r}, which version {self._work.head.number} connects: put "
+                        "the node back into the draft"
                     )
                     self._work.refuse(self.key, item, [end], reason)
 
@@ -301,17 +317,34 @@ class _PartMerge:
             features = Features(tuple(self.put), geometry, properties, local)
             yield Put(self.key, features, entry.provenance.with_edit_step())
 
-    def _has_node(self, item: Any, networks: Mapping[PartKey, _PartMerge]) -> bool:
-        rows = [part.row(item) for part in networks.values() if part.key.layer == "topology"]
-        return any(row is not None and not row.is_edge for row in rows)
+    def _has_node(self, item: str, networks: Sequence[_PartMerge]) -> bool:
+        """Return whether an edge of this network may name a node."""
+        if self._network_of(item, networks) is not None:
+            return True
+        return self.row(item) is None and self._work.has_unchanged_node(item, {n.key for n in networks})
 
-    def _moved(self, side: _Side) -> set[str]:
+    def _network_of(self, item: str, networks: Sequence[_PartMerge]) -> _PartMerge | None:
+        """Return the merged network with the node that an edge of this one names: its own, else another level's."""
+        for network in (self, *networks):
+            row = network.row(item)
+            if row is not None and not row.is_edge:
+                return network
+            if row is not None and network is self:
+                return None
+        return None
+
+    def moved_nodes(self, side: _Side) -> set[str]:
         """Return the nodes that a side moved."""
         return {
             i
             for i, row in side.put.items()
             if not row.is_edge and i in self._base and not _is_same_shape(row, self._base[i])
         }
+
+    def lost_nodes(self, side: _Side) -> set[str]:
+        """Return the nodes that a side deleted, or replaced with edges of the same ids."""
+        lost = {*side.deleted, *(i for i, row in side.put.items() if row.is_edge)}
+        return {i for i in lost if i in self._base and not self._base[i].is_edge}
 
     def _read(self, version: Version, ids: Sequence[str] | None) -> dict[str, _Row]:
         if version.part(self.key) is None:

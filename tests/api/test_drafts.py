@@ -261,3 +261,61 @@ def test_unknown_draft_is_told(api: Api, farm: str, fresh: Any) -> None:
         assert "has no draft" in api.problem("GET", f"environments/{env}/versions/draft:{name}/layers", 404)["detail"]
     api.problem("GET", f"environments/{farm}/drafts/mine", 422)
     assert "name" in api.problem("POST", f"environments/{farm}/drafts", 422, json={"name": "a\nb"})["detail"]
+
+
+def on_level(change: Json, level: str) -> Json:
+    return {**change, "level": level}
+
+
+def lift(source: str, target: str) -> Json:
+    """Put an edge to another level's node; it is stored on the ground."""
+    change = on_level(edge(source, target, action="lift"), "ground")
+    change["feature"]["place"] = {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}
+    return change
+
+
+@pytest.fixture
+def storeys(api: Api, farm: str) -> Iterator[Desk]:
+    """A draft of an environment with a second network, on level `upper`, and a third, on `top`."""
+    changes = [on_level(node(name, x, 1), "upper") for name, x in (("loft", 1), ("attic", 5), ("roof", 9))]
+    changes += [on_level(node("roof", 9, 1), "top"), on_level(node("mast", 9, 2), "top")]
+    api.post(f"environments/{farm}/edits", {"changes": changes})
+    return Desk(api, farm, name="lifts")
+
+
+def becomes_edge(name: str) -> Json:
+    change = on_level(edge("attic", "attic"), "upper")
+    change["feature"] |= {"id": name, "place": {"type": "LineString", "coordinates": [[5, 1], [5, 1]]}}
+    return change
+
+
+@pytest.mark.parametrize("removal", [delete("loft"), becomes_edge("loft")])
+@pytest.mark.parametrize("removes", ["draft", "head"])
+def test_edge_to_another_level_keeps_its_node(storeys: Desk, removal: Json, removes: str) -> None:
+    """One side deletes a node, or makes it an edge, to which the other leads a lift from a level of its own."""
+    changes = {removes: removal, "head" if removes == "draft" else "draft": lift("gate", "loft")}
+    storeys.edit(changes["draft"])
+    edit_head(storeys, changes["head"])
+    for body in ({}, {"prefer": "draft"}, {"prefer": "head"}):
+        (conflict,) = storeys.rebase(409, **body)["conflicts"]
+        assert (conflict["level"], conflict["id"], conflict["fields"]) == ("ground", "gate_loft", ["target"])
+        assert ("the draft deleted" in conflict["reason"]) == (removes == "draft")
+    storeys.edit(on_level(node("loft", 1, 1), "upper") if removes == "draft" else delete("gate_loft"))
+    storeys.rebase()
+
+
+@pytest.mark.parametrize("moves", ["draft", "head"])
+def test_edge_to_another_level_is_tied_to_its_moved_node(storeys: Desk, moves: str) -> None:
+    changes = {moves: on_level(node("loft", 3, 4), "upper")}
+    changes["head" if moves == "draft" else "draft"] = lift("gate", "loft")
+    storeys.edit(changes["draft"])
+    edit_head(storeys, changes["head"])
+    storeys.rebase()
+    assert storeys.features()["gate_loft"]["place"]["coordinates"] == [[0, 0], pytest.approx([3, 4])]
+
+
+def test_node_of_an_unchanged_level_takes_the_place_of_a_deleted_one(storeys: Desk) -> None:
+    storeys.edit(lift("gate", "roof"))
+    edit_head(storeys, {**delete("roof"), "level": "upper"})
+    storeys.rebase()
+    assert "gate_roof" in storeys.features()
