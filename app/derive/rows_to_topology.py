@@ -51,15 +51,16 @@ class Parameters:
     node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
 
 
-@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}), version=2)
+@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}), version=3)
 def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of the aisles between rows: nodes along each aisle, at its ends and in the headlands.
 
     Rows are lines of kind ``row`` or ``tree_row``: from ``imagery_to_rows`` and ``occupancy_to_rows``, or drawn. Nodes
     are named as in Riseholme's polytunnels: ``r1.5-ca`` in the headland, ``-cb`` at the row's end, ``-c0`` … between,
     ``-cy`` and ``-cz`` at the other end. Edges along a row have the action ``row_traversal``, others ``row_change``.
-    Edges that meet occupied cells of a stored grid ``map`` are left out. Raises MissingLayer if there are no rows,
-    CannotConvert if the robot fits between none.
+    Rows that lie end to end are fields of their own; names of several fields begin with ``f1-``, ``f2-`` … Edges that
+    meet occupied cells of a stored grid ``map`` are left out. Raises MissingLayer if there are no rows, CannotConvert
+    if the robot fits between none.
     """
     parts: dict[PartKey, Part] = {}
     by_level: dict[str, list[Features]] = {}
@@ -74,9 +75,11 @@ def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNo
         )
     for level, drawn in by_level.items():
         grid = layers.grids().get(PartKey("occupancy", level, MAP))
-        fields = _fields(concatenate(drawn), layers)
+        fields = _fields(concatenate(drawn), layers, notes)
         if not fields:
-            raise CannotConvert("no two rows are parallel: draw or derive at least two rows of a field")
+            raise CannotConvert(
+                "no two rows are parallel and side by side: draw or derive at least two rows of a field"
+            )
         network = _Network(parameters, grid)
         for number, one in enumerate(fields, 1):
             network.add(one, "" if len(fields) == 1 else f"f{number}-")
@@ -84,37 +87,77 @@ def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNo
             raise CannotConvert(
                 f"a robot of radius {parameters.robot_radius:g} m fits between no two rows: use a smaller robot_radius"
             )
+        notes.drop("aisles", network.narrow, f"a robot of radius {parameters.robot_radius:g} m does not fit")
+        notes.drop("aisles", network.apart, "their rows do not lie side by side")
         notes.drop("edges", network.blocked, "they would meet occupied cells of the stored grid")
         parts[PartKey("topology", level, NETWORK)] = features([*network.nodes, *network.edges], "local")
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _fields(drawn: Features, layers: Layers) -> list[RowField]:
-    """Group rows by their field, or by direction if they state none."""
+def _fields(drawn: Features, layers: Layers, notes: DerivationNotes) -> list[RowField]:
+    """Group rows by their field, or by direction if they state none, and where they lie side by side."""
     try:
         metres = drawn.in_local(layers.frame)
     except Invalid as error:  # too far from the datum
         raise CannotConvert(error.detail, error.problems) from error
     groups: dict[Any, list[Drawn]] = {}
-    for geometry, properties in zip(metres, drawn.properties, strict=True):
+    pieces, owner = shapely.get_parts(shapely.force_2d(metres), return_index=True)
+    for geometry, properties in zip(pieces, [drawn.properties[k] for k in owner], strict=True):
         if geometry.geom_type != "LineString" or geometry.length == 0:
             continue
-        line = shapely.get_coordinates(shapely.force_2d(geometry))
+        line = shapely.get_coordinates(geometry)
         ends = line[[0, -1]]
         angle = math.degrees(math.atan2(*(ends[1] - ends[0])[::-1])) % 180.0
         name = properties.get("field")
         near = (k for k in groups if isinstance(k, float) and abs((k - angle + 90) % 180 - 90) <= PARALLEL)
         group = name if isinstance(name, int | str) and not isinstance(name, bool) else next(near, float(angle))
         groups.setdefault(group, []).append((line, properties))
-    return [_row_field(rows) for rows in groups.values() if len(rows) > 1]
+    blocks = [block for rows in groups.values() for block in _blocks(rows)]
+    notes.drop("rows", sum(len(block) == 1 for block in blocks), "no row of their direction lies beside them")
+    return [_row_field(block) for block in blocks if len(block) > 1]
+
+
+def _blocks(rows: list[Drawn]) -> list[list[Drawn]]:
+    """Split parallel rows that do not lie side by side, such as fields end to end.
+
+    Two rows are neighbours if each is the next one that lies beside the other. What is drawn between them in order
+    across, but not beside them, is another block; a row drawn in two pieces divides none.
+    """
+    course = _common_course(rows)
+    turned = [course.turned(line) for line, _ in rows]
+    order = sorted(range(len(rows)), key=lambda k: float(turned[k][1].mean()))
+    low = np.array([turned[k][0].min() for k in order])
+    high = np.array([turned[k][0].max() for k in order])
+    before: list[int] = []
+    after: list[int] = []
+    chains: dict[int, list[int]] = {}  # by its last row
+    for k in range(len(order)):
+        beside = np.flatnonzero((low < high[k]) & (high > low[k]))
+        before.append(int(beside[beside < k].max(initial=-1)))
+        after.append(int(beside[beside > k].min(initial=len(order))))
+        is_next = before[k] in chains and after[before[k]] == k
+        chains[k] = [*chains.pop(before[k]), k] if is_next else [k]
+    blocks: dict[int, list[int]] = {}
+    for chain in sorted(chains.values()):
+        block = blocks.get(chain[0] - 1, [])
+        if before[chain[0]] in block or (block and after[block[-1]] in chain):
+            del blocks[block[-1]]
+            chain = [*block, *chain]  # noqa: PLW2901
+        blocks[chain[-1]] = chain
+    return [[rows[k] for k in sorted(order[n] for n in block)] for block in blocks.values()]
+
+
+def _common_course(rows: list[Drawn]) -> Course:
+    """Return the direction and the bend that drawn rows have in common."""
+    steps = np.array([line[-1] - line[0] for line, _ in rows])
+    double = 2 * np.arctan2(steps[:, 1], steps[:, 0])
+    yaw = half_turn(math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2)
+    return _course(yaw, [line for line, _ in rows])
 
 
 def _row_field(rows: list[Drawn]) -> RowField:
     """Return drawn rows as a field, with the bend that they have in common."""
-    steps = np.array([line[-1] - line[0] for line, _ in rows])
-    double = 2 * np.arctan2(steps[:, 1], steps[:, 0])
-    yaw = half_turn(math.atan2(float(np.sin(double).mean()), float(np.cos(double).mean())) / 2)
-    course = _course(yaw, [line for line, _ in rows])
+    course = _common_course(rows)
     out = []
     for line, properties in rows:
         along, across = course.turned(line)
@@ -155,13 +198,19 @@ def _high_end(a: Row, b: Row) -> float:
 
 @dataclass(slots=True)
 class _Network:
-    """Network that grows field by field. blocked: number of edges that meet occupied cells."""
+    """Network that grows field by field.
+
+    blocked: number of edges that meet occupied cells. narrow, apart: number of aisles in which the robot does not fit,
+    and of those whose rows do not lie side by side.
+    """
 
     parameters: Parameters
     grid: OccupancyGrid | None
     nodes: list[Item] = field(default_factory=list)
     edges: list[Item] = field(default_factory=list)
     blocked: int = 0
+    narrow: int = 0
+    apart: int = 0
 
     def add(self, one: RowField, prefix: str) -> None:
         """Add the aisles of a field, and the changes between them."""
@@ -169,7 +218,11 @@ class _Network:
         before: tuple[Item, Item] | None = None
         for number, (a, b) in enumerate(itertools.pairwise(one.rows), 1):
             free = b.v - a.v - (a.width + b.width) / 2
-            if free < 2 * parameters.robot_radius or min(a.high, b.high) - max(a.low, b.low) <= 0:
+            fits = free >= 2 * parameters.robot_radius
+            beside = min(a.high, b.high) > max(a.low, b.low)
+            if not (fits and beside):  # neither: pieces of one row, without an aisle between
+                self.narrow += beside
+                self.apart += fits
                 continue
             middle = (a.v + a.width / 2 + b.v - b.width / 2) / 2
             if len(self.nodes) + (_high_end(a, b) - _low_end(a, b)) / parameters.node_spacing > MAX_NODES:

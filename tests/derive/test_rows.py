@@ -262,3 +262,43 @@ def test_rows_one_cell_thick_are_found(thick: int) -> None:
         mask[20 + 25 * k : 20 + 25 * k + thick, 20:180] = True
     (field,) = find_fields(mask, 0.1, 0.0, 0.0)
     assert [row.v for row in field.rows] == pytest.approx([2.0 + 2.5 * k + 0.05 * thick for k in range(5)], abs=0.1)
+
+
+def test_fields_end_to_end_each_have_their_aisles() -> None:
+    """Two blocks of four rows, 3 m apart, with 10 m between their ends: each has three aisles."""
+    ends = ((0, 30), (40, 70))
+    rows = [(f"r{a}-{v}", shapely.LineString([(a, v), (b, v)]), {"kind": "row"}) for v in (0, 3, 6, 9) for a, b in ends]
+    network = derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")}))
+    nodes = {p["name"]: g for g, p in of(network, "topology", "node")}
+    aisles = {name.split("-c")[0] for name in nodes}
+    assert aisles == {f"f{field}-r{number}.5" for field in (1, 2) for number in (1, 2, 3)}
+    assert all((g.x < 35) == name.startswith("f1-") for name, g in nodes.items())
+    lines_of_rows = shapely.union_all([line for _, line, _ in rows])
+    assert not any(
+        g.crosses(lines_of_rows) for g, p in of(network, "topology", "edge") if p["action"] == "row_traversal"
+    )
+
+
+def test_row_in_two_pieces_divides_no_field() -> None:
+    """The aisles on both sides of it stay connected, whether its pieces are two lines or one geometry."""
+    pieces = [[(0, 3), (14, 3)], [(16, 3), (30, 3)]]
+    full = [[(0, v), (30, v)] for v in (0, 6)]
+    for middle in ([shapely.LineString(piece) for piece in pieces], [shapely.MultiLineString(pieces)]):
+        drawings = [*map(shapely.LineString, full), *middle]
+        rows = [(f"r{k}", line, {"kind": "row"}) for k, line in enumerate(drawings)]
+        notes = DerivationNotes()
+        site = Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")})
+        network = run([all_derivations()["rows_to_topology"].step()], site, notes)
+        assert {g.y for g, _ in of(network, "topology", "node")} == {1.5, 4.5}
+        assert sum(p["action"] == "row_change" for _, p in of(network, "topology", "edge")) == 4
+        assert not notes.dropped
+
+
+def test_rows_and_aisles_without_a_way_are_reported() -> None:
+    spans = {"a": (0, 0, 30), "b": (0.5, 0, 30), "c": (3, 40, 70), "d": (6, 0, 30)}
+    rows = [(name, shapely.LineString([(a, v), (b, v)]), {"kind": "row"}) for name, (v, a, b) in spans.items()]
+    notes = DerivationNotes()
+    site = Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")})
+    network = run([all_derivations()["rows_to_topology"].step()], site, notes)
+    assert {g.y for g, _ in of(network, "topology", "node")} == {3.25}
+    assert {(d.subject, d.count) for d in notes.dropped} == {("rows", 1), ("aisles", 1)}
