@@ -41,7 +41,9 @@ MARGIN = 1.0
 """Margin around the zones of a level without a map, in metres."""
 
 STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Metres per second of one step of a cell: the finest one that reaches the highest limit is used."""
+"""Metres per second of one step of a cell: the finest one that reaches the highest limit is used, or the lowest limit
+if that is less.
+"""
 
 MAX_CELLS = 2**28
 _LIMIT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCII)
@@ -73,6 +75,7 @@ class Parameters:
     parameters=Parameters,
     cost=1.0,
     makes=frozenset({KEEPOUT, SPEED}),
+    version=2,
 )
 def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Costmap filter masks from keepout and speed zones: grids keepout and speed, in the frame of the level's map.
@@ -229,7 +232,8 @@ def _burn(cells: NDArray[np.uint8], frame: _Frame, shapes: list[Any], values: li
 def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) -> tuple[list[int], FilterInfo | None]:
     """Return (the cell of each zone, 0 if it has no limit; the meaning of cells, None if there is no limit at all).
 
-    Limits are rounded down to what a cell can express, and never to 0, which would mean no limit.
+    Limits are rounded down to what a cell can express, and never to 0, which would mean no limit. If the cells cannot
+    express both the lowest and the highest limit, robots are slower than the highest one.
     """
     limits = [_parse_limit(z) for z in zones]
     notes.drop(
@@ -252,25 +256,35 @@ def _limits(zones: list[_Zone], parameters: Parameters, notes: DerivationNotes) 
             exact.append(limit[0] if limit[1] else limit[0] / top * 100.0)
         else:
             exact.append(limit[0] / 100.0 * top if limit[1] else limit[0])
-    step = 1.0
-    if not percent:
-        highest = max(v for v in exact if v is not None)
-        step = next((s for s in STEPS if highest <= 100 * s + 1e-9), STEPS[-1])
-    values, rounded, stopped = [], 0, 0
+    step = _step([v for v in exact if v is not None], percent=percent)
+    values, rounded, capped, stopped = [], 0, 0, 0
     for value in exact:
         if value is None or (percent and value > 100.0):
             values.append(0)
             continue
         cell = min(100, max(1, math.floor(value / step + 1e-6)))
-        stopped += value <= 0.0
+        stopped += value < step - 1e-9
+        capped += value > 100 * step + 1e-6
         rounded += abs(cell * step - value) > 1e-6
         values.append(cell)
     unit = "%" if percent else "m/s"
     notes.drop("exact speed limits", rounded, f"cells store multiples of {step:g} {unit}; limits are rounded down")
+    if capped:
+        lowest = f"the lowest limit needs steps of {step:g} {unit}"
+        notes.warn(f"{capped} speed zones get the limit {100 * step:g} {unit}, less than their own: {lowest}")
     if stopped:
-        notes.warn(f"{stopped} speed zones have the limit 0, which means no limit in Nav2; they get {step:g} {unit}")
+        reason = f"the limit 0, or one below {step:g} {unit}, and a cell of 0 means no limit in Nav2"
+        notes.warn(f"{stopped} speed zones have {reason}; they get {step:g} {unit}")
     kind = masks.SPEED_PERCENT if percent else masks.SPEED_METRES
     return values, FilterInfo(kind, 0.0, step) if any(values) else None
+
+
+def _step(limits: list[float], *, percent: bool) -> float:
+    """Return the step of a cell, in the limits' unit: not above the lowest of them, which would raise it."""
+    highest = max(limits)
+    step = 1.0 if percent else next((s for s in STEPS if highest <= 100 * s + 1e-9), STEPS[-1])
+    lowest = min((v for v in limits if v > 0.0), default=step)
+    return max(STEPS[0], min(step, lowest))
 
 
 def _parse_limit(zone: _Zone) -> tuple[float, bool] | None:

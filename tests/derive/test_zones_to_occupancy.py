@@ -117,6 +117,29 @@ def test_lowest_speed_limit_wins_and_is_rounded_down() -> None:
     assert "limit 0" in notes.warnings[0].problem
 
 
+@pytest.mark.parametrize(
+    ("limits", "unit", "expected"),
+    [
+        ((0.3, 30), "m/s", (0.3, 30.0)),
+        ((0.04, 5.0), "m/s", (0.04, 4.0)),
+        ((0.13, 3.0), "m/s", (0.1, 3.0)),
+        (("0.25 %", "80 %"), "%", (0.25, 25.0)),
+        (("1 %", "80 %"), "%", (1.0, 80.0)),
+    ],
+)
+def test_high_speed_limit_does_not_raise_a_low_one(
+    limits: tuple[Any, Any], unit: str, expected: tuple[float, float]
+) -> None:
+    """Steps that reach the highest limit would be above the lowest one."""
+    places = ((0, 0, 4, 4), (6, 0, 9, 4))
+    layers = zones(*((shapely.box(*at), {"kind": "speed", "value": v}) for at, v in zip(places, limits, strict=True)))
+    out, notes = derive_masks(layers)
+    mask = grid(out, SPEED)
+    assert (speed_at(mask, 2, 2), speed_at(mask, 7, 2)) == (pytest.approx(expected[0]), pytest.approx(expected[1]))
+    slowed = [w.problem for w in notes.warnings if f"get the limit {expected[1]:g} {unit}" in w.problem]
+    assert len(slowed) == (expected[1] < float(str(limits[1]).rstrip(" %")))
+
+
 def test_speed_in_percent() -> None:
     layers = zones(
         (shapely.box(0, 0, 4, 4), {"kind": "speed", "value": "50 %"}),
