@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -171,21 +172,27 @@ def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[S
 
 
 def _splat(out: States, state: States, grid: OccupancyGrid, edge: float, corner: tuple[int, int]) -> None:
-    """Draw occupied cells into all columns that they touch.
+    """Draw occupied cells into all columns that they touch, but do not have the centre of.
 
-    Sampled are their corners, and points between at most half a voxel apart.
+    Sampled are their corners, and points of their border at most half a voxel apart.
     """
     v, u = np.nonzero(state == 2)
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
     steps = max(2, math.ceil(2 * grid.resolution / edge) + 1)
+    for a, b in _border(steps):
+        p, q = (u + a) * grid.resolution, (v + b) * grid.resolution
+        column = np.floor((x + p * c - q * s) / edge).astype(np.int64) - corner[0]
+        row = np.floor((y + p * s + q * c) / edge).astype(np.int64) - corner[1]
+        out[np.clip(row, 0, out.shape[0] - 1), np.clip(column, 0, out.shape[1] - 1)] = 2
+
+
+def _border(steps: int) -> list[tuple[float, float]]:
+    """Return points just inside the border of a square of side 1, with so many on each side."""
     inset = 1e-6
-    for a in np.linspace(inset, 1 - inset, steps):
-        for b in np.linspace(inset, 1 - inset, steps):
-            p, q = (u + a) * grid.resolution, (v + b) * grid.resolution
-            column = np.floor((x + p * c - q * s) / edge).astype(np.int64) - corner[0]
-            row = np.floor((y + p * s + q * c) / edge).astype(np.int64) - corner[1]
-            out[np.clip(row, 0, out.shape[0] - 1), np.clip(column, 0, out.shape[1] - 1)] = 2
+    places = np.linspace(inset, 1 - inset, steps).tolist()
+    ends = (places[0], places[-1])
+    return [*itertools.product(ends, places), *itertools.product(places[1:-1], ends)]
 
 
 def _cut_into_leaves(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:

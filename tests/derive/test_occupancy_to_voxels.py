@@ -97,6 +97,15 @@ def test_rotated_cells_occupy_all_touched_voxels(origin: tuple[float, float, flo
             assert rows[j][i] == FREE
 
 
+def test_large_cells_are_sampled_at_their_border_only() -> None:
+    """Their inside is found from the voxels' centres; one cell of 250 × 250 voxels took a minute before."""
+    points = np.array(module._border(501))
+    assert len({tuple(point) for point in points.tolist()}) == len(points) == 4 * 500
+    assert (np.minimum(points, 1 - points).min(axis=1) < 1e-5).all()
+    voxels = extrude(grid_of([[OCCUPIED]], resolution=5.0), resolution=0.02, height=0.02)
+    assert voxels.voxel_counts() == {"occupied": 250 * 250, "free": 0}
+
+
 @pytest.mark.parametrize("name", ["occupancy_grid/nav2_tb3_sandbox", "occupancy_grid/nav2_map_circular"])
 def test_real_maps_survive_round_trip(shared: Path, name: str) -> None:
     files = {p.name: p.read_bytes() for p in (shared / "data" / name).iterdir()}
