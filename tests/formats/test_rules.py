@@ -320,6 +320,8 @@ TMAP2: list[Any] = [
     (lambda top: top["nodes"][0]["meta"].pop("map"), {(ERROR, "nodes[0].meta")}),
     (lambda top: top["nodes"][0]["meta"].update(node="C"), {(WARNING, "nodes[0].meta.node")}),
     (lambda top: first(top).pop("parent_frame"), {(ERROR, "nodes[0].node")}),
+    (lambda top: first(top).update(nav_frame=first(top).pop("parent_frame")), set()),
+    (lambda top: top.update(transformation={"topo_frame_id": first(top).pop("parent_frame")}), set()),
     (lambda top: first(top).pop("pose"), {(ERROR, "nodes[0].node.pose")}),
     (lambda top: first(top)["edges"][0].pop("edge_id"), {(ERROR, "nodes[0].node.edges[0]")}),
     (lambda top: first(top)["edges"][0].update(node="C", edge_id="A_C"), {(ERROR, "nodes")}),

@@ -513,6 +513,60 @@ def test_transformation_moves_nodes_in_child_frame() -> None:
             assert after["node"]["pose"][key] == pytest.approx(before["node"]["pose"][key], abs=1e-9)
 
 
+NEWEST_FRAMES = [
+    {"nav_frame": "${transformation.topo_frame_id}"},
+    {"nav_frame": "farm"},
+    {"parent_frame": "farm"},
+    {},
+]
+
+
+@pytest.mark.parametrize("frames", NEWEST_FRAMES, ids=str)
+def test_newest_transformation_moves_nodes(frames: dict[str, str]) -> None:
+    """topological_navigation 47595a188d: topo_frame_id replaces child, and nav_frame parent_frame."""
+    document = yaml.safe_load(two("A"))
+    rotation = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+    translation = {"x": 100.0, "y": 0.0, "z": 0.0}
+    document["transformation"] = {"topo_frame_id": "farm", "parent": "map"}
+    document["transformation"] |= {"rotation": rotation, "translation": translation}
+    first, second = (entry["node"] for entry in document["nodes"])
+    first.pop("parent_frame", None)
+    first |= frames
+    second["parent_frame"] = "map"
+    layers, context = read(yaml.safe_dump(document))
+    x = first["pose"]["position"]["x"]
+    part = network(layers)
+    assert part.geometry[0].x == pytest.approx(x + 100.0)
+    assert part.geometry[1].x == pytest.approx(second["pose"]["position"]["x"])
+    assert "1 nodes are in the frame 'farm'" in warnings(context)
+    assert "unknown" not in warnings(context)
+    served, _ = again(layers)
+    assert yaml.safe_load(served)["nodes"] == document["nodes"]
+    found = [p for p in formats.check(FORMAT, {"a.tmap2.yaml": served}) if p.where == "nodes[0].node"]
+    assert found == []
+
+
+def test_new_nodes_are_in_frame_of_newest_network() -> None:
+    """The newest localisation takes all nodes to be in topo_frame_id."""
+    document = yaml.safe_load(two("A"))
+    half = math.sqrt(0.5)
+    rotation = {"w": half, "x": 0.0, "y": 0.0, "z": half}  # a quarter turn to the left
+    document["transformation"] = {"topo_frame_id": "farm", "parent": "map", "rotation": rotation}
+    document["transformation"]["translation"] = {"x": 100.0, "y": 0.0, "z": 0.0}
+    rows: list[Any] = [("plain", shapely.Point(100.0, 7.0), {"kind": "node"})]
+    rows += [("turned", shapely.Point(100.0, 8.0), {"kind": "node", "orientation": [0.0, 0.0, half, half]})]
+    layers, _ = read(yaml.safe_dump(document))
+    new = {PartKey("topology", "ground", "other"): features(rows, "local")}
+    served, _ = write(Layers({NETWORK: network(layers), **new}))
+    nodes = {entry["node"]["name"]: entry["node"] for entry in yaml.safe_load(served)["nodes"]}
+    for name, x, z, w in (("plain", 7.0, -half, half), ("turned", 8.0, 0.0, 1.0)):
+        assert nodes[name]["parent_frame"] == "farm"
+        assert nodes[name]["pose"]["position"] == pytest.approx({"x": x, "y": 0.0, "z": 0.0}, abs=1e-9)
+        assert nodes[name]["pose"]["orientation"] == pytest.approx({"w": w, "x": 0.0, "y": 0.0, "z": z}, abs=1e-9)
+    back = network(read(served)[0])
+    assert back.geometry[back.index()["plain"]].coords[0][:2] == pytest.approx((100.0, 7.0))
+
+
 # --- determinism and round trips -------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,9 @@
-"""Frame of a network's nodes: its ``transformation``, and nodes in its child frame."""
+"""Frame of a network's nodes: its ``transformation``, and nodes in its child frame.
+
+The newest topological_navigation names the child frame ``topo_frame_id``, older ones ``child``. Nodes are in it if
+their ``parent_frame`` or ``nav_frame`` says so; with ``topo_frame_id`` also if they have neither. Source:
+LCAS/topological_navigation, map_manager2.py and networkx_utils.py.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +39,34 @@ class MapTransform:
         )
 
 
+CHILD_FRAME_REFERENCE = "${transformation.topo_frame_id}"
+
+
+def child_frame(document: Mapping[str, Any]) -> str | None:
+    """Return the name of the transformation's child frame, or None if it has none."""
+    transformation = document.get("transformation")
+    names = [transformation.get(key) for key in ("topo_frame_id", "child")] if isinstance(transformation, dict) else []
+    return next((name for name in names if isinstance(name, str) and name), None)
+
+
+def has_default_frame(document: Mapping[str, Any]) -> bool:
+    """Whether nodes without a frame are in the child frame."""
+    transformation = document.get("transformation")
+    return isinstance(transformation, dict) and bool(transformation.get("topo_frame_id"))
+
+
+def is_in_child_frame(node: Mapping[str, Any], document: Mapping[str, Any]) -> bool:
+    """Check that a node's pose is in the child frame of the document's transformation."""
+    frames = [node[key] for key in ("parent_frame", "nav_frame") if node.get(key)]
+    if not frames:
+        return has_default_frame(document)
+    return child_frame(document) in frames or CHILD_FRAME_REFERENCE in frames
+
+
 def map_transform(document: Mapping[str, Any]) -> MapTransform | None:
     """Parse the file's transformation, or return None if it is missing or the identity."""
-    transformation = document.get("transformation")
-    if (
-        not isinstance(transformation, dict)
-        or not isinstance(transformation.get("child"), str)
-        or transformation["child"] == transformation.get("parent")
-    ):
+    transformation, child = document.get("transformation"), child_frame(document)
+    if not isinstance(transformation, dict) or child is None or child == transformation.get("parent"):
         return None
     rotation, translation = transformation.get("rotation") or {}, transformation.get("translation") or {}
     if not isinstance(rotation, dict) or not isinstance(translation, dict):
@@ -58,7 +83,7 @@ def map_transform(document: Mapping[str, Any]) -> MapTransform | None:
         )
     if x == y == z == 0.0 and not shift.any():
         return None
-    return MapTransform(transformation["child"], (x / length, y / length, z / length, w / length), shift)
+    return MapTransform(child, (x / length, y / length, z / length, w / length), shift)
 
 
 def multiply(a: Sequence[float], b: Sequence[float]) -> list[float]:
@@ -84,7 +109,7 @@ def to_local(
     turn = map_transform(document)
     if turn is None:
         return
-    inside = [k for k, node in enumerate(nodes) if node.get("parent_frame") == turn.child]
+    inside = [k for k, node in enumerate(nodes) if is_in_child_frame(node, document)]
     if not inside:
         return
     xyz[inside] = xyz[inside] @ turn.matrix().T + turn.shift

@@ -100,7 +100,7 @@ _EDGE = record(
     inflation_radius=NOT_NEGATIVE,
 )
 _NODE = record(
-    "name parent_frame localise_by_topic map pointset",
+    "name parent_frame nav_frame localise_by_topic map pointset",
     edges=[_EDGE],
     pose=record(position=POINT, orientation=Quaternion()),
     properties=_FREE,
@@ -114,7 +114,7 @@ ENTRIES = [record(node=_NODE, meta=record(is_open=True))]
 SHAPE = record(
     "metric_map name pointset verts",
     meta=record(is_open=True),
-    transformation=record("child parent topo_map", rotation=Quaternion(), translation=POINT),
+    transformation=record("child parent topo_frame_id topo_map", rotation=Quaternion(), translation=POINT),
     nodes=ENTRIES,
 )
 """Schema of tmap2 files and of the older list's nodes. Source: topological_navigation's map files of all versions."""

@@ -30,7 +30,7 @@ from app.syntax import yaml
 
 TOP = ("meta", "metric_map", "name", "nodes", "pointset")
 META = ("map", "node", "pointset")
-NODE = ("edges", "name", "parent_frame")
+NODE = ("edges", "name")
 EDGE = ("edge_id", "node")
 LAST_UPDATED = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}")
 
@@ -116,6 +116,8 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
     if not isinstance(time, str) or not LAST_UPDATED.fullmatch(time):
         reason = f"must be a string like 2024-05-01_10-00-00, got {shown(time)}"
         yield error_finding(reason, main, where="meta.last_updated")
+    transformation = top.get("transformation")
+    has_default = isinstance(transformation, dict) and bool(transformation.get("topo_frame_id"))
     rows = top.get("nodes")
     if not isinstance(rows, list):
         if rows is not None:
@@ -126,13 +128,15 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
         meta, node = (row.get("meta"), row.get("node")) if isinstance(row, dict) else (None, None)
         if absent := missing(meta, META):
             yield error_finding(f"the schema requires {', '.join(absent)}", main, where=f"{location}.meta")
-        if absent := missing(node, NODE):
+        # Only older schemas require a frame; the newest has topo_frame_id and nav_frame instead.
+        framed = isinstance(node, dict) and (node.get("nav_frame") or (has_default and not node.get("parent_frame")))
+        if absent := missing(node, NODE if framed else (*NODE, "parent_frame")):
             yield error_finding(f"the schema requires {', '.join(absent)}", main, where=f"{location}.node")
         if not isinstance(node, dict):
             continue
         if missing(node.get("pose"), ("orientation", "position")):
             yield error_finding("a node needs a pose, which localisation reads", main, where=f"{location}.node.pose")
-        for key in ("name", "parent_frame"):
+        for key in ("name", "parent_frame", "nav_frame"):
             if node.get(key) is not None and not isinstance(node[key], str):
                 yield error_finding(f"must be a string, got {shown(node[key])}", main, where=f"{location}.node.{key}")
         name = str(node.get("name"))

@@ -42,7 +42,7 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=network.WriteOptions,
         extensions=(*NAMES, ".tmap"),
-        version=2,
+        version=3,
         selection=Selection(network.choose),
         claims=Claims(priority=50, leads_folder="topological"),
         traits=Traits(keeps_bends="nodes", has_title=True),

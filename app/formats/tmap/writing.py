@@ -13,7 +13,7 @@ import shapely
 
 from app.formats import WriteContext
 from app.formats._network import shorten_list
-from app.formats.tmap.frames import map_transform, multiply
+from app.formats.tmap.frames import has_default_frame, is_in_child_frame, map_transform, multiply
 from app.formats.tmap.network import (
     ANY_YAW,
     CANONICAL_EDGE,
@@ -165,7 +165,7 @@ class _Writer:
     def _plain_node(self) -> Callable[[str, str, tuple[str, str, str]], str]:
         """Create a fast formatter of nodes with only a name and position: (name, edges, position) as texts -> entry."""
         a, b, c, d, e = self._node_template({}, {}, None, has_yaw=False, fill=True)
-        d += self._pose(None, ("\0", "\0", "\0"), [0.0, 0.0, 0.0, 1.0], turned=False)
+        d += self._pose(None, ("\0", "\0", "\0"), [0.0, 0.0, 0.0, 1.0], turned=self._is_in_child_frame({}))
         d, y, z, end = d.split("\0")
         e = end + e
 
@@ -229,7 +229,7 @@ class _Writer:
         """Check that a node's pose is in the child frame of the transformation."""
         source_properties = p.get(NAME)
         node = source_properties.get("node") if isinstance(source_properties, dict) else None
-        return self.turn is not None and isinstance(node, dict) and node.get("parent_frame") == self.turn.child
+        return self.turn is not None and is_in_child_frame(_mapping_text(node), self.document)
 
     def _edge(self, p: Properties, i: str, target: str) -> tuple[str, str]:
         """Return the written id and the text of an edge. target: its target's name as YAML."""
@@ -293,10 +293,14 @@ class _Writer:
         assert isinstance(self.options, WriteOptions)
         return {
             "localise_by_topic": self.options.localise_by_topic,
-            "parent_frame": self.options.parent_frame,
+            "parent_frame": self._default_frame(self.options),
             "restrictions_planning": self.options.restrictions,
             "restrictions_runtime": self.options.restrictions,
         }
+
+    def _default_frame(self, options: WriteOptions) -> str:
+        """Return the frame of new nodes: that of nodes without a frame in the source's document, if it has one."""
+        return self.turn.child if self.turn is not None and has_default_frame(self.document) else options.parent_frame
 
     def _node(self, p: Properties, name: str, name_text: str, at: tuple[str, str, str], edges: Lines) -> str:
         """Return the text of a node's entry. name_text: its name as YAML; at: its position as texts."""
@@ -381,7 +385,7 @@ class _Writer:
             # The older layout has its tolerances beside the name.
             tolerances = {key: inner.get(key, value) for key, value in tolerances.items()}
             inner["properties"] = {**tolerances, **_mapping_text(inner.get("properties"))}
-        elif "nav_frame" not in inner:
+        elif "nav_frame" not in inner and not (self.turn is not None and has_default_frame(self.document)):
             inner.setdefault("parent_frame", FRAME)
         if more:
             inner["properties"] = {**_mapping_text(inner.get("properties")), **more}
@@ -421,7 +425,7 @@ class _Writer:
             fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, reason, "xy_goal_tolerance")
             fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")
             if isinstance(options, WriteOptions):
-                fill("nodes: parent_frame", options.parent_frame, why, "parent_frame")
+                fill("nodes: parent_frame", self._default_frame(options), why, "parent_frame")
                 fill("nodes: restrictions", options.restrictions, why, "restrictions")
             else:
                 fill("nodes: map, pointset", "the map's", why)
