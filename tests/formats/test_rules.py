@@ -311,11 +311,21 @@ def first(top: dict[str, Any]) -> Any:
     return top["nodes"][0]["node"]
 
 
+def newest(top: dict[str, Any], **members: Any) -> None:
+    """Give the file the newest map manager's form of time."""
+    top["meta"]["last_updated"] = "31-05-2026_10-00-00"
+    top.update(members)
+
+
 TMAP2: list[Any] = [
     (lambda top: None, set()),
     (lambda top: top.pop("pointset"), {(ERROR, "pointset")}),
     (lambda top: top["meta"].update(last_updated=0), {(ERROR, "meta.last_updated")}),
     (lambda top: top["meta"].update(last_updated="2024-05-01"), {(ERROR, "meta.last_updated")}),
+    (lambda top: top["meta"].update(last_updated="31-05-2026_10-00-00"), set()),
+    (lambda top: newest(top, nodes=[*top["nodes"], top["nodes"][1]]), {(ERROR, "nodes")}),
+    (lambda top: newest(top) or top["nodes"][0]["meta"].update(pointset="field"), {(ERROR, "nodes")}),
+    (lambda top: top["nodes"][0]["meta"].update(pointset="field"), set()),
     (lambda top: top.update(name=7), {(ERROR, "name")}),
     (lambda top: top["nodes"][0]["meta"].pop("map"), {(ERROR, "nodes[0].meta")}),
     (lambda top: top["nodes"][0]["meta"].update(node="C"), {(WARNING, "nodes[0].meta.node")}),

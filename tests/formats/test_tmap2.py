@@ -466,8 +466,16 @@ def test_invalid_last_updated_is_replaced_with_warning() -> None:
         served, context = again(read(yaml.safe_dump(document))[0])
         assert yaml.safe_load(served)["meta"]["last_updated"] == EPOCH
         assert ("not a time" in warnings(context)) == (value is not None)
-    document["meta"]["last_updated"] = "2022-06-23_13-10-11"
-    assert yaml.safe_load(again(read(yaml.safe_dump(document))[0])[0])["meta"]["last_updated"] == "2022-06-23_13-10-11"
+
+
+@pytest.mark.parametrize("time", ["2022-06-23_13-10-11", "23-06-2026_13-10-11"])
+def test_last_updated_is_kept(time: str) -> None:
+    """Day first since topological_navigation of 2026."""
+    document = yaml.safe_load(two("A"))
+    document["meta"]["last_updated"] = time
+    served, context = again(read(yaml.safe_dump(document))[0])
+    assert yaml.safe_load(served)["meta"]["last_updated"] == time
+    assert "not a time" not in warnings(context)
 
 
 def test_unknown_members_round_trip_in_place() -> None:

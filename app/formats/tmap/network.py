@@ -32,7 +32,9 @@ from app.parameters import parameter
 from app.syntax import yaml
 
 NAME = "tmap2"
-LAST_UPDATED = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}\Z")
+LAST_UPDATED = re.compile(r"(?:[0-9]{4}-[0-9]{2}-[0-9]{2}|[0-9]{2}-[0-9]{2}-[0-9]{4})_[0-9]{2}-[0-9]{2}-[0-9]{2}\Z")
+"""Time of the last change: year first or, since topological_navigation of 2026, day first."""
+
 EPOCH = "1970-01-01_00-00-00"
 """Default time: the schema requires one, and the same network must give the same bytes."""
 

@@ -1,7 +1,8 @@
 """Rules of topological_navigation for tmap2.
 
 Sources: its JSON schema (config/tmap-schema.yaml); manager2.py, which addresses edges by ``edge_id`` and assigns new
-ones of the form ``<from>_<to>`` when a node is renamed; localisation.py, which reads each node's pose.
+ones of the form ``<from>_<to>`` when a node is renamed; localisation.py, which reads each node's pose. The schema of
+2026 has times with the day first; its map_manager2.py refuses duplicate names and several pointsets.
 
 A network of a city has megabytes of YAML. If its lines are regular, as PyYAML writes them, it is enough to count them;
 only files with missing members or another layout are parsed.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 from app.errors import Problem
@@ -32,9 +34,11 @@ TOP = ("meta", "metric_map", "name", "nodes", "pointset")
 META = ("map", "node", "pointset")
 NODE = ("edges", "name")
 EDGE = ("edge_id", "node")
-LAST_UPDATED = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}")
+YEAR_FIRST = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}")
+DAY_FIRST = re.compile(r"[0-9]{2}-[0-9]{2}-[0-9]{4}_[0-9]{2}-[0-9]{2}-[0-9]{2}")
 
 _LINES = re.compile(rb"\n(    name|    node| {6}edge_id| {6}node): (.*)")
+_POINTSET = re.compile(rb"\n    pointset: ([^\n]*)")
 _NO_TEXT = re.compile(rb"\n(?:metric_map|name|pointset): [-+.\d~]")
 _COUNTED = (
     b"\n    map: ",
@@ -48,6 +52,17 @@ _TOPS = (b"\nmetric_map: ", b"\nname: ", b"\npointset: ")
 _TIME = re.compile(rb"""(?:^|\n)meta:\n(?:  [^\n]*\n)*?  last_updated: (['"]?)([^'"\n]*)\1\n""")
 
 Edges = list[tuple[str, str, str]]
+"""(source, id, target) of edges."""
+
+
+@dataclass(slots=True)
+class _Network:
+    """What a file contains. pointsets: those of its nodes; is_newest: whether its time has the day first."""
+
+    nodes: list[str] = field(default_factory=list)
+    edges: Edges = field(default_factory=list)
+    pointsets: set[str] = field(default_factory=set)
+    is_newest: bool = False
 
 
 def check(files: Files) -> Iterator[Problem]:
@@ -60,13 +75,13 @@ def check(files: Files) -> Iterator[Problem]:
         return
     network = _regular(data)
     if network is None:
-        network = ([], [])
-        yield from _check_document(yaml.load(data, LIMITS), main, *network)
-    yield from _network(*network, main)
+        network = _Network()
+        yield from _check_document(yaml.load(data, LIMITS), main, network)
+    yield from _check_network(network, main)
 
 
-def _regular(data: bytes) -> tuple[list[str], Edges] | None:
-    """Return nodes and edges (source, id, target) of a regular, complete file, else None."""
+def _regular(data: bytes) -> _Network | None:
+    """Return the network of a regular, complete file, else None."""
     count = data.count(b"\n- meta:\n")
     if not count or not _is_dated(data[:HEAD_BYTES]) or b"&" in data:
         return None
@@ -94,16 +109,29 @@ def _regular(data: bytes) -> tuple[list[str], Edges] | None:
             targets.clear()
         else:
             waiting[key.strip()].append(text)
-    return (nodes, edges) if len(nodes) == count and not waiting[b"edge_id"] else None
+    if len(nodes) != count or waiting[b"edge_id"]:
+        return None
+    is_newest = DAY_FIRST.fullmatch(_time(data[:HEAD_BYTES])) is not None
+    found = _POINTSET.findall(data) if is_newest else []
+    return _Network(nodes, edges, {text.decode("utf-8", "replace").strip("'\"") for text in found}, is_newest)
+
+
+def _time(head: bytes) -> str:
+    """Return the time of the last change, or an empty text."""
+    time = _TIME.search(head)
+    return "" if time is None else time[2].decode("latin1")
 
 
 def _is_dated(head: bytes) -> bool:
-    time = _TIME.search(head)
-    return time is not None and LAST_UPDATED.fullmatch(time[2].decode("latin1")) is not None
+    return _is_time(_time(head))
 
 
-def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iterator[Problem]:
-    """Check the schema's rules one by one; adds to ``nodes`` and ``edges``."""
+def _is_time(time: Any) -> bool:
+    return isinstance(time, str) and bool(YEAR_FIRST.fullmatch(time) or DAY_FIRST.fullmatch(time))
+
+
+def _check_document(top: Any, main: str, network: _Network) -> Iterator[Problem]:
+    """Check the schema's rules one by one; adds to ``network``."""
     if not isinstance(top, dict):
         yield error_finding("a topological map must be a mapping: upload a list as the older format tmap", main)
         return
@@ -113,7 +141,8 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
         if top.get(key) is not None and not isinstance(top[key], str):
             yield error_finding(f"must be a string, got {shown(top[key])}", main, where=key)
     time = top["meta"].get("last_updated") if isinstance(top.get("meta"), dict) else None
-    if not isinstance(time, str) or not LAST_UPDATED.fullmatch(time):
+    network.is_newest = isinstance(time, str) and DAY_FIRST.fullmatch(time) is not None
+    if not _is_time(time):
         reason = f"must be a string like 2024-05-01_10-00-00, got {shown(time)}"
         yield error_finding(reason, main, where="meta.last_updated")
     transformation = top.get("transformation")
@@ -144,7 +173,9 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
             yield warning_finding(
                 f"is {shown(meta['node'])}, but the node is named {name!r}", main, where=f"{location}.meta.node"
             )
-        nodes.append(name)
+        network.nodes.append(name)
+        if isinstance(meta, dict):
+            network.pointsets.add(str(meta.get("pointset")))
         listed = node.get("edges")
         if listed is not None and not isinstance(listed, list):
             yield error_finding(f"must be a list, got {shown(listed)}", main, where=f"{location}.node.edges")
@@ -155,15 +186,19 @@ def _check_document(top: Any, main: str, nodes: list[str], edges: Edges) -> Iter
                     f"the schema requires {', '.join(absent)}", main, where=f"{location}.node.edges[{j}]"
                 )
                 continue
-            edges.append((name, str(edge["edge_id"]), str(edge["node"])))
+            network.edges.append((name, str(edge["edge_id"]), str(edge["node"])))
 
 
-def _network(nodes: list[str], edges: Edges, main: str) -> Iterator[Problem]:
-    node_names = set(nodes)
-    if repeats := duplicates(nodes):
-        yield warning_finding(
+def _check_network(network: _Network, main: str) -> Iterator[Problem]:
+    edges, node_names = network.edges, set(network.nodes)
+    if repeats := duplicates(network.nodes):
+        finding = error_finding if network.is_newest else warning_finding
+        yield finding(
             f"{len(repeats)} duplicate node names, to which edges refer: {names(repeats)}", main, where="nodes"
         )
+    if network.is_newest and len(network.pointsets) > 1:
+        listed = names(sorted(network.pointsets))
+        yield error_finding(f"the nodes have several pointsets in their meta: {listed}", main, where="nodes")
     if dangling := [i for _, i, target in edges if target not in node_names]:
         reason = f"{len(dangling)} edges lead to unknown nodes: {names(dangling)}"
         yield error_finding(reason, main, where="nodes")
