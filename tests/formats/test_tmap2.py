@@ -521,6 +521,31 @@ def test_transformation_moves_nodes_in_child_frame() -> None:
             assert after["node"]["pose"][key] == pytest.approx(before["node"]["pose"][key], abs=1e-9)
 
 
+@pytest.mark.parametrize("frame_key", ["child", "topo_frame_id"])
+def test_levels_with_different_child_frames_keep_their_places(frame_key: str) -> None:
+    """A file has one transformation: nodes in the child frame of another one are moved to a frame of it."""
+    parts = {}
+    for level, child, shift, names in (("L1", "one", 100.0, "AB"), ("L2", "two", 500.0, "CD")):
+        document = yaml.safe_load(two(*names))
+        document["transformation"] = {frame_key: child, "parent": "map", "rotation": {"w": 1.0}}
+        document["transformation"]["translation"] = {"x": shift, "y": 0.0, "z": 0.0}
+        for entry in document["nodes"]:
+            entry["node"]["parent_frame"] = child
+        parts.update(read(yaml.safe_dump(document), level=level)[0].parts)
+    served, context = write(Layers(parts))
+    nodes = {entry["node"]["name"]: entry["node"] for entry in yaml.safe_load(served)["nodes"]}
+    other = ("map", 0.0) if frame_key == "child" else ("one", -100.0)  # the newest localisation has one frame for all
+    assert {name: node["parent_frame"] for name, node in nodes.items()} == {
+        "A": "one", "B": "one", "C": other[0], "D": other[0],
+    }  # fmt: skip
+    assert nodes["A"]["pose"]["position"]["x"] == 1.0
+    assert nodes["C"]["pose"]["position"]["x"] == 501.0 + other[1]
+    assert "2 nodes are in the frame of another transformation" in warnings(context)
+    part = network(read(served)[0])
+    at = {i: g.x for i, g in zip(part.ids, part.geometry, strict=True) if g.geom_type == "Point"}
+    assert at == {"A": 101.0, "B": 105.0, "C": 501.0, "D": 505.0}
+
+
 NEWEST_FRAMES = [
     {"nav_frame": "${transformation.topo_frame_id}"},
     {"nav_frame": "farm"},

@@ -13,7 +13,7 @@ import shapely
 
 from app.formats import WriteContext
 from app.formats._network import shorten_list
-from app.formats.tmap.frames import has_default_frame, is_in_child_frame, map_transform, multiply
+from app.formats.tmap.frames import child_frame, has_default_frame, is_in_child_frame, map_transform, multiply
 from app.formats.tmap.network import (
     ANY_YAW,
     CANONICAL_EDGE,
@@ -61,6 +61,8 @@ class _Writer:
         self.document = self._document()
         self.turn = map_transform(self.document)
         self.ring = ring(self.options.verts_radius)
+        self.foreign: Mapping[str, Any] | None = None  # document of the current network, if its child frame is another
+        self.moved: list[str] = []  # nodes from such child frames
         self.legacy = False  # whether the current network came as the older list, which lacks members of tmap2
         self.unwritten = CROSS_PART_PROPERTIES if self.options.osm else CROSS_PART_PROPERTIES | WRITTEN_ON_DEMAND
         # Sets of properties that add nothing to an item's own ``properties``.
@@ -136,6 +138,9 @@ class _Writer:
     def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
         """Write the nodes of a network, each with its edges."""
         self.legacy = "tmap" in part.document
+        own = _mapping_text(part.document.get(NAME))
+        has_other_frame = not self.listed and child_frame(own) not in (None, child_frame(self.document))
+        self.foreign = own if has_other_frame else None
         is_point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
         kinds = [p.get("kind") for p in part.properties]
         places = [k for k, point in enumerate(is_point.tolist()) if point and kinds[k] == "node"]
@@ -228,8 +233,22 @@ class _Writer:
     def _is_in_child_frame(self, p: Properties) -> bool:
         """Check that a node's pose is in the child frame of the transformation."""
         source_properties = p.get(NAME)
-        node = source_properties.get("node") if isinstance(source_properties, dict) else None
-        return self.turn is not None and is_in_child_frame(_mapping_text(node), self.document)
+        node = _mapping_text(source_properties.get("node") if isinstance(source_properties, dict) else None)
+        return self.turn is not None and is_in_child_frame({} if self._is_foreign(node) else node, self.document)
+
+    def _is_foreign(self, node: Mapping[str, Any]) -> bool:
+        """Check that a node's frame is the child of another network's transformation, which is not written."""
+        if self.foreign is None or not is_in_child_frame(node, self.foreign):
+            return False
+        return self.turn is None or not is_in_child_frame(node, self.document)
+
+    def _moved_node(self, node: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the members of a node from another network's child frame, in a frame of this transformation."""
+        transformation = _mapping_text(self.document.get("transformation"))
+        frame: Any = transformation.get("parent", FRAME)
+        if self.turn is not None and has_default_frame(self.document):
+            frame = self.turn.child
+        return {**{key: value for key, value in node.items() if key != "nav_frame"}, "parent_frame": frame}
 
     def _edge(self, p: Properties, i: str, target: str) -> tuple[str, str]:
         """Return the written id and the text of an edge. target: its target's name as YAML."""
@@ -312,6 +331,10 @@ class _Writer:
             more = self._more(p, CANONICAL_NODE)
             if isinstance(p.get("name"), str) and p["name"] not in ("", name):
                 more["name"] = p["name"]
+        if self._is_foreign(node):
+            self.moved.append(name)
+            node = self._moved_node(node)
+            extra_members = {**extra_members, "node": node}
         if "name" in node or "edges" in node:
             dangling = [e for e in node.get("edges") or () if isinstance(e, dict)]
             edges = edges + [_dangling(e, name) for e in dangling]
@@ -403,6 +426,10 @@ class _Writer:
 
     def _report(self) -> None:
         fill, filled, options = self.context.fill, self.filled, self.options
+        if self.moved:
+            problem = f"{len(self.moved)} nodes are in the frame of another transformation than the one written"
+            listed = shorten_list(sorted(self.moved))
+            self.context.warn(f"{problem}; their poses are converted: {listed}", where="transformation")
         if filled["edges"]:
             why = f"{filled['edges']} edges come from a format without it"
             reason = f"{why}; used for those without one"
