@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from pyproj import CRS, Geod, Proj, Transformer
-from pyproj.crs import ProjectedCRS
+from pyproj.crs import CompoundCRS, ProjectedCRS
 from pyproj.crs.coordinate_operation import HotineObliqueMercatorBConversion, TransverseMercatorConversion
 from pyproj.exceptions import ProjError
 
@@ -316,6 +316,30 @@ def length_units(crs: str) -> tuple[float, float] | None:
     if definition.is_geographic or not definition.axis_info:
         return None
     return float(definition.axis_info[0].unit_conversion_factor), _vertical_unit(crs)
+
+
+def with_vertical(crs: str, vertical: str) -> str | None:
+    """Return the code of a CRS (EPSG:<number>) with the heights of a vertical one; None if PROJ knows no such CRS."""
+    try:
+        CRS.from_user_input(f"{crs}+{vertical}")
+    except ProjError:
+        return None
+    return f"{crs}+{vertical}"
+
+
+def with_height_unit(crs: str, unit: float) -> str:
+    """Return a CRS with heights above an unknown surface, whose unit has this many metres, as WKT 2.
+
+    Raises Invalid for a CRS that cannot have such heights (a geocentric one).
+    """
+    axis = f'AXIS["up (H)",up,LENGTHUNIT["{unit:.10g} m",{unit:.17g}]]'
+    heights = CRS.from_wkt(f'VERTCRS["height",VDATUM["unknown"],CS[vertical,1],{axis}]')
+    try:
+        horizontal = CRS.from_user_input(crs).to_2d()
+        compound = CompoundCRS(f"{horizontal.name} + height", [horizontal, heights])
+    except ProjError as error:
+        raise Invalid(f"the CRS {_short(crs)!r} cannot have heights of another unit") from error
+    return str(compound.to_wkt("WKT2_2019"))
 
 
 def engineering_unit(crs: str) -> float | None:

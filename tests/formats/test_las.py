@@ -120,6 +120,69 @@ def test_wkt_of_las_1_4_with_heights_in_feet_is_applied() -> None:
     assert voxels.axis(2)[0].tolist() == [int(100 * 1200 / 3937 / 0.05)]
 
 
+FOOT = 1200 / 3937
+
+
+def feet(*keys: tuple[int, int]) -> bytes:
+    """Return two points of a survey in US feet in New York, with GeoTIFF keys (id, code)."""
+    header = laspy.LasHeader(version="1.2", point_format=1)
+    header.offsets, header.scales = np.array([982000.0, 200000.0, 0.0]), np.full(3, 0.01)
+    packed = b"".join(struct.pack("<4H", key, 0, 1, code) for key, code in keys)
+    header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", struct.pack("<4H", 1, 1, 0, len(keys)) + packed))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.array([[982000.0, 200000.0, 100.0], [982010.0, 200010.0, 110.0]]).T
+    out = io.BytesIO()
+    las.write(out)
+    return out.getvalue()
+
+
+def heights(data: bytes) -> tuple[list[float], list[str]]:
+    """Return the heights of the voxels' lower sides in metres, and what was reported of the CRS."""
+    voxels, context, _ = read(data, {"resolution": "0.01"})
+    found = sorted((voxels.axis(2)[0] * voxels.resolution).tolist())
+    return found, [w.problem for w in context.warnings if w.where == "crs"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "unit", "warning"),
+    [
+        (((3072, 2263), (4096, 6360)), FOOT, None),  # NAVD88 in US survey feet
+        (((3072, 2263), (4096, 5703)), 1.0, None),  # NAVD88 in metres
+        (((3072, 2263), (4099, 9003)), FOOT, None),
+        (((3072, 2263), (4099, 9002)), 0.3048, None),
+        (((3072, 2263), (4099, 9001)), 1.0, None),
+        (((3072, 2263), (4096, 32767), (4099, 9003)), FOOT, None),  # user-defined
+        (((3072, 32118), (4099, 9003)), FOOT, None),  # New York in metres
+        (
+            ((3072, 2263),),
+            FOOT,
+            "the file names no unit of heights: they are read in that of EPSG:2263, 0.3048006096 m",
+        ),
+        (((3072, 32118),), 1.0, None),
+    ],
+)
+def test_heights_in_feet_become_metres(keys: tuple[tuple[int, int], ...], unit: float, warning: str | None) -> None:
+    found, warnings = heights(feet(*keys))
+    assert found == pytest.approx([100 * unit, 110 * unit], abs=0.011)
+    assert [w.partition(";")[0] for w in warnings] == ([] if warning is None else [warning])
+
+
+def test_feet_of_a_user_defined_projection_become_local_metres() -> None:
+    data = feet((3072, 32767), (3076, 9003))
+    voxels, context, layers = read(data, {"resolution": "0.01"})
+    assert layers.datum is None
+    low, high = np.array(voxels.bounds()).reshape(2, 3)
+    assert (high - low).tolist() == pytest.approx([10 * FOOT] * 3, abs=0.021)
+    assert low[2] == pytest.approx(100 * FOOT, abs=0.011)
+    assert any("units of 0.3048006096 m (x, y)" in w.problem for w in context.warnings)
+    local = points(written({"a.las": data}, frame="local"))
+    assert np.ptp(np.asarray(local.x)) == pytest.approx(10 * FOOT, abs=0.002)
+    assert np.asarray(local.z).tolist() == pytest.approx([100 * FOOT, 110 * FOOT], abs=0.002)
+    assert written({"a.las": data}) == data
+    plain, _, _ = read(data, {"resolution": "0.01", "crs": "local"})
+    assert plain.bounds()[2] == 100.0, "local metres, ignoring the file"
+
+
 def test_file_round_trips_and_both_encodings_hold_same_points() -> None:
     assert written({"a.las": FIELD}) == FIELD
     assert written({"a.laz": SPIRAL}) == SPIRAL

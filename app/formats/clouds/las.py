@@ -1,6 +1,8 @@
 """LAS and LAZ point clouds ↔ voxels.
 
-Reading gives the voxels of the points, and the file as a resource (see ``clouds.points``), placed by the file's CRS.
+Reading gives the voxels of the points, and the file as a resource (see ``clouds.points``), placed by the file's CRS, as
+WKT or GeoTIFF keys. Heights become metres: by its vertical CRS, else by ``VerticalUnits``, else they have the unit of
+the horizontal CRS that the keys name.
 Writing gives the file that the voxels came from; the points of another cloud format; else the centres of the occupied
 voxels. New files are LAS 1.4 in steps of a millimetre.
 """

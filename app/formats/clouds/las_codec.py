@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import UnreadableFile
+from app.errors import Invalid, UnreadableFile
 from app.formats import ReadContext, WriteContext
 from app.formats.clouds.points import AXES, RGB, Cloud, check_count, unreadable_error
+from app.model.geodesy import length_units, with_height_unit, with_vertical
 
 MAGIC = b"LASF"
 SCALE = 0.001
@@ -42,6 +43,15 @@ FILES = re.compile(r"EXTENSION|PARAMETERFILE|GRIDS", re.IGNORECASE)
 SOFTWARE = "Fleet Map Server"
 NO_DATE = slice(90, 94)
 """Creation day and year in the header, set to 0 (unknown): the current date would change the bytes each day."""
+
+GEOGRAPHIC, PROJECTED, PROJECTED_UNITS, VERTICAL, VERTICAL_UNITS = 2048, 3072, 3076, 4096, 4099
+"""GeoTIFF keys of a CRS and its units (OGC 19-008r4)."""
+
+USER_DEFINED = 32767
+"""Code of a CRS that is defined by further keys."""
+
+UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+"""Metres of a unit, by its EPSG code."""
 
 INTEGER_DIMENSIONS = {"intensity": 65535, "classification": 255, "user_data": 255, "point_source_id": 65535}
 """Standard dimensions that take other formats' columns of the same name, with their maximum value."""
@@ -183,28 +193,65 @@ def _cloud(las: Any, count: int, context: ReadContext) -> Cloud:
         column = np.asarray(las[name])
         if len(column) and column.any():
             columns[name if name not in columns else f"{name}_"] = column
-    crs = _crs(las.header)
+    keys = _geo_keys(las.header)
+    crs = _wkt(las.header) or (_crs(keys, context) if keys else None)
     if crs is not None and (len(crs) > 2**16 or FILES.search(crs)):
         context.warn("the coordinate reference system is too long or refers to files; it is ignored, set crs=EPSG:…")
         crs = None
-    return Cloud(columns, count, crs=crs)
+    return Cloud(columns, count, crs=crs, units=_units(keys) if crs is None else None)
 
 
-def _crs(header: Any) -> str | None:
-    """Return the coordinate reference system: WKT, else the code of the GeoTIFF keys, else None."""
+def _records(header: Any, number: int) -> list[Any]:
+    """Return the records of a projection with a number."""
     records = [*header.vlrs, *(header.evlrs or ())]
-    for record in records:
-        if record.user_id == "LASF_Projection" and record.record_id == 2112:
-            text = str(getattr(record, "string", "")).strip("\0 ")
-            if re.match(r"[A-Z_0-9]{4,40}\[", text):  # WKT only, none of PROJ's other CRS notations
-                return text
-    for record in records:
-        if record.user_id == "LASF_Projection" and record.record_id == 34735:
-            keys = {k.id: k.value_offset for k in getattr(record, "geo_keys", ()) if k.tiff_tag_location == 0}
-            code = keys.get(3072) or keys.get(2048)  # projected, geographic
-            if code and 1024 <= code < 32767:
-                return f"EPSG:{code}"
+    return [r for r in records if r.user_id == "LASF_Projection" and r.record_id == number]
+
+
+def _wkt(header: Any) -> str | None:
+    """Return the coordinate reference system as WKT, if the file has it."""
+    for record in _records(header, 2112):
+        text = str(getattr(record, "string", "")).strip("\0 ")
+        if re.match(r"[A-Z_0-9]{4,40}\[", text):  # WKT only, none of PROJ's other CRS notations
+            return text
     return None
+
+
+def _geo_keys(header: Any) -> dict[int, int]:
+    """Return the GeoTIFF keys that are codes."""
+    for record in _records(header, 34735):
+        return {k.id: k.value_offset for k in getattr(record, "geo_keys", ()) if k.tiff_tag_location == 0}
+    return {}
+
+
+def _crs(keys: Mapping[int, int], context: ReadContext) -> str | None:
+    """Return the CRS that GeoTIFF keys name by codes, with the unit of its heights if that is not the metre."""
+    code = keys.get(PROJECTED) or keys.get(GEOGRAPHIC)
+    if not code or not 1024 <= code < USER_DEFINED:
+        return None
+    crs, vertical = f"EPSG:{code}", keys.get(VERTICAL, 0)
+    compound = with_vertical(crs, str(vertical)) if 1024 <= vertical < USER_DEFINED else None
+    if compound is not None:
+        return compound
+    unit = UNITS.get(keys.get(VERTICAL_UNITS, 0))
+    try:
+        plane, height = length_units(crs) or (1.0, 1.0)
+        if unit is None and plane != height:
+            unit = plane
+            context.warn(
+                f"the file names no unit of heights: they are read in that of {crs}, {unit:.10g} m; set crs={crs} if "
+                "they are metres",
+                where="crs",
+            )
+        return crs if unit is None or unit == height else with_height_unit(crs, unit)
+    except Invalid:
+        return crs  # an unknown CRS is reported where it is applied
+
+
+def _units(keys: Mapping[int, int]) -> tuple[float, float] | None:
+    """Return the metres of a unit of x and y, and of z, of a CRS without a code; None if both are metres."""
+    unit = UNITS.get(keys.get(PROJECTED_UNITS, 0), 1.0) if keys.get(PROJECTED) == USER_DEFINED else 1.0
+    height = UNITS.get(keys.get(VERTICAL_UNITS, 0), unit)
+    return None if unit == height == 1.0 else (unit, height)
 
 
 # --- writing ------------------------------------------------------------------------------------------------------

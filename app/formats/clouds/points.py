@@ -84,7 +84,7 @@ class Cloud:
 
     width, height: of an organised cloud, width · height = n; else n and 1. viewpoint: x, y, z and the quaternion w, x,
     y, z of the sensor. comments: lines of text. further: counts of the file's other elements by name. crs: as in the
-    file (a code or WKT).
+    file (a code or WKT). units: metres of a unit of x and y, and of z, if there is no CRS; default: metres.
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -94,6 +94,7 @@ class Cloud:
     comments: tuple[str, ...] = ()
     further: Mapping[str, int] = field(default_factory=dict)
     crs: str | None = None
+    units: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.columns["x"])
@@ -212,6 +213,14 @@ def _voxelise(
             )
         local = frame.to_local(earth)
         placed |= {"crs": crs, "datum": frame.datum.as_dict()}
+    elif cloud.units is not None and options.crs is None:
+        context.warn(
+            f"the file names no CRS by a code, but units of {cloud.units[0]:.10g} m (x, y) and {cloud.units[1]:.10g} m "
+            "(z): the points are converted to local metres; set crs=EPSG:… to place them",
+            where="crs",
+        )
+        local = _in_metres(cloud.places(0, len(cloud)), cloud.units)
+        placed["units"] = list(cloud.units)
     n = len(cloud)
 
     def chunks() -> Iterator[Array]:
@@ -289,6 +298,11 @@ def _to_wgs84(cloud: Cloud, options: ReadOptions, context: ReadContext) -> tuple
             f"all points are outside the area of the coordinate reference system {crs[:80]}", where="crs"
         )
     return crs, earth
+
+
+def _in_metres(places: Array, units: Sequence[float]) -> Array:
+    """Convert coordinates from the units of x and y, and of z."""
+    return places * (units[0], units[0], units[1])
 
 
 def _usable(places: Array) -> NDArray[np.bool_]:
@@ -454,7 +468,7 @@ def source(
             )
         return CloudToWrite(lambda: centres(voxels, context), None, "", local=True)
     form = str(source_properties["file"]).rpartition(".")[2]
-    moved = "crs" in source_properties or "origin" in source_properties
+    moved = any(name in source_properties for name in ("crs", "units", "origin"))
     local = moved and (frame == "local" or (frame is None and form not in forms))
     if moved and not local:
         context.warn("the points have the coordinates of the upload; frame=local converts them to the local frame")
@@ -499,6 +513,8 @@ def _to_local(cloud: Cloud, source_properties: Mapping[str, Any], context: Write
         if normals is not None:
             _turn(columns, normals, places, str(source_properties["crs"]), frame)
         places = frame.to_local(crs_to_wgs84(str(source_properties["crs"]), places))
+    elif "units" in source_properties:
+        places = _in_metres(places, source_properties["units"])
     places = places - np.array(source_properties.get("origin", (0.0, 0.0, 0.0)))
     columns |= {axis: places[:, k] for k, axis in enumerate(AXES)}
     if cloud.viewpoint != IDENTITY_VIEWPOINT:
