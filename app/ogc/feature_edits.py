@@ -18,6 +18,7 @@ from app.model.antimeridian import join_at_antimeridian
 from app.model.geodesy import local_frame
 from app.model.layers import PartKey
 from app.ogc.crs import ReferenceSystem
+from app.ogc.poses import SAME, moved_pose
 from app.ogc.tables import collection_of
 from app.ogc.vector import TITLES
 from app.store.content import ContentReader
@@ -25,9 +26,6 @@ from app.store.values import Version
 
 SNAP: Final = 0.5
 """Distance in metres within which the end of an edge is put onto a node."""
-
-SAME: Final = 1e-3
-"""Distance in metres below which the end of an edge is where it was: more than the rounding of GIS programs."""
 
 MAX_JSON_ID: Final = 512
 
@@ -117,6 +115,9 @@ class FeatureEditor:
             _, geometry = self._tie(geometry, merged, stored, {})
         elif not is_moved:
             return self._put(stored.item, stored.geometry, merged, _place_of(stored.key), local=stored.local)
+        elif geometry is not None:
+            before = self._local(stored.geometry, stored.local)
+            merged |= moved_pose(before, geometry, stored.properties, merged)
         return self._put(stored.item, geometry, merged, _place_of(stored.key))
 
     def delete(self, feature: str) -> Mapping[str, Any]:

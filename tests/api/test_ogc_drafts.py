@@ -10,6 +10,7 @@ from tests.api.conftest import Api
 
 Json = dict[str, Any]
 
+CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
 MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 UTM = "http://www.opengis.net/def/crs/EPSG/0/32630"
 MERGE = {"content-type": "application/merge-patch+json"}
@@ -259,3 +260,35 @@ def test_given_ids_are_kept_once(gis: Gis) -> None:
     assert "already" in gis.add("nodes", point(2, 2), 409, id="a/b c").json()["detail"]
     made = {gis.add("nodes", point(k, 3), name="barn").headers["location"] for k in range(2)}
     assert len(made) == 2, "a name that is taken is no id"
+
+
+CRATE = b"""<?xml version="1.0"?><sdf version="1.7"><world name="w"><model name="crate"><static>true</static>
+<pose>2 3 0.5 0 0 0</pose><link name="l"><collision name="c"><geometry><box><size>1 1 1</size></box></geometry>
+</collision></link></model></world></sdf>"""
+
+
+@pytest.mark.parametrize("in_degrees", [False, True])
+def test_object_that_is_moved_by_its_outline_is_moved_in_every_format(gis: Gis, *, in_degrees: bool) -> None:
+    gis.api.upload(gis.env, {"w.sdf": CRATE})
+    shown = gis.item("objects-polygons", "crate", local=not in_degrees)["geometry"]
+    step = 1e-4 if in_degrees else 6.0
+    ring = [[x + step, y] for x, y, *_ in reversed(shown["coordinates"][0])]
+    headers = {"content-crs": f"<{CRS84}>"} if in_degrees else {}
+    gis.patch("objects-polygons", "crate", headers=headers, geometry={"type": "Polygon", "coordinates": [ring]})
+    after = gis.item("objects-polygons", "crate")
+    west, east = (pick(x for x, *_ in after["geometry"]["coordinates"][0]) for pick in (min, max))
+    assert west > 5, "the outline was moved"
+    (draft,) = gis.drafts()
+    gis.api.post(f"environments/{gis.env}/drafts/{draft['id']}/commit", {"message": "moved"})
+    pose = gis.api.get(f"/maps/{gis.env}/gazebo").text.split("<pose>")[1].split("<")[0]
+    assert [float(word) for word in pose.split()] == pytest.approx([(west + east) / 2, 3, 0.5, 0, 0, 0], abs=1e-3)
+
+
+def test_solids_are_not_left_behind_by_another_outline(gis: Gis) -> None:
+    gis.api.upload(gis.env, {"w.sdf": CRATE})
+    shown = gis.item("objects-polygons", "crate")
+    ring = [[x * 2, y] for x, y, *_ in shown["geometry"]["coordinates"][0]]
+    wider = {"type": "Polygon", "coordinates": [ring]}
+    assert "change its 'pose'" in gis.patch("objects-polygons", "crate", 400, geometry=wider).json()["detail"]
+    gis.patch("objects-polygons", "crate", geometry=wider, properties={"pose": [3, 3, 0.5, 0, 0, 0]})
+    assert gis.item("objects-polygons", "crate")["properties"]["pose"][0] == 3
