@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
@@ -174,6 +175,29 @@ def test_moved_end_takes_the_node_at_that_place(gis: Gis) -> None:
     assert path(edge) == [[0, 0], [5, 5], [10, 8]]
     gis.patch("edges", "gate_barn", properties={"target": "barn"})
     assert path(gis.item("edges", "gate_barn")) == [[0, 0], [5, 5], [10, 0]]
+
+
+def test_edge_away_from_its_nodes_stays_there_unless_it_is_moved(gis: Gis) -> None:
+    """Ends of edges of other sources may be metres from their nodes."""
+    features = [gis.item("nodes", name, local=False) for name in ("gate", "barn")]
+    (west, south), (east, north) = (one["geometry"]["coordinates"] for one in features)
+    edge = line((west, south + 2e-5), (east, north + 2e-5))
+    properties = {"kind": "edge", "source": "gate", "target": "barn"}
+    features.append({"type": "Feature", "id": "far", "geometry": edge, "properties": properties})
+    network = json.dumps({"type": "FeatureCollection", "features": features}).encode()
+    gis.api.upload(gis.env, {"n.geojson": network}, layer="topology")
+    start, end = gis.item("edges", "far")["geometry"]["coordinates"]
+    assert start[1] > 2, "more than edges are drawn to their nodes from"
+    gis.patch("edges", "far", properties={"colour": "red"})
+    assert path(gis.item("edges", "far")) == [start, end], "only properties were changed"
+    gis.patch("edges", "far", geometry=line(start, (5, 3), end), properties={"source": None})
+    shown = gis.item("edges", "far")
+    assert path(shown) == [start, [5, 3], end], "only a bend was added"
+    assert (shown["properties"]["source"], shown["properties"]["colour"]) == ("gate", "red")
+    body = {"type": "Feature", "geometry": shown["geometry"], "properties": {}}
+    at = f"{gis.at}/collections/edges/items/far"
+    gis.api("PUT", at, 204, json=body, headers={**GEOJSON, **gis.local})
+    assert path(gis.item("edges", "far")) == [start, [5, 3], end]
 
 
 def test_deleted_node_with_edges_is_refused(api: Api, gis: Gis) -> None:
