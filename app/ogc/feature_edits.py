@@ -19,7 +19,7 @@ from app.model.geodesy import local_frame
 from app.model.layers import PartKey
 from app.ogc.crs import ReferenceSystem
 from app.ogc.poses import SAME, moved_pose
-from app.ogc.tables import collection_of
+from app.ogc.tables import collection_of, unqualified
 from app.ogc.vector import TITLES
 from app.store.content import ContentReader
 from app.store.values import Version
@@ -63,19 +63,16 @@ class FeatureEditor:
 
     def find(self, feature: str) -> Stored:
         """Return a feature by its id in the collection. Raises NotFound."""
-        item, _, place = feature.rpartition("@")
-        for name, at in ((feature, ""), (item, place.partition("#")[0])):
-            for entry in self._version.parts:
-                key = entry.key
-                if key.layer != self._layer or not name or at not in ("", f"{key.level}/{key.name}"):
-                    continue
-                part = self._content.features(self._version, key, ids=[name])
-                for i, geometry, properties, local in zip(
-                    part.ids, part.geometry, part.properties, part.local.tolist(), strict=True
-                ):
-                    kind = shapely.get_type_id(geometry)
-                    if collection_of(self._layer, properties.get("kind"), kind) == self._collection:
-                        return Stored(key, i, geometry, properties, local)
+        keys = [entry.key for entry in self._version.parts if entry.key.layer == self._layer]
+        qualified = [(key, item) for key in keys if (item := unqualified(feature, key)) is not None]
+        for key, item in (*((key, feature) for key in keys), *qualified):
+            part = self._content.features(self._version, key, ids=[item])
+            for i, geometry, properties, local in zip(
+                part.ids, part.geometry, part.properties, part.local.tolist(), strict=True
+            ):
+                kind = shapely.get_type_id(geometry)
+                if collection_of(self._layer, properties.get("kind"), kind) == self._collection:
+                    return Stored(key, i, geometry, properties, local)
         raise NotFound(f"{self._collection} has no feature {feature[:80]!r}")
 
     def create(self, feature: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:

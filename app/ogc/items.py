@@ -266,7 +266,7 @@ async def get_item(
             unknown[0][:80], "is unknown", f"unknown query parameter {unknown[0][:80]!r}{near}; accepted: crs, f"
         )
     output = _output(service, systems, parse_crs(given["crs"], systems, "crs") if "crs" in given else None)
-    row = (await run_in_threadpool(getattr, table, "rows")).get(feature)
+    row = await run_in_threadpool(table.row_of, feature)
     if row is None:
         listed = service.url("collections", collection, "items")
         raise NotFound(f"{collection} has no feature {feature[:80]!r}: list them at {listed}")

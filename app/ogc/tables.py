@@ -6,6 +6,7 @@ number of bytes.
 
 from __future__ import annotations
 
+import re
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
@@ -45,6 +46,8 @@ ROW_BYTES = 900
 
 _PLACED: Final = frozenset({"level", "part", "stored_level", "stored_part"})
 _EDGE: Final = ormsgpack.packb("kind") + ormsgpack.packb("edge")
+
+_NUMBERED: Final = re.compile(r"#[0-9]+\Z")
 
 MAX_PROPERTIES = 1000
 """Maximum number of properties in a collection's schema; further ones are in its features only."""
@@ -140,6 +143,16 @@ class Table:
     def rows(self) -> Mapping[str, int]:
         """Return the row of each id."""
         return {item: row for row, item in enumerate(self.ids)}
+
+    def row_of(self, feature: str) -> int | None:
+        """Return the row of an id, which may be qualified in any case; None if there is none."""
+        row = self.rows.get(feature)
+        ends = [*(start for start, _ in self.parts[1:]), len(self)]
+        for (start, key), end in zip(self.parts, ends, strict=True):
+            item = unqualified(feature, key) if row is None else None
+            if item is not None and item in self.source_ids[start:end]:
+                row = self.source_ids.index(item, start, end)
+        return row
 
     @cached_property
     def boxes(self) -> NDArray[np.float64]:
@@ -248,6 +261,23 @@ def json_types(seen: Iterable[tuple[str, type]]) -> dict[str, frozenset[JsonType
     return {name: frozenset(types) for name, types in out.items()}
 
 
+# --- ids ---
+
+
+def qualifier(key: PartKey) -> str:
+    """Return what follows the id of a feature whose id an earlier part has, too."""
+    return f"@{key.level}/{key.name}"
+
+
+def unqualified(feature: str, key: PartKey) -> str | None:
+    """Return the id in a part of a feature with a qualified id; None if it is not qualified by this part."""
+    for text in (feature, _NUMBERED.sub("", feature)):
+        item = text.removesuffix(qualifier(key))
+        if item and item != text:
+            return item
+    return None
+
+
 # --- from parts to tables ---
 
 
@@ -292,7 +322,7 @@ class _Columns:
         """Return the id, qualified by level and part if an earlier part has the same one."""
         candidate, number = item, 1
         while candidate in self.taken:
-            candidate = f"{item}@{key.level}/{key.name}" + (f"#{number}" if number > 1 else "")
+            candidate = item + qualifier(key) + (f"#{number}" if number > 1 else "")
             number += 1
         self.taken.add(candidate)
         return candidate

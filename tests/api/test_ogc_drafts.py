@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 
@@ -263,6 +264,27 @@ def test_feature_is_the_same_read_alone_or_from_the_table(gis: Gis, collection: 
     for before, query in zip(alone, queries, strict=True):
         now = gis.api.get(f"{at}/{item}{query}")
         assert (now.headers["etag"], now.content) == (before.headers["etag"], before.content), query
+
+
+def test_qualified_ids_are_those_of_their_part_whatever_its_name(gis: Gis) -> None:
+    tree = {"type": "Feature", "id": "n1", "properties": {"kind": "tree"}, "geometry": point(-0.5245, 53.2686)}
+    data = json.dumps({"type": "FeatureCollection", "features": [tree]}).encode()
+    for level in ("A", "B", "Floor #2", "c@d"):
+        gis.api.upload(gis.env, {"o.geojson": data}, layer="objects", level=level)
+    at = f"{gis.at}/collections/objects-points/items"
+    shown = gis.api.get(at).json()["features"]
+    assert [one["properties"]["level"] for one in shown] == ["A", "B", "Floor #2", "c@d"]
+    for one in shown:
+        item = quote(one["id"], safe="")
+        gis.patch("objects-points", item, properties={"note": one["properties"]["level"]})
+        assert gis.item("objects-points", item)["properties"]["note"] == one["properties"]["level"]
+    qualified = quote(f"n1@B/{shown[1]['properties']['part']}", safe="")
+    gis.api("DELETE", f"{at}/n1", 204)
+    assert gis.item("objects-points", qualified)["properties"]["level"] == "B", "also if no other has its id"
+    gis.api("DELETE", f"{at}/{qualified}", 204)
+    gis.api("DELETE", f"{at}/{qualified}", 404)
+    gis.api.get(f"{at}/{qualified}", 404)
+    assert [one["properties"]["level"] for one in gis.api.get(at).json()["features"]] == ["Floor #2", "c@d"]
 
 
 def test_drafts_of_others_are_read_and_not_written(api: Api, farm: str) -> None:
