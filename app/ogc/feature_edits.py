@@ -155,12 +155,10 @@ class FeatureEditor:
         if isinstance(value, float) and value.is_integer() and "number" not in types:
             value = int(value)
         fits: Mapping[str, Any] = {"string": str, "boolean": bool, "array": list, "object": dict}
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (
-            any(isinstance(value, fits[one]) for one in types if one in fits)
-            or (is_number and "number" in types)
-            or (is_number and isinstance(value, int) and "integer" in types)
-        ):
+        is_number = isinstance(value, int) and not isinstance(value, bool)
+        is_number |= isinstance(value, float) and math.isfinite(value)
+        fits_number = is_number and bool(types & {"number", "integer"})  # its values may all be whole by chance
+        if not fits_number and not any(isinstance(value, fits[one]) for one in types if one in fits):
             raise self._type_error(name, types)
         return value
 

@@ -290,7 +290,13 @@ async def get_item(
 # --- schemas ---
 
 
-def _property_schema(types: frozenset[str]) -> dict[str, Any]:
+MEASURES = frozenset({"speed_limit", "width", "height", "base", "value"})
+"""Properties that are numbers, even while all their values are whole."""
+
+
+def _property_schema(name: str, types: frozenset[str]) -> dict[str, Any]:
+    if name in MEASURES and "integer" in types:
+        types |= {"number"}
     kinds = sorted(types - {"integer"} if "number" in types else types)
     return {"type": kinds[0] if len(kinds) == 1 else kinds}
 
@@ -320,7 +326,7 @@ def collection_schema(service: Service, collection: str, table: Table) -> dict[s
     }
     for number, (name, types) in enumerate(table.types.items(), start=2):
         if name not in listed:
-            listed[name] = {"title": name, **_property_schema(types), "x-ogc-propertySeq": number}
+            listed[name] = {"title": name, **_property_schema(name, types), "x-ogc-propertySeq": number}
     return _schema(service, collection, "schema", listed)
 
 
@@ -333,7 +339,7 @@ def queryables_schema(service: Service, collection: str, table: Table) -> dict[s
         }
     }
     for name, types in queryables(table).items():
-        listed.setdefault(name, {"title": name, **_property_schema(types)})
+        listed.setdefault(name, {"title": name, **_property_schema(name, types)})
     return _schema(service, collection, "queryables", listed)
 
 

@@ -244,6 +244,20 @@ def test_types_are_those_of_the_schema(gis: Gis) -> None:
     assert "must be string, as the schema of nodes says" in wrong["detail"]
 
 
+def test_fractions_are_numbers_where_all_were_whole(gis: Gis) -> None:
+    ring = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [0.0, 0.0]]
+    zone = {"type": "Polygon", "coordinates": [ring]}
+    gis.add("zones", zone, id="slow", kind="speed", value=1, rank=1)
+    listed = gis.api.get(f"{gis.at}/collections/zones/schema").json()["properties"]
+    assert (listed["value"]["type"], listed["rank"]["type"]) == ("number", "integer")
+    (draft,) = gis.drafts()
+    gis.api.post(f"environments/{gis.env}/drafts/{draft['id']}/commit", {"message": "a speed zone"})
+    gis.patch("zones", "slow", properties={"value": 0.5, "rank": 2.0})
+    properties = gis.item("zones", "slow")["properties"]
+    assert (properties["value"], repr(properties["rank"])) == (0.5, "2")
+    gis.patch("zones", "slow", 400, properties={"value": "0.5"})
+
+
 def test_if_match_names_the_feature(gis: Gis) -> None:
     at = f"{gis.at}/collections/nodes/items/barn"
     tag = gis.api.get(at).headers["etag"]
