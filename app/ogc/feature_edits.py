@@ -97,6 +97,9 @@ class FeatureEditor:
             if properties.pop(name, value) not in (value, None):
                 problem = Problem(f"must stay {value!r}", where=f"properties.{name}")
                 raise Invalid(f"a feature keeps its {name}: delete it, and add it with the other {name}", [problem])
+        for name in PLACE & stored.properties.keys():  # as features are shown
+            if f"stored_{name}" in properties:
+                properties[name] = properties.pop(f"stored_{name}")
         if properties.get("id") == feature and "id" not in stored.properties:
             del properties["id"]
         merged = {} if replaces else dict(stored.properties)
@@ -139,8 +142,7 @@ class FeatureEditor:
             raise Invalid(
                 "the feature's 'properties' must be an object", [Problem("must be an object", where="properties")]
             )
-        moved = {f"stored_{name}" for name in PLACE}
-        return {name: self._typed(name, value) for name, value in (sent or {}).items() if name not in moved}
+        return {name: self._typed(name, value) for name, value in (sent or {}).items()}
 
     def _typed(self, name: str, value: Any) -> Any:
         """Return a property's value in a type of the schema. Raises Invalid."""

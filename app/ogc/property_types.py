@@ -63,5 +63,6 @@ def _add_leaf(seen: dict[str, dict[tuple[str, type], None]], layer: VectorLayer,
     rows: list[dict[str, Any]] = ormsgpack.unpackb(array_header(len(leaf.ids)) + b"".join(leaf.properties))
     shapes = shapely.get_type_id(from_wkb(leaf.wkb)).tolist() if layer == "objects" else [0] * len(rows)
     for members, shape in zip(rows, shapes, strict=True):
-        pairs = zip(members, map(type, members.values()), strict=True)
+        names = (f"stored_{name}" if name in ("level", "part") else name for name in members)
+        pairs = zip(names, map(type, members.values()), strict=True)
         seen[collection_of(layer, members.get("kind"), shape)].update(dict.fromkeys(pairs))

@@ -239,6 +239,29 @@ def test_put_replaces_and_patch_merges(gis: Gis) -> None:
     gis.api("PUT", f"{at}x", 404, json=body, headers={**GEOJSON, **gis.local})
 
 
+@pytest.mark.parametrize("is_listed_before", [False, True])
+def test_what_was_read_can_be_put_back(gis: Gis, *, is_listed_before: bool) -> None:
+    """A feature has properties of its own called level and part, which are shown as stored_level and stored_part."""
+    properties = {"kind": "tree", "level": 2, "part": "north", "colour": "green"}
+    tree = {"type": "Feature", "id": "oak", "properties": properties, "geometry": point(-0.5245, 53.2686)}
+    data = json.dumps({"type": "FeatureCollection", "features": [tree]}).encode()
+    gis.api.upload(gis.env, {"o.geojson": data}, layer="objects")
+    at = f"{gis.at}/collections/objects-points/items/oak"
+    if is_listed_before:  # types are then those of the cached table
+        gis.api.get(f"{gis.at}/collections/objects-points/items")
+    shown = gis.item("objects-points", "oak")
+    assert (shown["properties"]["stored_level"], shown["properties"]["stored_part"]) == (2, "north")
+    body = {name: shown[name] for name in ("type", "id", "geometry", "properties")}
+    gis.api("PUT", at, 204, json=body, headers={**GEOJSON, **gis.local})
+    assert gis.item("objects-points", "oak")["properties"] == shown["properties"]
+    gis.patch("objects-points", "oak", properties={"stored_level": 3.0, "stored_part": None})
+    after = gis.item("objects-points", "oak")["properties"]
+    assert repr(after["stored_level"]) == "3"
+    assert "stored_part" not in after
+    gis.patch("nodes", "barn", properties={"stored_level": 7})
+    assert gis.item("nodes", "barn")["properties"]["stored_level"] == 7
+
+
 def test_types_are_those_of_the_schema(gis: Gis) -> None:
     wrong = gis.patch("nodes", "barn", 400, properties={"name": 5}).json()
     assert "must be string, as the schema of nodes says" in wrong["detail"]
