@@ -171,6 +171,8 @@ async def stream_events(
 ) -> Response:
     """Stream server-sent events: `event` is the type, `data` the JSON, `id` the number from which to resume.
 
+    The stream begins with an `id` without data: the number that it begins after.
+
     With `robots=true`, `robot.status` has the status of a robot as in `GET /robots`, after each change and at most once
     per second. It has no `id`, because it is not stored: read `GET /robots` after the stream has opened again.
     """
@@ -275,7 +277,8 @@ async def _stream(
 ) -> AsyncIterator[bytes]:
     feed.streams += 1
     try:
-        yield b": Fleet Map Server\nretry: 2000\n\n"
+        # The id tells clients that lose the stream before its first event where to resume.
+        yield b": Fleet Map Server\nretry: 2000\nid: %d\n\n" % start
         quiet = 0.0
         loop = asyncio.get_running_loop()
         while True:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 from collections.abc import Iterator
@@ -39,6 +40,15 @@ def test_stream_sends_stored_and_new_events(api: Api, bare: str) -> None:
     number, kind, body = next(following)
     assert (number, kind, body["version"]) == (3, "version.created", 2)
     following.close()
+
+
+def test_stream_without_events_can_be_resumed(api: Api, bare: str) -> None:
+    with api.http.stream("GET", f"{API}/events", params={"environment": bare}, timeout=60) as answer:
+        beginning = list(itertools.takewhile(bool, answer.iter_lines()))
+    assert "id: 1" in beginning, "the environment's creation"
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2()})
+    seen = list(stream(api, environment=bare, headers={"last-event-id": "1"}, follow="false"))
+    assert [(n, kind) for n, kind, _ in seen] == [(2, "version.created")]
 
 
 def test_stream_covers_all_environments_of_a_token(api: Api, fresh: Any) -> None:

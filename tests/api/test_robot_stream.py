@@ -23,8 +23,9 @@ ROOT = "5" * 64
 def messages(answer: httpx.Response) -> Iterator[dict[str, str]]:
     fields: dict[str, str] = {}
     for line in answer.iter_lines():
-        if not line and "data" in fields:
-            yield fields
+        if not line:
+            if "data" in fields:
+                yield fields
             fields = {}
         elif not line.startswith(":"):
             name, _, value = line.partition(": ")

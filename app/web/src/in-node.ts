@@ -15,6 +15,9 @@ const nothing = () => undefined;
 /** Addresses that the page has gone to. */
 export const visited: string[] = [];
 
+/** Streams of events that the page has opened. */
+export const sources: EventSource[] = [];
+
 /** Listeners of the window, or of the service worker, by type of event. */
 export const listeners = new Map<string, (event: never) => void>();
 
@@ -35,6 +38,15 @@ Object.assign(globalThis, {
   sessionStorage: storage(),
   matchMedia: () => ({ matches: false, addEventListener: nothing }),
   document: { documentElement: { dataset: {} } },
+  EventSource: class {
+    static readonly CLOSED = 2;
+    readyState = 0;
+    addEventListener = nothing;
+    close = nothing;
+    constructor(readonly url: string) {
+      sources.push(this as unknown as EventSource);
+    }
+  },
   BroadcastChannel: class {
     postMessage = nothing;
     close = nothing;

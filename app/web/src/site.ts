@@ -93,7 +93,7 @@ export class Site {
   private extentControl = new AbortController();
 
   constructor(readonly name: string) {
-    this.events = new EventStream(name);
+    this.events = new EventStream(name, () => void this.refresh());
     this.stops.push(
       this.events.subscribe((event) => {
         if (event.type.startsWith("version.") || event.type.startsWith("channel.")) this.refresh();

@@ -1,4 +1,4 @@
-/** Events of the server, resumed by the browser at the last one received. */
+/** Events of the server. The browser resumes at the last one received; what may be missed is read again. */
 import { signal } from "@preact/signals";
 import { apiPath, request } from "./client";
 
@@ -37,15 +37,21 @@ const MAX_PAUSE = 30_000;
 /** Whether events arrive. */
 export const live = signal(false);
 
-/** Stream of an environment's events (null: of all). Ends with `close`. */
+/** Stream of an environment's events (null: of all). Ends with `close`.
+ *
+ * onReturn: called when the stream is open again. A stream that the server has refused begins with new events: the log may
+ * be another one, from a backup, in which its place does not exist. */
 export class EventStream {
   private source: EventSource | null = null;
   private timer = 0;
   private pause = 1000;
-  private last = "";
+  private wasLost = false;
   private readonly listeners = new Set<Listener>();
 
-  constructor(private readonly environment: string | null) {
+  constructor(
+    private readonly environment: string | null,
+    private readonly onReturn: () => void,
+  ) {
     this.open();
   }
 
@@ -63,16 +69,18 @@ export class EventStream {
   }
 
   private open(): void {
-    const source = new EventSource(
-      apiPath(["events"], { environment: this.environment, since: this.last, robots: this.environment ? true : null }),
-    );
+    const { environment } = this;
+    const source = new EventSource(apiPath(["events"], { environment, robots: environment ? true : null }));
     this.source = source;
     source.onopen = () => {
       live.value = true;
       this.pause = 1000;
+      if (this.wasLost) this.onReturn();
+      this.wasLost = false;
     };
     source.onerror = () => {
       live.value = false;
+      this.wasLost = true;
       if (source.readyState !== EventSource.CLOSED) return; // the browser tries again by itself
       void request("/api/v1/session").catch(() => undefined); // has the session ended, or does the server not answer?
       this.timer = window.setTimeout(() => this.open(), this.pause);
@@ -80,7 +88,6 @@ export class EventStream {
     };
     for (const type of TYPES) {
       source.addEventListener(type, (message: MessageEvent<string>) => {
-        if (message.lastEventId) this.last = message.lastEventId;
         const event = { ...JSON.parse(message.data), type } as FleetEvent; // a robot's status has no type
         for (const listener of this.listeners) listener(event);
       });

@@ -41,7 +41,7 @@ export function Sites() {
   );
   useEffect(() => {
     document.title = "Sites – Fleet Map Server";
-    const stream = new EventStream(null);
+    const stream = new EventStream(null, sites.reload);
     const stop = stream.subscribe((event) => {
       if (/^(environment|version)\./.test(event.type)) sites.reload();
     });
