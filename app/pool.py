@@ -8,10 +8,13 @@ memory. The server itself is never forked, since it has native threads. Workers 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
+import io
 import logging
 import multiprocessing
 import os
+import pickle
 import queue
 import resource
 import threading
@@ -19,6 +22,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -45,11 +49,40 @@ IDLE_SECONDS = 1.0
 CANCEL_POLL_SECONDS = 0.2
 """Seconds between two checks of a queued job for its cancellation."""
 
+_VALUE_TYPES = {
+    "builtins": frozenset({"bytearray", "complex", "frozenset", "range", "set", "slice", "bytes", "RuntimeError"}),
+    "collections": frozenset({"Counter", "OrderedDict"}),
+    "datetime": frozenset({"date", "datetime", "time", "timedelta", "timezone"}),
+    "numpy": frozenset({"dtype", "ndarray"}),
+    **dict.fromkeys(("numpy._core.multiarray", "numpy.core.multiarray"), frozenset({"_reconstruct", "scalar"})),
+    **dict.fromkeys(("numpy._core.numeric", "numpy.core.numeric"), frozenset({"_frombuffer"})),
+}
+"""Module -> names that an answer may have besides app's dataclasses, named tuples, texts, enumerations and errors."""
+
 
 def preload_in_background(warm: tuple[str, ...] = PRELOADED_MODULES) -> None:
     """Start the process that workers are forked from, without waiting for its imports."""
     _processes.set_forkserver_preload(list(warm))
     forkserver.ensure_running()
+
+
+class _AnswerReader(pickle.Unpickler):
+    """Reads what a worker sends, which a hostile file may have taken over: values, and nothing that does something."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return a type of values. Raises UnpicklingError for any other."""
+        if name in _VALUE_TYPES.get(module, ()):
+            return super().find_class(module, name)
+        if module.startswith("app.") and not module.endswith("__main__"):
+            found = super().find_class(module, name)
+            if isinstance(found, type) and found.__module__ == module and _is_of_values(found):
+                return found
+        log.error("pool: a worker sent %s.%s, which is no type of values; its answer is refused", module, name)
+        raise pickle.UnpicklingError(f"a worker sent {module}.{name}, which is no type of values")
+
+
+def _is_of_values(found: type) -> bool:
+    return dataclasses.is_dataclass(found) or issubclass(found, FleetMapError | tuple | str | Enum)
 
 
 class WorkerDied(FleetMapError):
@@ -299,7 +332,7 @@ def _call_worker(
         while True:
             if not worker.pipe.poll(max(0.0, end - time.monotonic())):
                 raise WorkerDied(f"the time limit of {seconds:g} seconds was exceeded")
-            ok, value = worker.pipe.recv()
+            ok, value = _AnswerReader(io.BytesIO(worker.pipe.recv_bytes())).load()
             if ok is not None:
                 break
             if note is not None:
@@ -345,7 +378,7 @@ def _work(
         except MemoryError:
             answer = (False, _no_memory())
         except FleetMapError as error:
-            answer = (False, error)
+            answer = (False, _as_ours(error))
         except Exception as error:  # noqa: BLE001  a bug: send the parent its traceback, for the log
             trace = "".join(traceback.format_exception(error))
             answer = (False, RuntimeError(f"{type(error).__name__} in a worker\n{trace}"))
@@ -360,6 +393,14 @@ def _work(
         except Exception as error:  # noqa: BLE001  a result that cannot be pickled is a bug, too
             with contextlib.suppress(OSError):
                 pipe.send((False, RuntimeError(f"sending a worker's result failed: {error}")))
+
+
+def _as_ours(error: FleetMapError) -> FleetMapError:
+    """Return an error as one of app: the server does not read classes of plug-ins."""
+    if type(error).__module__.startswith("app."):
+        return error
+    ours: type[FleetMapError] = next(kind for kind in type(error).__mro__ if kind.__module__.startswith("app."))
+    return ours(error.detail, error.problems)
 
 
 def _no_memory() -> TooLarge:

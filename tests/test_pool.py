@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -11,16 +13,20 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 from multiprocessing import forkserver
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from app import progress, sandbox
 from app.errors import NotFound, Problem, TooLarge, Unavailable
-from app.pool import CancelHandle, Cancelled, Pool, WorkerDied
+from app.pool import CancelHandle, Cancelled, Pool, WorkerDied, _AnswerReader
 from app.progress import Progress
 from app.sandbox import SandboxPolicy
+from app.store.changes import KEEP
 
 
 def work_double(x: int) -> int:
@@ -69,6 +75,44 @@ class _Unsendable:
         return bytes, (bytes(64 * 2**30),)
 
 
+class _Call:
+    """Result that calls a function where it is read."""
+
+    def __init__(self, function: Any, *args: object) -> None:
+        self.call = function, args
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def work_call_back(name: str, folder: str) -> _Call:
+    calls = {
+        "program": _Call(os.system, f"touch {folder}/made"),
+        "builtin": _Call(eval, f"open({folder + '/made'!r}, 'w')"),
+        "function of app": _Call(sandbox.landlock_version),
+        "class of app": _Call(Pool, 1),
+    }
+    return calls[name]
+
+
+class PluginError(NotFound):
+    """Error of a distribution that the server need not know."""
+
+
+def work_refuse_as_plugin() -> None:
+    raise PluginError("nothing here", [Problem("gone", "a.yaml", 3)])
+
+
+VALUES = [
+    *(None, True, 2**70, 1.5, "é", b"x", [1], (2,), {"a": {3}}, frozenset({4}), bytearray(b"y"), 1j),
+    *(datetime(2026, 1, 2, tzinfo=UTC), timedelta(seconds=3), np.float64(0.5), KEEP, Problem("gone", line=3)),
+]
+
+
+def work_values() -> list[object]:
+    return VALUES
+
+
 def work_steps() -> int:
     progress.report(0.0, "reading")
     with progress.within(0.2, 0.6):
@@ -104,6 +148,33 @@ def test_worker_errors_keep_their_class_and_locations(pool: Pool) -> None:
 def test_bug_in_a_worker_is_reported_with_its_traceback(pool: Pool) -> None:
     with pytest.raises(RuntimeError, match="KeyError in a worker"):
         pool.run(work_bug)
+
+
+@pytest.mark.parametrize("name", ["program", "builtin", "function of app", "class of app"])
+def test_answer_of_a_worker_calls_nothing(pool: Pool, tmp_path: Path, name: str) -> None:
+    with pytest.raises(pickle.UnpicklingError, match="no type of values"):
+        pool.run(work_call_back, name, str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+    assert pool.run(work_double, 1) == 2
+
+
+@pytest.mark.parametrize("name", ["os.system", "multiprocessing.Process", "BaseProcess", "importlib.import_module"])
+def test_answer_of_a_worker_gets_no_foreign_name_through_app(name: str) -> None:
+    data = b"\x80\x04\x8c\x08app.pool\x8c" + bytes([len(name)]) + name.encode() + b"\x93."
+    with pytest.raises(pickle.UnpicklingError, match="no type of values"):
+        _AnswerReader(io.BytesIO(data)).load()
+
+
+def test_values_return_from_a_worker(pool: Pool) -> None:
+    assert pool.run(work_values) == VALUES
+    array = pool.run(np.arange, 5)
+    assert (array.dtype, array.tolist()) == (np.arange(5).dtype, [0, 1, 2, 3, 4])
+
+
+def test_errors_of_plugins_return_as_errors_of_app(pool: Pool) -> None:
+    with pytest.raises(NotFound, match="nothing here") as caught:
+        pool.run(work_refuse_as_plugin)
+    assert (type(caught.value), caught.value.problems) == (NotFound, (Problem("gone", "a.yaml", 3),))
 
 
 def test_crash_fails_one_job_and_worker_is_replaced(pool: Pool) -> None:

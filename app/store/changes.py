@@ -33,6 +33,9 @@ class Keep(enum.Enum):
 
     KEEP = "keep"
 
+    def __reduce_ex__(self, _: object) -> tuple[type[Keep], tuple[str]]:
+        return type(self), (self.value,)  # Python 3.11 would call getattr, which no answer of a worker may do
+
 
 KEEP: Final = Keep.KEEP
 
