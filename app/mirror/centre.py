@@ -6,6 +6,7 @@ import base64
 import contextlib
 import json
 import secrets
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Final
@@ -21,6 +22,9 @@ from app.store.values import rfc3339
 
 API: Final = "/api/v1"
 MAX_PAGE_BYTES: Final = 512 * 2**20
+PIECE_BYTES: Final = 2**20
+"""Maximum size of a decoded piece of a body, however small it was packed."""
+
 TIMEOUT: Final = httpx.Timeout(10.0, read=60.0)
 STREAM_SECONDS: Final = 60.0
 """Maximum time without data on the stream of events; a server sends a comment every 15 seconds."""
@@ -49,7 +53,7 @@ class Centre:
     ) -> None:
         self.url, self.key, self._given = url.rstrip("/"), key, given
         self._http = client or httpx.Client(timeout=TIMEOUT)
-        self._headers = {"authorization": authorization(token)}
+        self._headers = {"authorization": authorization(token), "accept-encoding": "gzip"}
         self.received = self.sent = 0
 
     def close(self) -> None:
@@ -113,10 +117,9 @@ class Centre:
             self._http.stream("POST", self.url + path, json=body, headers=self._headers) as answer,
         ):
             if answer.status_code != 200:
-                answer.read()
-                raise self._problem(answer)
+                raise self._problem(answer, self._body(answer))
             try:
-                yield answer.iter_bytes()
+                yield self._pieces(answer)
             finally:
                 self._count(answer)
 
@@ -143,15 +146,18 @@ class Centre:
         """Wait until the centre has an event after a position of its log; False if the connection ends before."""
         timeout = httpx.Timeout(10.0, read=STREAM_SECONDS)
         with (
-            contextlib.suppress(httpx.HTTPError),
+            contextlib.suppress(httpx.HTTPError, FleetMapError),
             self._http.stream(
                 "GET", f"{self.url}{API}/events", params={"since": position}, headers=self._headers, timeout=timeout
             ) as answer,
         ):
             if answer.status_code == 200:
-                for line in answer.iter_lines():
-                    if line.startswith("data:"):
+                last = b""
+                for piece in self._pieces(answer):
+                    *lines, last = (last + piece).split(b"\n")
+                    if any(line.startswith(b"data:") for line in lines):
                         return True
+                    last = last[: len(b"data:")]  # all that matters of a line, which may be endless
         return False
 
     def _parsed(self, data: bytes) -> Any:
@@ -165,15 +171,45 @@ class Centre:
             self._errors(),
             self._http.stream(method, self.url + API + path, headers=self._headers, **more) as answer,
         ):
-            data = bytearray()
-            for piece in answer.iter_bytes():
-                data += piece
-                if len(data) > MAX_PAGE_BYTES:
-                    raise Untrusted(f"{self.url} sent more than {MAX_PAGE_BYTES} bytes: this is no Fleet Map Server")
+            data = self._body(answer)
             self._count(answer)
             if answer.status_code != 200:
-                raise self._problem(answer, bytes(data))
-            return bytes(data), answer.headers
+                raise self._problem(answer, data)
+            return data, answer.headers
+
+    def _body(self, answer: httpx.Response) -> bytes:
+        data = bytearray()
+        for piece in self._pieces(answer):
+            data += piece
+            if len(data) > MAX_PAGE_BYTES:
+                raise Untrusted(f"{self.url} sent more than {MAX_PAGE_BYTES} bytes: this is no Fleet Map Server")
+        return bytes(data)
+
+    def _pieces(self, answer: httpx.Response) -> Iterator[bytes]:
+        """Iterate over a body. httpx would decode each piece as a whole: 1 KiB may unpack to gigabytes.
+
+        Raises Untrusted for a coding that was not requested, Unavailable if the body is damaged or ends early.
+        """
+        coding = answer.headers.get("content-encoding", "identity").lower()
+        if coding == "identity":
+            yield from answer.iter_raw()
+            return
+        if coding != "gzip":
+            raise Untrusted(f"{self.url} used the Content-Encoding {coding[:80]!r}, which was not requested")
+        decoder = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+        try:
+            for raw in answer.iter_raw():
+                packed = raw
+                while packed and not decoder.eof:
+                    if piece := decoder.decompress(packed, PIECE_BYTES):
+                        yield piece
+                    packed = decoder.unconsumed_tail
+            if piece := decoder.flush():
+                yield piece
+        except zlib.error as error:
+            raise Unavailable(f"{self.url} sent a damaged body: {error}") from error
+        if not decoder.eof:
+            raise Unavailable(f"{self.url} sent a body that ended early")
 
     def _count(self, answer: httpx.Response) -> None:
         self.received += answer.num_bytes_downloaded
@@ -188,10 +224,10 @@ class Centre:
         except httpx.HTTPError as error:
             raise Unavailable(f"no connection to {self.url}: {type(error).__name__}: {error}") from error
 
-    def _problem(self, answer: httpx.Response, data: bytes | None = None) -> FleetMapError:
+    def _problem(self, answer: httpx.Response, data: bytes) -> FleetMapError:
         """Return the error of a response."""
         try:
-            detail = str(json.loads(answer.content if data is None else data)["detail"])
+            detail = str(json.loads(data)["detail"])
         except (ValueError, KeyError, TypeError):
             detail = f"status {answer.status_code}"
         text = f"{self.url}: {detail[:500]}"

@@ -25,6 +25,7 @@ from app.store.mirror_target import MirrorPage
 from app.store.store import Store
 
 MAX_CHUNK_BYTES: Final = 2**28
+MAX_HEAD_BYTES: Final = 2**12
 BATCH_BYTES: Final = 4 * 2**20
 """Bytes of chunks or small files that are stored in one transaction."""
 
@@ -114,7 +115,10 @@ class Fetcher:
             files: list[Path] = []
             bases: list[str | None] = []
             for expected in names:
-                head = ormsgpack.unpackb(frames.read(int.from_bytes(frames.read(4))))
+                head_length = int.from_bytes(frames.read(4))
+                if head_length > MAX_HEAD_BYTES:
+                    raise Untrusted(f"{page.name}: {self._centre.url} sent {head_length} bytes before a file")
+                head = ormsgpack.unpackb(frames.read(head_length))
                 name, size, coding, base, length = _checked_head(head, expected)
                 base_data = b"" if base is None else self._base(base, files, bases)
                 if base_data is None:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import gzip
 import itertools
+import json
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from sqlalchemy import update
 
 from app.errors import Denied, FleetMapError, Unauthenticated, Unavailable, Untrusted
+from app.mirror.centre import Centre
 from app.store import tables
 from tests.api import samples
 from tests.api.conftest import Api, create_farm, running, settings_for
@@ -232,3 +237,81 @@ def test_token_limits_what_is_mirrored(centre: Api, farm: str, alone: Make) -> N
         edge.centre.page(other, -1, 0)
     viewer = centre.token_for("viewer")
     viewer.problem("GET", f"environments/{own}/mirror?nonce={'n' * 16}", 403)
+
+
+def centre_of(answer: Callable[[httpx.Request], httpx.Response]) -> Centre:
+    return Centre("http://centre", "token", client=httpx.Client(transport=httpx.MockTransport(answer)))
+
+
+def peak_bytes(action: Callable[[], object]) -> int:
+    """Return the most memory that an action took at once."""
+    tracemalloc.start()
+    try:
+        action()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_packed_answer_takes_no_more_memory_than_a_page_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.mirror.centre.MAX_PAGE_BYTES", 2**20)
+    bomb = gzip.compress(bytes(2**26))
+    packed = centre_of(
+        lambda _: httpx.Response(200, headers={"content-encoding": "gzip"}, stream=httpx.ByteStream(bomb))
+    )
+
+    def read() -> None:
+        with packed.content("farm", {}) as pieces:
+            assert len(next(pieces)) <= 2**20
+        with pytest.raises(Untrusted, match="more than 1048576 bytes"):
+            packed.listing()
+
+    assert peak_bytes(read) < 2**24
+
+
+def test_packed_answer_is_read_whole() -> None:
+    lines = [{"key": "k" * 200}] * 3000
+    data = gzip.compress(json.dumps(lines).encode())
+    pieces = [data[k : k + 7] for k in range(0, len(data), 7)]
+    headers = {"content-encoding": "gzip"}
+    assert centre_of(lambda _: httpx.Response(200, headers=headers, content=iter(pieces))).keys() == lines
+    for damaged in (data[:-9], b"x" + data, data[:50] + b"\0\0\0\0" + data[54:]):
+        broken = centre_of(
+            lambda _, damaged=damaged: httpx.Response(200, headers=headers, stream=httpx.ByteStream(damaged))
+        )  # type: ignore[misc]
+        with pytest.raises(Unavailable):
+            broken.keys()
+
+
+def test_large_head_of_a_file_is_not_read(farm: str, alone: Make) -> None:
+    edge = alone(farm)
+
+    def enlarged(body: bytes) -> bytes:
+        return (2**30).to_bytes(4) + body[4:] if body[4:5] == b"\x95" else body  # a head is an array of five
+
+    edge.wire.change = only("/content", enlarged)
+    failures = edge.mirror.run_once().failures
+    assert "sent 1073741824 bytes before a file" in failures[farm]
+    edge.wire.change = None
+    edge.follow()
+
+
+def test_coding_that_was_not_requested_is_refused() -> None:
+    with pytest.raises(Untrusted, match="'zstd', which was not requested"):
+        centre_of(
+            lambda _: httpx.Response(200, headers={"content-encoding": "zstd"}, stream=httpx.ByteStream(b"x"))
+        ).keys()
+
+
+@pytest.mark.parametrize(("end", "has_event"), [(b"", False), (b"\ndata: {}\n", True), (b"data: {}\n", False)])
+def test_endless_line_of_events_takes_no_memory(end: bytes, has_event: bool) -> None:
+    pieces = itertools.chain((b"x" * 2**16 for _ in range(1000)), [end])
+    centre = centre_of(lambda _: httpx.Response(200, content=pieces))
+    outcome: list[bool] = []
+    assert peak_bytes(lambda: outcome.append(centre.wait_for_event(1))) < 2**22
+    assert outcome == [has_event]
+
+
+def test_event_is_found_in_pieces() -> None:
+    pieces = [b": hello\n\nid: 1\nda", b"t", b"a: {}", b"\n"]
+    assert centre_of(lambda _: httpx.Response(200, content=iter(pieces))).wait_for_event(1)
