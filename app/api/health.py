@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import re
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
@@ -77,7 +78,7 @@ async def readyz(
     - `mqtt`: the same for the MQTT broker, if there is one.
     - `mirror`: on a server that mirrors another one: `connected`, `starting` or `cut off`, the time of the last
       contact, how many changes wait for the centre, until when robots accept its manifests without contact, and how
-      many statuses of robots the centre refused (`skipped`), by environment, if it did.
+      many statuses of robots the centre refused (`skipped`), if it did.
     - `ros2`: number of published topics, if the ROS 2 publisher is enabled; `standby`: another server publishes them.
     """
     services: Services = request.app.state.services
@@ -107,9 +108,14 @@ async def readyz(
         "cache": services.maps.cache.problem or "ok",
     }
     mirror = await run_in_threadpool(services.store.mirrors.describe)
-    shown = ("state", "contact", "waiting", "serves_until", "skipped")
-    mirrored = {} if mirror is None else {"mirror": {name: mirror[name] for name in shown if name in mirror}}
+    mirrored = {} if mirror is None else {"mirror": _mirror_state(mirror)}
     return json_response({**state, "events": events, **broker, **topics, **mirrored})
+
+
+def _mirror_state(mirror: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what everybody may know of a mirror: no names of environments."""
+    shown = {name: mirror[name] for name in ("state", "contact", "waiting", "serves_until") if name in mirror}
+    return {**shown, **({"skipped": sum(mirror["skipped"].values())} if "skipped" in mirror else {})}
 
 
 @root_router.get(
