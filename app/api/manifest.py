@@ -372,9 +372,10 @@ def _list_files(
         try:
             recipe = _recipe(services, version, entry)
             cached_map = services.maps.get_cached(recipe) or cached_maps.get(recipe.key)
-            failure = None if cached_map is not None or entry.required else services.maps.failure(recipe)
-            if failure is not None:
-                raise failure
+            if cached_map is None and not entry.required:
+                failure = services.maps.failure(recipe, len(entries))
+                if failure is not None:
+                    raise failure
         except UNAVAILABLE as error:
             if entry.required:
                 raise _with_format_name(error, entry) from error

@@ -55,7 +55,7 @@ MAX_HOLD_ATTEMPTS = 5
 """Maximum number of conversions of a map that the cache evicts at once."""
 
 FAILURE_SECONDS = 60.0
-"""Seconds before a failed optional map is tried again."""
+"""Minimum number of seconds before a failed optional map is tried again; see ``Maps.failure``."""
 
 MAX_CACHED_RESULTS = 1000
 """Maximum number of maps with a cached failure, or with cached warnings about edges that cross obstacles."""
@@ -84,7 +84,7 @@ class Maps:
         self.cache = Cache(cache_dir, cache_bytes, shared)
         self._trials = Trials(cache_dir / "trials")
         self._crossings_cache: dict[Any, list[Problem]] = {}
-        self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
+        self._failures: OrderedDict[str, tuple[float, float, FleetMapError]] = OrderedDict()
         self._detours: OrderedDict[str, tuple[ChainFailure, ...]] = OrderedDict()
         self._guard = threading.Lock()
 
@@ -192,6 +192,7 @@ class Maps:
 
     def _convert(self, recipe: Recipe, stop: CancelHandle | None) -> CachedMap:
         """Convert exactly this recipe and cache failures: that of a step which finds nothing to use, for all maps."""
+        started = time.monotonic()
         try:
             if recipe.members:
                 return self.cache.get_or_fetch(recipe.key) or self._assemble(recipe, stop)
@@ -202,7 +203,7 @@ class Maps:
                 self._trials.add(key, ChainFailure.from_error(error), lasting=is_lasting(recipe.chain))
             raise
         except (CannotConvert, NotFound, Invalid) as error:
-            self.note_failure(recipe, error)
+            self.note_failure(recipe, error, time.monotonic() - started)
             raise
 
     def _find_losses(self, recipe: Recipe, stop: CancelHandle | None) -> ConvertedMap:
@@ -220,16 +221,20 @@ class Maps:
             raise CannotConvert(f"the map in {recipe.format.name} could not be read back: {error.detail}") from error
         return ConvertedMap({"losses.json": (content, "application/json")}, None, cached_map.report)
 
-    def failure(self, recipe: Recipe) -> FleetMapError | None:
-        """Return the error of a recent conversion that content or parameters made impossible, or None."""
-        with self._guard:
-            since, error = self._failures.get(recipe.key, (0.0, None))
-        return error if time.monotonic() - since < FAILURE_SECONDS else None
+    def failure(self, recipe: Recipe, formats: int = 1) -> FleetMapError | None:
+        """Return the error of a recent conversion that content or parameters made impossible, or None.
 
-    def note_failure(self, recipe: Recipe, error: FleetMapError) -> None:
-        """Remember that this map could not be made, here or by another process."""
+        formats: number of maps that are wanted together. A failure counts until each of them may have failed as slowly,
+        twice: otherwise the first one would be tried again before the last has failed, for ever.
+        """
         with self._guard:
-            self._failures[recipe.key] = (time.monotonic(), error)
+            since, seconds, error = self._failures.get(recipe.key, (0.0, 0.0, None))
+        return error if time.monotonic() - since < max(FAILURE_SECONDS, 2 * formats * seconds) else None
+
+    def note_failure(self, recipe: Recipe, error: FleetMapError, seconds: float) -> None:
+        """Remember that this map could not be made, here or by another process, and how long that took."""
+        with self._guard:
+            self._failures[recipe.key] = (time.monotonic(), seconds, error)
             self._failures.move_to_end(recipe.key)
             while len(self._failures) > MAX_CACHED_RESULTS:
                 self._failures.popitem(last=False)

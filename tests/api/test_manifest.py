@@ -10,6 +10,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import httpx
@@ -19,6 +20,9 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from app.api.http.deltas import Deltas
+from app.convert import maps as map_service
+from app.convert.maps import Maps
+from app.errors import CannotConvert
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 
@@ -116,6 +120,29 @@ def test_unknown_formats_are_refused(api: Api, unchanged_farm: str, formats: str
 def test_unavailable_format_reports_missing_inputs(api: Api, bare: str) -> None:
     problem = api.problem("GET", f"environments/{bare}/versions/latest/manifest?formats=tmap2", 422)
     assert "supply" in problem["detail"]
+
+
+def test_optional_formats_that_fail_slowly_are_missing(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each was tried again before the other had failed, and the manifest was never signed."""
+    clock, tried, convert = [1000.0], [], Maps._run_conversion
+
+    def fail_slowly(maps: Maps, recipe: Any, stop: Any) -> Any:
+        if recipe.format.name == "tmap2":
+            return convert(maps, recipe, stop)
+        tried.append(recipe.format.name)
+        assert len(tried) < 10
+        clock[0] += 70.0
+        raise CannotConvert("the time limit was exceeded")
+
+    monkeypatch.setattr(Maps, "_run_conversion", fail_slowly)
+    monkeypatch.setattr(map_service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    place = f"environments/{farm}/versions/latest/manifest?formats=tmap2&optional=kml,geojson,lanelet2"
+    missing = {"geojson", "kml", "lanelet2"}
+    assert {line["format"] for line in api.get(place).json()["missing"]} == missing
+    assert sorted(tried) == sorted(missing)
+    clock[0] += 2 * 4 * 70.0
+    assert {line["format"] for line in api.get(f"{place}&closures=mark").json()["missing"]} == missing
+    assert len(tried) == 6, "each is tried again later"
 
 
 def test_rotated_key_is_endorsed(api: Api, farm: str) -> None:

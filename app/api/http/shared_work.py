@@ -82,11 +82,12 @@ class SharedWork:
 
         Raises the errors of the conversion, NoWorkersError, and Cancelled after ``stop`` or if others cancelled it.
         """
+        started = time.monotonic()
         job = self._wait(job.id, stop)
         if job.state == "failed":
             error = error_from_json(job.outcome)
             if isinstance(error, CannotConvert | NotFound | Invalid):
-                self._maps.note_failure(recipe, error)
+                self._maps.note_failure(recipe, error, time.monotonic() - started)
             raise error
         if job.state == "cancelled":
             raise Cancelled("the conversion was cancelled: request it again")
