@@ -7,11 +7,13 @@ from collections.abc import Mapping
 
 from app import formats
 from app.api.http.dependencies import Services
+from app.convert import site
 from app.errors import CannotConvert, NotFound
 from app.events import cdr
 from app.events.ros2 import TopicContent
 from app.events.ros_names import EnvironmentSelector, namespace_of
 from app.formats import ReadContext
+from app.model import masks
 from app.model.frame import GROUND
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP
@@ -55,7 +57,7 @@ def topic_content(services: Services, derive: bool, version: Version) -> TopicCo
     """Load the grid of each level, and the network. derive: also derive content that is not stored."""
     absent: list[str] = []
     grids: dict[str, cdr.Grid] = {}
-    for values in _grids(version, derive):
+    for values in _grids(version, derive, absent):
         try:
             grids[values["level"]] = _grid(services, version, values, derive)
         except (CannotConvert, NotFound) as error:
@@ -72,15 +74,27 @@ def topic_content(services: Services, derive: bool, version: Version) -> TopicCo
     return TopicContent(by_level, network, tuple(absent))
 
 
-def _grids(version: Version, derive: bool) -> list[dict[str, str]]:
-    """Select options of ``occupancy_grid``: on each level the stored grid ``map``, else the only one of any name."""
+def _grids(version: Version, derive: bool, absent: list[str]) -> list[dict[str, str]]:
+    """Select options of ``occupancy_grid``: on each level the grid ``map``, else the only one that is no mask.
+
+    absent: gets the levels with several others.
+    """
     stored = [e.key for e in version.parts if e.key.layer == "occupancy" and e.count]
-    names = {key.name for key in stored}
-    name = MAP if MAP in names or len(names) != 1 else names.pop()
-    levels = {key.level for key in stored if key.name == name}
     if derive and not stored:
-        levels = {level.name for level in version.levels}
-    return [{"grid": name, "level": level} for level in sorted(levels)]
+        return [{"grid": MAP, "level": level.name} for level in sorted(version.levels, key=lambda one: one.name)]
+    parts = formats.get_format("occupancy_grid").selection.parts
+    assert parts is not None
+    names: dict[str, list[str]] = {}
+    for key in stored:
+        if key.name not in masks.MASKS:
+            names.setdefault(key.level, []).append(key.name)
+    chosen = {level: site.default_name(parts, of_level) for level, of_level in sorted(names.items())}
+    absent += [
+        f"no grid of the level {level}: name one {MAP}; its grids: {', '.join(names[level])[:500]}"
+        for level, name in chosen.items()
+        if name is None
+    ]
+    return [{"grid": name, "level": level} for level, name in chosen.items() if name is not None]
 
 
 def _grid(services: Services, version: Version, values: Mapping[str, str], derive: bool) -> cdr.Grid:

@@ -23,6 +23,7 @@ import yaml
 import zenoh
 from zenoh import ext
 
+from app.api.ros2 import topic_content
 from app.backends.lead import LocalLeads
 from app.backends.notify import CommitCounter
 from app.errors import Unavailable
@@ -362,6 +363,18 @@ def test_each_level_has_its_topic_and_the_lowest_needs_no_name(api: Api, session
     assert grid_of(Heard(session, f"5/tower/L2/map/{GRID}").wait())["cells"][1, 1] == 100
     ground = Heard(session, f"5/tower/map/{GRID}")
     eventually(lambda: ground.samples and grid_of(bytes(ground.samples[-1].payload))["cells"][2, 2] == 100)
+
+
+def test_each_level_publishes_its_map_or_its_only_grid_that_is_no_mask(api: Api) -> None:
+    api.post("environments", {"name": "mill"})
+    floors = {"ground": "map attic", "L2": "upstairs keepout", "L3": "left right", "L4": "nogo"}
+    for level, names in floors.items():
+        for name in names.split():
+            api.upload("mill", samples.grid(name), level=level, grid=name)
+    services = api.app.state.services
+    content = topic_content(services, False, services.store.versions.get("mill"))
+    assert set(content.grids) == {None, "L2"}
+    assert content.absent == ("no grid of the level L3: name one map; its grids: left, right",)
 
 
 def test_ros2_publishes_version_of_channel(api: Api, session: zenoh.Session) -> None:
