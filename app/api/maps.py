@@ -183,10 +183,10 @@ def _file_etag(recipe: Recipe, name: str) -> str:
     return f'{recipe.etag[:-1]}-{hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]}"'
 
 
-def _identity(recipe: Recipe) -> tuple[str, int, str, str]:
-    """Return a key that distinguishes recipes at one address."""
-    closures = recipe.version.closures
-    return recipe.key, recipe.version.number, recipe.version.environment, closures.digest if closures else ""
+def _identity(recipe: Recipe) -> tuple[str, int, str, str, str]:
+    """Return a key that distinguishes recipes at one address, also of a purged environment with the same name."""
+    version, closures = recipe.version, recipe.version.closures
+    return recipe.key, version.number, version.environment, version.root, closures.digest if closures else ""
 
 
 def _matches(request: Request, etag: str) -> bool:

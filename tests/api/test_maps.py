@@ -534,3 +534,19 @@ def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
 def _outlast(pool: Pool, stop: CancelHandle) -> None:
     with contextlib.suppress(Cancelled):
         pool.run(time.sleep, 300, stop=stop)
+
+
+def test_map_has_the_root_of_its_own_environment_after_a_purge(api: Api, fresh: Any) -> None:
+    """The new environment has the same name, number and network, but a grid, too."""
+    env = fresh()
+    network, roots = {"n.tmap2.yaml": samples.tmap2()}, []
+    for files in (network, {**network, **samples.grid()}):
+        api.post("environments", {"name": env})
+        api.upload(env, files)
+        root = api.get(f"environments/{env}/versions/latest").json()["root"]
+        headers = api.get(f"/maps/{env}/tmap2").headers
+        assert (headers["fleetmap-version"], headers["fleetmap-root"]) == ("1", root)
+        roots.append(root)
+        api("DELETE", f"environments/{env}", 204)
+        api.post(f"environments/{env}/purge", expect=204)
+    assert roots[0] != roots[1]
