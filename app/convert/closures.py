@@ -335,11 +335,17 @@ def report_lines(version: Version, stored: Iterable[ClosureLine]) -> tuple[Closu
 
 
 def merge_report_lines(reports: Iterable[Iterable[ClosureLine]]) -> tuple[ClosureLine, ...]:
-    """Join the lines of several maps' reports: one line for each closure, with all its effects and edges."""
+    """Join the lines of several maps' reports: one line for each closure, with all its effects and edges.
+
+    A line without an effect, and its reason, count only if no map shows the closure.
+    """
     out: dict[str, ClosureLine] = {}
     for one in (one for report in reports for one in report):
         first = out.setdefault(one.id, one)
-        effect = ", ".join(dict.fromkeys([first.effect, one.effect]))
+        if NO_EFFECT in (first.effect, one.effect):
+            out[one.id] = one if first.effect == NO_EFFECT != one.effect else first
+            continue
+        effect = ", ".join(dict.fromkeys([*first.effect.split(", "), *one.effect.split(", ")]))
         out[one.id] = replace(first, effect=effect, edges=tuple(dict.fromkeys(first.edges + one.edges))[:MAX_LISTED])
     return tuple(out.values())
 

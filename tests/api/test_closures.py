@@ -419,6 +419,20 @@ def test_robots_get_the_mask_of_a_closed_area_with_the_whole_site(api: Api, fres
     assert {name for name in last if last[name] != after[name]} == {"keepout.pgm"}
 
 
+def test_report_of_the_whole_site_says_what_any_of_its_maps_shows(api: Api, farm: str) -> None:
+    """The area is in the masks, not in the grid map, whose report says so by itself."""
+    for name in ("keepout", "nogo"):
+        api.upload(farm, samples.grid(name), grid=name)
+    close(api, farm, polygon=SQUARE, crs="local")
+    close(api, farm, edge="gate_barn")
+    place = f"environments/{farm}/versions/latest/reports/occupancy_grid"
+    area, edge = sorted(api.get(f"{place}?level=*&grid=*").json()["closures"], key=lambda line: "edge" in line)
+    assert (area["effect"], area.get("why")) == ("keepout cells", None)
+    assert (edge["effect"], edge["why"]) == ("none", "this map has no such edge")
+    (alone, _) = sorted(api.get(f"{place}?grid=map").json()["closures"], key=lambda line: "edge" in line)
+    assert (alone["effect"], alone["why"]) == ("none", "this map contains nothing inside the area")
+
+
 def test_environment_package_report_lists_effects_of_closures(api: Api, farm: str) -> None:
     closure = close(api, farm, edge="gate_barn")
     (line,) = api.get(f"environments/{farm}/versions/latest/reports/environment").json()["closures"]
