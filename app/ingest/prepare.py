@@ -32,6 +32,7 @@ from app.model.imagery import GeoImage
 from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
 from app.store.in_worker import open_store
+from app.store.prepare import merge_provenance
 from app.store.store import Store
 from app.store.values import Version
 from app.upload_reader import Bundle, EnvironmentContext, UploadHints
@@ -217,26 +218,26 @@ def operation_for(
     for name in names:
         digest.update(hashlib.sha256(files[name]).digest())
     provenance = Provenance("raw", origin, names, digest.hexdigest(), attribution=upload_bundle.credit(key))
-    is_stored = any(e.key == key for e in base.parts)
+    entry = base.part(key)
     fmt = formats.all_formats().get(origin)
     own_ids = fmt is not None and fmt.traits.own_ids
     if isinstance(part, Features):
         if key.layer == "topology" and key.level in renamed:
             part = _rename_drawn_from(part, renamed[key.level])
-        if is_stored and key.layer in ("topology", "objects", "zones") and not own_ids:
+        if entry is not None and key.layer in ("topology", "objects", "zones") and not own_ids:
             ids = part.ids
             with contextlib.suppress(Damaged):  # nothing to compare with: keep the upload's ids
                 part = match_ids(store, base, key, part)
             if key.layer == "objects":
                 renamed.setdefault(key.level, {}).update((a, b) for a, b in zip(ids, part.ids, strict=True) if a != b)
         if mode == "merge":
-            return Put(key, _merge_with_stored(store, base, key, part) if is_stored else part, provenance)
-    elif mode == "merge" and is_stored:
+            return Put(key, _merge_with_stored(store, base, key, part) if entry else part, provenance)
+    elif mode == "merge" and entry is not None:
         old = store.content.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
-            part = merge_grids(old, part, key.name)
+            part, provenance = merge_grids(old, part, key.name), merge_provenance(entry.provenance, provenance)
         elif isinstance(part, Resources) and isinstance(old, Resources):
-            part = Resources({**old.files, **part.files})
+            part, provenance = Resources({**old.files, **part.files}), merge_provenance(entry.provenance, provenance)
     return Replace(key, part, provenance)
 
 

@@ -69,3 +69,27 @@ def test_grey_is_unknown_by_the_thresholds_of_the_stored_grid(api: Api, bare: st
     api.upload(bare, saved_grid(stored, free=EARLIER))
     api.upload(bare, saved_grid(uploaded), mode="merge")
     assert written_pixels(api, bare).tolist() == [[WALL, WALL, GREY], [GREY, GREY, CLEAR]]
+
+
+def generate_hall(api: Api, env: str) -> None:
+    """Generate a hall with objects and a grid of cells of 1 m."""
+    size = {"width": 8.0, "depth": 8.0, "cell": 1.0, "resolution": 1.0}
+    api.post(f"environments/{env}/generations", {"generator": "cluttered_hall", "seed": 7, "parameters": size})
+
+
+def occupancy_report(api: Api, env: str) -> dict[str, Any]:
+    lines = api.get(f"environments/{env}/versions/latest/reports/occupancy_grid").json()["layers"]
+    return next(dict(line) for line in lines if line["layer"] == "occupancy")
+
+
+def test_merged_grid_keeps_credits_and_steps(api: Api, bare: str) -> None:
+    """Cells that a generator made up stay marked by its step."""
+    generate_hall(api, bare)
+    assert [step["step"] for step in occupancy_report(api, bare)["steps"]] == ["cluttered_hall"]
+    licence = b"ODbL 1.0\n(c) 2024 Somebody\n"
+    api.upload(bare, {"LICENSE": licence, **saved_grid(np.full((2, 2), WALL))}, mode="merge")
+    api.upload(bare, saved_grid(np.full((2, 2), CLEAR)), mode="merge")
+    report = occupancy_report(api, bare)
+    assert report["information"] == "raw"
+    assert [step["step"] for step in report["steps"]] == ["cluttered_hall"]
+    assert report["attribution"] == ["ODbL 1.0, (c) 2024 Somebody (LICENSE)"]
