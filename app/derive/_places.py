@@ -10,7 +10,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.model.areas import AREA_KINDS
-from app.model.features import Features, Properties, from_columns, points, unique_ids
+from app.model.features import Features, Properties, from_columns, points, short_id, unique_ids
+from app.model.frame import is_writable
 from app.model.layers import Layers
 
 Metres = NDArray[np.float64]
@@ -51,7 +52,8 @@ def named(network: Features, layers: Layers, level: str) -> tuple[Features, int]
 
     A door has one node, an aisle or row a node in its middle and ``/in`` and ``/out`` at its ends, a room or corridor
     the node nearest to its middle. Where there is no node, the nearest edge is divided. Such a node has the area's
-    name as its id and name. All nodes in an area have its name as ``area``; those in aisles and rows that of these.
+    name as its id and name; the id is on one line, and cut if it is long. All nodes in an area have its name as
+    ``area``; those in aisles and rows that of these.
     """
     areas = _areas(layers, level)
     if not areas or not len(network):
@@ -168,7 +170,7 @@ def _features(net: _Net, titles: dict[int, Place], areas: list[tuple[str, str, A
     inside = _area_names(xy, areas)
     taken = {name for k, name in enumerate(net.ids) if k not in titles}
     ids = list(net.ids)
-    for k, name in zip(titles, unique_ids([place.name for place in titles.values()], taken), strict=True):
+    for k, name in zip(titles, unique_ids(map(_node_id, titles.values()), taken), strict=True):
         ids[k] = name
         inside[k] = titles[k].owner or inside[k]
     properties: list[Properties] = []
@@ -179,7 +181,13 @@ def _features(net: _Net, titles: dict[int, Place], areas: list[tuple[str, str, A
     properties += [{**net.edges[a, b], "source": ids[a], "target": ids[b]} for a, b in pairs]
     lines = shapely.linestrings(xy[np.array(pairs, np.int64).reshape(-1, 2)]) if pairs else np.empty(0, object)
     geometry = np.concatenate([points(xy), np.asarray(lines, object)])
-    return from_columns([*ids, *(f"{ids[a]}_{ids[b]}" for a, b in pairs)], geometry, properties, "local")
+    edges = unique_ids([short_id(f"{ids[a]}_{ids[b]}") for a, b in pairs], set(ids))
+    return from_columns([*ids, *edges], geometry, properties, "local")
+
+
+def _node_id(place: Place) -> str:
+    """Return the id of a place's node: an area's name is any text."""
+    return short_id("".join(c if is_writable(c) else " " for c in place.name))
 
 
 def _area_names(xy: Metres, areas: list[tuple[str, str, Any]]) -> list[str]:

@@ -37,6 +37,7 @@ all        ``<format>``      format-specific data of the item, stored for export
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -290,6 +291,16 @@ def unique_ids(names: Iterable[str], taken: set[str] | None = None) -> list[str]
         used.add(candidate)
         out.append(candidate)
     return out
+
+
+def short_id(text: str, limit: int = MAX_ID - 12) -> str:
+    """Return the text, or, if it is too long for an id, its beginning and a hash of all of it.
+
+    The default limit leaves room for what makes it unique.
+    """
+    if len(text) <= limit:
+        return text
+    return f"{text[: limit - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"
 
 
 def _repeats(ids: Iterable[str]) -> Iterator[tuple[str, bool]]:

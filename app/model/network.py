@@ -7,7 +7,6 @@ an object: its nodes and edges name it in ``drawn_from``, so that a drawing form
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid, Problem
 from app.model.distinct import distinct
-from app.model.features import MAX_ID, Features, Properties, unique_ids
+from app.model.features import MAX_ID, Features, Properties, short_id, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Datum
 from app.model.geodesy import LocalFrame, local_frame
 
@@ -301,7 +300,7 @@ def _assemble(
     objects = drawing.objects
     pois = len(drawing.poi_owner)
     owners = drawing.owner[leaders].tolist()
-    base = {k: _short(objects.ids[k], 240) for k in set(owners[pois:])}
+    base = {k: short_id(objects.ids[k], 240) for k in set(owners[pois:])}
     names = [objects.ids[k] for k in owners[:pois]]
     names += [f"{base[k]}/{i}" for k, i in zip(owners[pois:], drawing.number[leaders[pois:]].tolist(), strict=True)]
     ids = unique_ids(names)
@@ -321,7 +320,7 @@ def _assemble(
     shared = {k: {w: objects.properties[k][w] for w in CARRIED if w in objects.properties[k]} for k in set(by)}
     edges = [f"{ids[p]}_{ids[q]}" for p, q in zip(a, b, strict=True)]
     if edges and max(map(len, edges)) > MAX_ID - 12:
-        edges = [_short(i, MAX_ID - 12) for i in edges]
+        edges = [short_id(i, MAX_ID - 12) for i in edges]
     if len({*ids, *edges}) < len(ids) + len(edges):
         edges = unique_ids(edges, set(ids))
     properties += [
@@ -368,10 +367,3 @@ def _geometries(coordinates: Metres, make: Any) -> NDArray[np.object_]:
     if not flat.all():
         out[~flat] = make(coordinates[~flat])
     return out
-
-
-def _short(text: str, limit: int) -> str:
-    """Return the text, or, if it is too long for an id, its beginning and a hash of all of it."""
-    if len(text) <= limit:
-        return text
-    return f"{text[: limit - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"

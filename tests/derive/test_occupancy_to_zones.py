@@ -239,6 +239,19 @@ def test_nodes_take_the_names_of_areas() -> None:
     assert "area" not in next(iter(nodes(plain).values()))[0]
 
 
+@pytest.mark.parametrize("name", ["Loading\nbay ", "\x07", "x" * 400, "x" * 600], ids=["lines", "bell", "400", "600"])
+def test_any_name_of_an_area_gives_a_node(name: str) -> None:
+    """An id has one line of at most 512 characters, also that of an edge between two such areas; a name is free."""
+    part = zones(flat())
+    names = [name + i for i in part.ids]
+    renamed = [{**p, "name": new} for p, new in zip(part.properties, names, strict=True)]
+    network, _ = named_network(replace(part, properties=tuple(renamed)), flat())
+    titled = {p["name"]: i for i, (p, _) in nodes(network).items() if p["name"] in names}
+    assert set(titled) == set(names)
+    for title, i in titled.items():
+        assert i.startswith(title.replace("\n", " ").replace("\x07", " ")[:400])
+
+
 def test_aisle_has_nodes_at_both_ends() -> None:
     hedges = [(3.0, 3.0, 15.0, 3.2), (3.0, 5.5, 15.0, 5.7)]
     cells = draw(18.0, 9.0, hedges)
