@@ -370,6 +370,14 @@ def check_crs(crs: str) -> None:
 
 
 @lru_cache(maxsize=64)
+def is_geographic(crs: str) -> bool:
+    """Return whether a named CRS has longitudes and latitudes. Raises Invalid if PROJ does not know it."""
+    try:
+        return bool(CRS.from_user_input(crs).is_geographic)
+    except ProjError as error:
+        raise Invalid(f"unknown CRS {_short(crs)!r}: use a code such as EPSG:32632") from error
+
+
 def _vertical_unit(crs: str) -> float:
     """Return the metres of one unit of height; 1 if the CRS has no vertical axis."""
     axes = CRS.from_user_input(crs).axis_info

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from app.errors import Invalid, MissingDatum
 from app.model.frame import MAX_METRES
 from app.model.gdal import gdal, native, open_memory_dataset
-from app.model.geodesy import WGS84, LocalFrame, between
+from app.model.geodesy import WGS84, LocalFrame, between, is_geographic
 from app.model.georeference import Turn, turn
 from app.model.imagery import CLEAR, LOCAL, Affine, GeoImage, pixel_positions
 
@@ -65,9 +65,15 @@ def resample(
         source = target = _NO_CRS
         back = forth = (1.0, 0.0, 0.0, 1.0)
     base = turn(picture.transform, forth)
+    around_globe = is_geographic(target)
 
     def to_target(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return _rotate_back(points if source == target else between(source, target, points), back)
+        if source == target:
+            return _rotate_back(points, back)
+        out = _rotate_back(between(source, target, points), back)
+        if around_globe:  # points in a row that cross the antimeridian continue beyond ±180 degrees
+            out[:, 0] = np.unwrap(out[:, 0], period=360.0)
+        return out
 
     height, width = picture.pixels.shape[:2]
     outline = to_target(_transform_points(picture.outline(STEPS), forth))

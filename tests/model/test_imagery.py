@@ -91,6 +91,23 @@ def test_resample_to_degrees_round_trips() -> None:
     assert set(np.unique(image.pixels)) >= set(range(1, 4801)), "at this resolution no pixel is missed"
 
 
+@pytest.mark.parametrize("longitude", [179.99995, 180.0, -179.9999])
+def test_image_on_the_antimeridian_is_resampled_to_degrees_beyond_it(longitude: float) -> None:
+    """The image is 40 × 30 m; before, it would have been as wide as the globe."""
+    forth = Transformer.from_crs("EPSG:4326", "EPSG:32760", always_xy=True)
+    east, north = forth.transform(longitude, -16.8)
+    source = numbered(crs="EPSG:32760", transform=(0.5, 0.0, east - 20.0, 0.0, -0.5, north + 15.0), nodata=0)
+    image = to_wgs84(source, method="nearest", resolution=2e-6)
+    west = image.transform[2]
+    assert abs(west - longitude) < 0.001 or abs(west - longitude - 360.0) < 0.001
+    expected, edge = truth(image, source, lambda p: np.column_stack(forth.transform(p[:, 0], p[:, 1])))
+    sure = edge > 1e-3
+    assert np.array_equal(image.pixels[..., 0][sure], expected[sure])
+    assert set(np.unique(image.pixels)) >= set(range(1, 4801)), "at this resolution no pixel is missed"
+    default = to_wgs84(source)
+    assert default.pixels.shape[0] * default.pixels.shape[1] < 10_000, "about as many pixels as the image has"
+
+
 def test_resampled_plane_stays_plane() -> None:
     """On a plane of heights, values between pixels equal the plane to a millimetre."""
     rows, columns = np.mgrid[0:60, 0:80] + 0.5
