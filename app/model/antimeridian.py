@@ -1,7 +1,7 @@
 """Geometries in degrees that cross the antimeridian: cut there, as RFC 7946 (3.1.9) asks, and joined again.
 
 A line whose longitude changes by more than 180 degrees from one vertex to the next crosses the antimeridian, which is
-the shorter way. What only touches it does not cross it.
+the shorter way. What only touches it does not cross it: it stays in one piece, on one side.
 """
 
 from __future__ import annotations
@@ -62,9 +62,12 @@ def _cut(shape: Any) -> Any:
     if kind.endswith("Point"):
         return shape
     cut = _pieces_of_area if kind.endswith("Polygon") else _pieces_of_line
-    pieces = [piece for part in shapely.get_parts(shape) for piece in cut(part)]
-    if len(pieces) == shapely.get_num_geometries(shape):
+    parts = shapely.get_parts(shape)
+    pieces = [piece for part in parts for piece in cut(part)]
+    if len(pieces) == len(parts) and all(piece is part for piece, part in zip(pieces, parts, strict=True)):
         return shape
+    if len(pieces) == 1 and not kind.startswith("Multi"):
+        return pieces[0]
     return shapely.multipolygons(pieces) if kind.endswith("Polygon") else shapely.multilinestrings(pieces)
 
 
@@ -78,8 +81,10 @@ def _continued(ring: Any, near: float | None = None) -> Array:
 
 
 def _pieces_of_line(line: Any) -> list[Any]:
-    """Return the pieces of a line in its direction: itself if it does not cross."""
+    """Return the pieces of a line in its direction: itself if it does not reach the antimeridian's other side."""
     points = _continued(line)
+    if (points[:, 0] == shapely.get_coordinates(line)[:, 0]).all():
+        return [line]
     sides = np.round(points[:, 0] / TURN)  # of the globe on which each vertex is; ±180 is on that of the middle
     pieces: list[Any] = []
     piece = [points[0]]
@@ -93,7 +98,7 @@ def _pieces_of_line(line: Any) -> list[Any]:
             piece = [crossing]
         piece.append(after)
     _add_piece(pieces, piece, sides[-1])
-    return pieces if len(pieces) > 1 else [line]
+    return pieces or [line]
 
 
 def _add_piece(pieces: list[Any], points: list[Array], side: float) -> None:
@@ -104,8 +109,10 @@ def _add_piece(pieces: list[Any], points: list[Array], side: float) -> None:
 
 
 def _pieces_of_area(polygon: Any) -> list[Any]:
-    """Return the pieces of a polygon, counter-clockwise: itself if it does not cross or is around a pole."""
+    """Return the pieces of a polygon, counter-clockwise: itself if it is on one side only, or around a pole."""
     outer = _continued(polygon.exterior)
+    if (outer[:, 0] == shapely.get_coordinates(polygon.exterior)[:, 0]).all():
+        return [polygon]
     middle = float(outer[:, 0].min() + outer[:, 0].max()) / 2
     rings = [outer, *(_continued(ring, middle) for ring in polygon.interiors)]
     if any(abs(ring[0, 0] - ring[-1, 0]) > HALF for ring in rings):
@@ -117,4 +124,4 @@ def _pieces_of_area(polygon: Any) -> list[Any]:
         cut = _turned(shapely.intersection(whole, globe), -side)
         pieces += [part for part in shapely.get_parts(shapely.get_parts(cut)) if part.geom_type == "Polygon"]
     pieces = [piece for piece in pieces if piece.area > 0.0]
-    return list(shapely.orient_polygons(np.array(pieces, object))) if len(pieces) > 1 else [polygon]
+    return list(shapely.orient_polygons(np.array(pieces, object))) or [polygon]

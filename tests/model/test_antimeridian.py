@@ -22,8 +22,17 @@ CROSSING = {
         "((-180 0, -178 0, -178 4, -180 4, -180 3, -179 3, -179 1, -180 1, -180 0)))",
 }  # fmt: skip
 
+TOUCHING = {
+    "LINESTRING (180 0, -180 1)": "LINESTRING (180 0, 180 1)",
+    "LINESTRING (180 0, -179 1)": "LINESTRING (-180 0, -179 1)",
+    "LINESTRING (-179 0, 180 1)": "LINESTRING (-179 0, -180 1)",
+    "LINESTRING Z (179 0 1, -180 1 2)": "LINESTRING Z (179 0 1, 180 1 2)",
+    "MULTILINESTRING ((180 0, -179 1), (-178 0, -177 0))": "MULTILINESTRING ((-180 0, -179 1), (-178 0, -177 0))",
+    "POLYGON ((180 0, -179 0, -179 1, 180 1, 180 0))": "POLYGON ((-180 0, -179 0, -179 1, -180 1, -180 0))",
+    "POLYGON ((179 0, -180 0, -180 1, 179 1, 179 0))": "POLYGON ((179 0, 180 0, 180 1, 179 1, 179 0))",
+}  # fmt: skip
+
 STAYING = [
-    "LINESTRING (180 0, -180 1)",
     "LINESTRING (179 0, 180 0, 180 5)",
     "LINESTRING (-0.5 53, 0.5 53)",
     "MULTIPOINT (179 1, -179 1)",
@@ -48,6 +57,15 @@ def test_crossing_geometries_are_cut(wkt: str) -> None:
     else:
         assert shapely.equals_exact(out, shapely.from_wkt(CROSSING[wkt]), normalize=True), out.wkt
         assert all(part.exterior.is_ccw for part in shapely.get_parts(out))
+
+
+@pytest.mark.parametrize("wkt", TOUCHING)
+def test_what_touches_from_one_side_is_on_that_side(wkt: str) -> None:
+    """It is in one piece, with the sign of 180 degrees that its other longitudes have."""
+    out, expected = cut(wkt), shapely.from_wkt(TOUCHING[wkt])
+    assert out.geom_type == expected.geom_type
+    assert shapely.equals_exact(out, expected, normalize="POLYGON" in wkt), out.wkt
+    assert out.has_z == expected.has_z
 
 
 @pytest.mark.parametrize("wkt", STAYING)
