@@ -30,6 +30,9 @@ DEFAULT_MAX_PIXELS = 2**21
 MAX_PIXELS = 2**25
 """Maximum number of pixels at a requested pixel size."""
 
+SIDE_POINTS = 64
+"""Number of points on each side of an image along which its longitudes are followed."""
+
 OPAQUE = 128
 """Minimum alpha of a valid pixel."""
 
@@ -142,12 +145,14 @@ def infrared_band(picture: GeoImage, number: int | None, name: str) -> int | Non
 
 
 def _middle(picture: GeoImage) -> Datum:
-    """Return the centre of an image in WGS 84."""
-    outline = picture.outline()
-    lonlat = crs_to_wgs84(picture.crs, np.column_stack([outline, np.zeros(len(outline))]))[:, :2].mean(axis=0)
+    """Return the centre of an image in WGS 84: the mean of its corners."""
+    outline = picture.outline(SIDE_POINTS)
+    lonlat = crs_to_wgs84(picture.crs, np.column_stack([outline, np.zeros(len(outline))]))[:, :2]
     if not np.isfinite(lonlat).all():
         raise CannotConvert("the image has no valid position on earth: correct its CRS or transform")
-    return Datum(round(float(lonlat[1]), 9), round(float(lonlat[0]), 9))
+    lonlat[:, 0] = np.unwrap(lonlat[:, 0], period=360.0)  # across the antimeridian
+    longitude, latitude = lonlat[::SIDE_POINTS].mean(axis=0).tolist()
+    return Datum(round(latitude, 9), round(longitude - 360.0 * round(longitude / 360.0), 9))
 
 
 def _native(picture: GeoImage, frame: LocalFrame | None) -> float:

@@ -22,6 +22,7 @@ from app.derive.resources_to_imagery import Parameters as Drawings
 from app.derive.resources_to_imagery import resources_to_imagery
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound
 from app.limits import Limits
+from app.model import geodesy
 from app.model.features import Features, features
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
@@ -29,7 +30,7 @@ from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import GeoImage
 from app.model.layers import MAP, Layers, PartKey, Resources
 from app.upload_reader import EnvironmentContext, UploadHints
-from tests.derive.pictures import BRANCH, BUILDING, CROWN, PATH, PATH_WIDTH, TREES, farm, local, plan
+from tests.derive.pictures import BRANCH, BUILDING, CROWN, HEIGHT, PATH, PATH_WIDTH, SIZE, TREES, farm, local, plan
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 DATUM = Datum(53.0, -0.5)
@@ -69,6 +70,20 @@ def of(part: Features, kind: str) -> list[Any]:
 def overlap(a: Any, b: Any) -> float:
     """Intersection over union."""
     return float(shapely.intersection(a, b).area / shapely.union(a, b).area)
+
+
+@pytest.mark.parametrize("offset", [-30.0, -10.0])
+def test_image_on_the_antimeridian_needs_no_datum(offset: float) -> None:
+    """Its middle is there, not at the mean of longitudes of both signs. offset: of its left side, in metres."""
+    pixels = farm()
+    easting, northing = geodesy.between("EPSG:4326", "EPSG:32760", np.array([[180.0, -16.8]]))[0].tolist()
+    picture = GeoImage(pixels, (SIZE, 0.0, easting + offset, 0.0, -SIZE, northing + HEIGHT / 2), "EPSG:32760")
+    trees = of(objects(layers(picture)), "tree")
+    assert len(trees) == len(TREES)
+    placed = geodesy.geometries_from_wgs84("EPSG:32760", np.array([tree.centroid for tree in trees], object))
+    for x, y in TREES:
+        at_place = shapely.Point(easting + offset + x, northing - HEIGHT / 2 + y)
+        assert min(at_place.distance(tree) for tree in placed) < 0.5
 
 
 def test_farm_image_gives_objects_of_each_kind() -> None:
