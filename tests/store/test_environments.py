@@ -6,6 +6,7 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
 import shapely
 
@@ -13,10 +14,12 @@ from app.errors import Conflict, Gone, Invalid, NotFound
 from app.events.messages import Event
 from app.model.features import features
 from app.model.frame import Datum
+from app.model.geodesy import between
 from app.model.layers import PartKey
 from app.store import outbox
 from app.store.changes import Delete, Put, Replace
 from app.store.extent import extent, geometry, join
+from app.store.parts.rasters import picture_bounds
 from app.store.store import Store
 from app.store.values import PartEntry, Provenance
 from tests.store.samples import (
@@ -125,6 +128,26 @@ def test_extent_crosses_antimeridian(store: Store, anchor: str):
     assert not store.environments.page(bbox=(-179.0, -18, 179.0, -16))[0]
     inside = store.content.features(store.versions.get("fiji"), OBJECTS, bbox=(179.0, -18, -179.0, -16), crs="wgs84")
     assert {"a", "b"} <= set(inside.ids)
+
+
+def test_box_of_an_image_crosses_antimeridian():
+    """An image of 60 × 40 m with its middle there; one that is as wide as the globe does not cross it."""
+    easting, northing = between("EPSG:4326", "EPSG:32760", np.array([[180.0, -16.8]]))[0].tolist()
+    size = {"width": 600, "height": 400}
+    west, south, east, north = picture_bounds(
+        {**size, "crs": "EPSG:32760", "transform": (0.1, 0.0, easting - 30.0, 0.0, -0.1, northing + 20.0)}
+    )["wgs84"] or (0, 0, 0, 0)
+    assert 179.9997 < west < 179.9998
+    assert -179.9998 < east < -179.9997
+    assert -16.801 < south < -16.8 < north < -16.799
+    for crs, transform in (
+        ("EPSG:4326", (0.6, 0.0, -180.0, 0.0, -0.4, 80.0)),
+        ("EPSG:4326", (0.4, 0.0, -120.0, 0.0, -0.4, 80.0)),
+        ("EPSG:3857", (66_000.0, 0.0, -19_800_000.0, 0.0, -66_000.0, 13_200_000.0)),
+    ):
+        west, _, east, _ = picture_bounds({**size, "crs": crs, "transform": transform})["wgs84"] or (0, 0, 0, 0)
+        assert west <= -119.99
+        assert east >= 119.99
 
 
 def test_boxes_are_joined_across_antimeridian():

@@ -10,12 +10,12 @@ import ormsgpack
 from numpy.typing import NDArray
 
 from app.errors import Invalid
-from app.model.geodesy import crs_bounds
+from app.model.geodesy import WGS84, between, crs_bounds
 from app.model.grid import OccupancyGrid
-from app.model.imagery import GeoImage
+from app.model.imagery import GeoImage, pixel_positions
 from app.store import tree
 from app.store.encode import ENCODING, interleave, pack, pack_value
-from app.store.parts.boxes import bounding_box
+from app.store.parts.boxes import bounding_box, crossing_box, ring
 from app.store.parts.roots import TILE_BATCH, EncodedPart, PartRoot, leaf_members, put_root
 from app.store.tree import ChunkStage, Node
 from app.store.values import Bounds
@@ -107,13 +107,19 @@ def tile_names(draft: ChunkStage, base: PartRoot | None) -> set[bytes]:
 
 
 def picture_bounds(header: Mapping[str, Any]) -> Bounds:
-    """Return the extent of an image."""
-    a, b, c, d, e, f = header["transform"]
-    w, h = header["width"], header["height"]
-    corners = np.array([[a * u + b * v + c, d * u + e * v + f] for u, v in ((0, 0), (w, 0), (w, h), (0, h))])
-    if header["crs"] == "local":
+    """Return the extent of an image; its box in degrees has west > east if it crosses the antimeridian."""
+    crs, transform, w, h = header["crs"], header["transform"], header["width"], header["height"]
+    corners = pixel_positions(transform, np.array([0, w, w, 0]), np.array([0, 0, h, h]))
+    if crs == "local":
         return {"local": bounding_box(corners), "wgs84": None}
-    return {"local": None, "wgs84": crs_bounds(header["crs"], corners)}
+    box = crs_bounds(crs, corners)
+    if box is not None and box[2] - box[0] > 180.0:
+        border = between(crs, WGS84, pixel_positions(transform, *ring((0.0, 0.0, w, h)).T))
+        with np.errstate(invalid="ignore"):  # infinite ones
+            longitude = np.unwrap(border[:, 0], period=360.0)
+        if np.ptp(longitude) <= 180.0:  # an image of half the globe is wide indeed
+            box = crossing_box(between(crs, WGS84, corners))
+    return {"local": None, "wgs84": box}
 
 
 def _load_tiles(draft: ChunkStage, root: PartRoot, out: NDArray[Any]) -> None:
