@@ -281,10 +281,34 @@ def test_duplicate_numbers_become_distinct() -> None:
     assert server.nodes[end] == (7.0, 7.0)
 
 
-def test_many_items_get_ids_over_16_bit_with_warning() -> None:
-    served, context = write(street([f"n{k}" for k in range(33_000)], oneway=True))
+def test_ids_have_16_bit_while_enough_are_free() -> None:
+    """Nav2's actions and services have ids of 16 bit; numbers of the source may be larger."""
+    names = [f"n{k}" for k in range(33_000)]
+    street_of_many = street(names, oneway=True)
+    place = shapely.Point(-1, 0)
+    large = features([("large", place, {"kind": "node", "nav2_route": {"id": 70_000}})], "local")
+    both = Features(
+        (*street_of_many.ids, *large.ids),
+        np.concatenate([street_of_many.geometry, large.geometry]),
+        (*street_of_many.properties, *large.properties),
+        np.concatenate([street_of_many.local, large.local]),
+        street_of_many.document,
+    )
+    served, _ = write(both)
+    server = RouteServer(served)
+    assert len(server.nodes) == 33_001
+    assert len(server.edges) == 32_999
+    assert [n for n in server.nodes if n >= 2**16] == [70_000]
+    assert max(server.edges) < 2**16
+
+
+def test_more_edges_than_16_bit_get_larger_ids_with_warning() -> None:
+    rows: list[Any] = [(i, shapely.Point(k, 0), {"kind": "node"}) for k, i in enumerate("ab")]
+    line = shapely.LineString([(0, 0), (1, 0)])
+    rows += [(f"e{k}", line, {"kind": "edge", "source": "a", "target": "b"}) for k in range(2**16 + 1)]
+    served, context = write(features(rows, "local"))
     RouteServer(served)
-    assert "ComputeRoute" in warnings(context)
+    assert "ComputeRoute" not in warnings(context)
     assert "DynamicEdges" in warnings(context)
 
 

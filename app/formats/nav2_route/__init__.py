@@ -54,7 +54,7 @@ register(
         write_options=WriteOptions,
         check=rules.check,
         extensions=(".geojson", ".json"),
-        version=3,
+        version=4,
         claims=Claims(priority=36),
         traits=Traits(keeps_bends="foreign", has_title=True),
     )

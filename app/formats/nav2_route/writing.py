@@ -244,7 +244,8 @@ def _assign_numbers(items: Sequence[Node | Edge], claims: Mapping[int, int], tak
         if _is_number(items[k].id) and int(items[k].id) not in taken:
             out[k] = int(items[k].id)
             taken.add(out[k])
-    size = 2**16 if len(items) <= MAX_USED_ID // 2 else 2**32
+    large = sum(n > MAX_USED_ID for n in claims.values())
+    size = 2**16 if len(items) - large <= 2**16 else 2**32
     for k in remaining:
         if k not in out:
             out[k] = next(n for n in _candidates(items[k].id, size) if n not in taken)
