@@ -192,6 +192,13 @@ def test_nav2_limits_grid_to_32767_cells_per_side(width: int, level: str | None)
         assert all(p.file == "map.pgm" for p in findings)
 
 
+def test_grid_larger_than_default_limit_of_uploads_has_no_error() -> None:
+    """Nav2 loads 32767 cells each way; FLEETMAP_MAX_PIXELS says what a server takes."""
+    width, height = 20_768, 13_612
+    assert width * height > Limits().pixels
+    assert findings_of("occupancy_grid", grid({}, png(width, height))) == set()
+
+
 def test_damaged_and_missing_images_are_errors() -> None:
     assert findings_of("occupancy_grid", grid({}, PGM[:-1])) == {(ERROR, None)}
     assert findings_of("occupancy_grid", grid({}, b"GIF89a")) == {(WARNING, None)}

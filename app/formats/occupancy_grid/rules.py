@@ -31,6 +31,8 @@ DECODED = 2**22
 """Maximum pixels of a compressed image that is decoded to search a grey value; a PGM is searched directly."""
 
 _YAML = Limits(yaml_nodes=10_000)
+_HEADER = Limits(pixels=MAX_CELLS**2)
+"""Limits for an image's header: Nav2's, whatever the server's settings are."""
 
 
 def check(files: Files) -> Iterator[Problem]:
@@ -126,7 +128,7 @@ def _picture(
         )
         return
     try:
-        width, height = images.read_size(data, LIMITS)
+        width, height = images.read_size(data, _HEADER)
     except BadUpload as error:
         yield error_finding(error.detail, name)
         return
