@@ -211,21 +211,21 @@ def read(item: FileGroup, context: ReadContext) -> Layers:
             layers = fmt.read({**item.files, **item.shared_files} if item.shared_files else item.files, context)
     except BadUpload as error:
         raise type(error)(
-            error.detail, [_with_file(p, item.main) for p in error.problems] or [_problem_of(error, item)]
+            error.detail, [_with_file(p, context.main) for p in error.problems] or [Problem(error.detail, context.main)]
         ) from error
     except FleetMapError as error:
         raise UnreadableFile(
-            f"{item.main}: {error.detail}",
-            [_with_file(p, item.main) for p in error.problems] or [_problem_of(error, item)],
+            f"{context.main}: {error.detail}",
+            [_with_file(p, context.main) for p in error.problems] or [Problem(error.detail, context.main)],
         ) from error
     except MemoryError as error:
         raise TooLarge(
-            f"{item.main} needs more memory than an upload may use", [Problem("out of memory", item.main)]
+            f"{context.main} needs more memory than an upload may use", [Problem("out of memory", context.main)]
         ) from error
     except BAD_INPUT as error:
         line, reason = describe_parse_error(error)
-        detail = f"{item.main} cannot be read as {fmt.title}: {reason}"
-        raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
+        detail = f"{context.main} cannot be read as {fmt.title}: {reason}"
+        raise UnreadableFile(detail, [Problem(reason, context.main, line)]) from error
     if fmt.traits.keeps_bends == "nodes":
         layers = bends.join(layers)
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
@@ -393,10 +393,6 @@ def read_options(fmt: Format, values: Mapping[str, str]) -> Any:
 
 def _with_file(problem: Problem, file: str) -> Problem:
     return problem if problem.file else Problem(problem.problem, file, problem.line, problem.where)
-
-
-def _problem_of(error: FleetMapError, item: FileGroup) -> Problem:
-    return Problem(error.detail, item.main)
 
 
 def describe_parse_error(error: BaseException) -> tuple[int | None, str]:

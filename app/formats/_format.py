@@ -35,7 +35,7 @@ class ReadContext(Warnings):
         decode_cells: whether the cells of grids will be used; if not, a reader checks only an image's header.
         keep_source_properties: whether the map may be exported in this format or its family again; if not, a reader may
             skip format-specific data (``properties.<format>``, the document).
-        main: the file that was detected.
+        main: the file that was detected; a reader of several files sets the one that it reads.
         folder: reads files that contain maps of other formats as an upload of a folder is read, for formats that are
             such a folder in one file; None inside such a folder.
     """

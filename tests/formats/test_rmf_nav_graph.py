@@ -353,6 +353,29 @@ def test_invalid_graph_raises_unreadable_file(text: str) -> None:
     assert caught.value.problems[0].file == "0.yaml"
 
 
+WRONG_FILE: list[tuple[str, str]] = [
+    ("[x, 0, {name: a}]", "levels.L.vertices[0][0]"),
+    ("[0, 0, {name: a}]]}}\nlevels: [\n#", ""),
+    ("[0, 0, {name: a}]]}}\ndoors: {d: {endpoints: [[0, 0]]}}\n#", "doors.d.endpoints"),
+]
+
+
+@pytest.mark.parametrize(("vertex", "where"), WRONG_FILE)
+def test_error_names_the_graph_that_has_it(vertex: str, where: str) -> None:
+    good = "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]]}}\n"
+    files = {"nav/0.yaml": good, "nav/1.yaml": good.replace("[0, 0, {name: a}]", vertex), "nav/2.yaml": good}
+    with pytest.raises(UnreadableFile) as caught:
+        read({name: text.encode() for name, text in files.items()})
+    assert [(p.file, p.where or "") for p in caught.value.problems] == [("nav/1.yaml", where)]
+
+
+def test_warning_names_the_graph_that_has_it() -> None:
+    good = "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: []}}\n"
+    files = {"nav/0.yaml": good.replace("lanes: []", "lanes: [[0, 7, {}]]"), "nav/1.yaml": good}
+    _, context = read({name: text.encode() for name, text in files.items()})
+    assert [p.file for p in context.warnings if "joins the vertices" in p.problem] == ["nav/0.yaml"]
+
+
 def test_building_takes_precedence_over_its_graphs() -> None:
     files = {**sample("openrmf", "clinic"), **sample("rmf_nav_graph", "clinic")}
     building = yaml.safe_load(offline(files, "openrmf", hints=UploadHints()).files["building.yaml"])

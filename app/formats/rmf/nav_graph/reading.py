@@ -50,12 +50,14 @@ def read(files: Files, context: ReadContext) -> Layers:
 
     Raises UnreadableFile with the location.
     """
-    graphs = _graphs(files, context)
+    main = context.main
+    graphs, names = _graphs(files, context)
     levels: dict[str, _Level] = {}
     tops: dict[str, Any] = {}
     doors: dict[str, tuple[Any, list[int], int]] = {}
     lifts: dict[str, tuple[Any, list[int], int]] = {}
     for graph in graphs:
+        context.main = names[graph]
         _fields.check(graphs[graph], SHAPE, context)
         top, graphs[graph] = graphs[graph], {}  # free the parsed graph before features are built
         tops[str(graph)] = {key: value for key, value in top.items() if key not in ("levels", "doors", "lifts")}
@@ -66,14 +68,18 @@ def read(files: Files, context: ReadContext) -> Layers:
         _collect(doors, mapping(top.get("doors"), "doors"), graph, context, "doors")
         _collect(lifts, mapping(top.get("lifts"), "lifts"), graph, context, "lifts")
     top = members = {}
+    context.main = main
     if not levels:
         raise_unreadable("a navigation graph needs at least one level", "levels")
     if context.level != GROUND:
         context.warn(f"the file names its own levels; level={context.level} is ignored", where="levels")
     for name, (members, inside, k) in doors.items():
+        context.main = names[inside[0]]
         _door(levels, name, members, {"index": k, **_partly(inside, graphs)})
     for name, (members, inside, k) in lifts.items():
+        context.main = names[inside[0]]
         _lift(levels, name, members, {"index": k, **_partly(inside, graphs)})
+    context.main = main
     parts: dict[PartKey, Part] = {}
     taken: set[str] = set()
     for name, level in levels.items():
@@ -91,9 +97,10 @@ def read(files: Files, context: ReadContext) -> Layers:
     return Layers({key: part for key, part in parts.items() if context.wants(key.layer)})
 
 
-def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
-    """Return the files by graph number: the number in the file name, else the next free one."""
+def _graphs(files: Files, context: ReadContext) -> tuple[dict[int, dict[str, Any]], dict[int, str]]:
+    """Return the content and the name of the files by graph: the number in the file name, else the next free one."""
     out: dict[int, dict[str, Any]] = {}
+    names: dict[int, str] = {}
     named = sorted(files, key=lambda name: (not _stem(name).isdigit(), len(_stem(name)), name))
     for name in named:
         context.main = name
@@ -109,8 +116,8 @@ def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
         )
         if graph_number is None:
             context.warn(f"the file name is not a number; it is read as graph {graph}")
-        out[graph] = top
-    return out
+        out[graph], names[graph] = top, name
+    return out, names
 
 
 def _stem(name: str) -> str:
