@@ -96,26 +96,25 @@ def report_unknown_elements(
     """
     plain = data.replace(b"\0", b"") if b"\0" in data[:4] else data  # UTF-16 or UTF-32
     names = {name.decode("utf-8", "replace").rpartition(":")[2] for name in set(_TAG.findall(plain))}
+    unknown = names - format_names
     elements_by_name: dict[str, list[etree._Element]] = {}
-    for name in sorted(names - format_names):
-        for element in root.iter("{*}" + name) if _NAME.fullmatch(name) else ():
-            space = etree.QName(element).namespace
-            ours = space is None or bool(namespace and namespace in space)
-            if ours and not any(etree.QName(above).localname in free for above in element.iterancestors()):
-                elements_by_name.setdefault(name, []).append(element)
+    for element in root.iter("*") if unknown else ():
+        space, _, name = str(element.tag).rpartition("}")
+        ours = name in unknown and (not space or bool(namespace and namespace in space))
+        if ours and not any(etree.QName(above).localname in free for above in element.iterancestors()):
+            elements_by_name.setdefault(name, []).append(element)
     if not elements_by_name:
         return
     first = min((elements[0] for elements in elements_by_name.values()), key=lambda e: e.sourceline or 0)
     texts = [
         f"<{name[:80]}>{did_you_mean(name, format_names)}{f' ({len(elements)} times)' if len(elements) > 1 else ''}"
-        for name, elements in list(elements_by_name.items())[:_SHOWN]
+        for name, elements in sorted(elements_by_name.items())[:_SHOWN]
     ]
     texts += [f"and {len(elements_by_name) - _SHOWN} more"] if len(elements_by_name) > _SHOWN else []
     warn(f"unknown elements: {', '.join(texts)}; they are stored without effect", line=first.sourceline)
 
 
 _TAG = re.compile(rb"<([^\s<>/!?=\"']+)")
-_NAME = re.compile(r"[^\W\d][\w.-]*")
 _SHOWN = 10
 """Maximum number of unknown elements that a warning names."""
 

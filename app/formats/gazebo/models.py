@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -305,9 +305,9 @@ class _Frames:
         """
         if name in self._placed:
             return self._placed[name]
-        chain: list[str] = []
+        chain: dict[str, None] = {}  # a set in order: files may have thousands of frames, each relative to the next
         while name in self._entries and name not in self._placed and name not in chain:
-            chain.append(name)
+            chain[name] = None
             pose, attached, _, _ = self._entries[name]
             name = pose.relative or attached
         at = self._base(name, chain)
@@ -318,7 +318,7 @@ class _Frames:
             self._placed[link] = at
         return at
 
-    def _base(self, name: str, chain: Sequence[str]) -> Matrix:
+    def _base(self, name: str, chain: dict[str, None]) -> Matrix:
         if name in self._placed:
             return self._placed[name]
         if name in ("", "__model__", "world", "__root__"):
@@ -328,7 +328,7 @@ class _Frames:
             frame = self._inner[outer].frame(inner_name)
             if frame is not None:
                 return np.asarray(self.place(outer) @ frame, np.float64)
-        element = self._entries[chain[-1]][3] if chain else None
+        element = self._entries[next(reversed(chain))][3] if chain else None
         circle = "is part of a cycle" if name in chain else "is unknown"
         line = None if element is None else element.sourceline
         location = None if element is None else element_path(element)
@@ -350,7 +350,7 @@ class _Frames:
         return np.asarray(parent @ pose.matrix, np.float64)
 
     def _relative(self, name: str) -> Matrix:
-        return self.place(name) if name in self._entries else self._base(name, ())
+        return self.place(name) if name in self._entries else self._base(name, {})
 
     def find(self, name: str) -> Matrix | None:
         """Return a frame of this model or, as ``model::frame``, of a nested one; None if unknown."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lxml import etree
 
@@ -17,9 +17,9 @@ class Item:
 
     element: etree._Element
     title: etree._Element | None = None
-    data: tuple[tuple[str, etree._Element], ...] = ()
-    geometries: tuple[etree._Element, ...] = ()
-    sequences: tuple[tuple[str, int, etree._Element], ...] = ()
+    data: list[tuple[str, etree._Element]] = field(default_factory=list)
+    geometries: list[etree._Element] = field(default_factory=list)
+    sequences: list[tuple[str, int, etree._Element]] = field(default_factory=list)
     shape: str = ""
 
 
@@ -53,7 +53,7 @@ def find_items(root: etree._Element) -> list[Item]:
     for g in root.iter(*(f"{{*}}{name}" for name in sorted(GEOMETRIES))):
         owner = index.get(g.getparent())
         if owner is not None:
-            owner.geometries += (g,)
+            owner.geometries.append(g)
     for tag in root.iter("{*}name"):
         owner = index.get(tag.getparent())
         if owner is not None and owner.title is None:
@@ -61,7 +61,7 @@ def find_items(root: etree._Element) -> list[Item]:
     for extended in root.iter("{*}ExtendedData"):
         owner = index.get(extended.getparent())
         if owner is not None:
-            owner.data += tuple(extended_values(extended))
+            owner.data += extended_values(extended)
     return items
 
 

@@ -321,7 +321,7 @@ class _Reader:
                 continue
             item.shape = sequences[0]
             for role, c in sequences[1]:
-                item.sequences += ((role, len(texts), c),)
+                item.sequences.append((role, len(texts), c))
                 texts.append(c.text or "")
         if not texts:
             return Sequences(np.empty((0, 3)), np.zeros(1, np.int64), np.zeros(0, bool))

@@ -77,6 +77,7 @@ class _Reader:
         self.is_first = "origins" not in top
         self.doubts: Counter[str] = Counter()
         self.heads: list[dict[str, Any]] = []
+        self.layout_ids: set[str] = set()
         self.items: dict[str, list[_Item]] = {kind: [] for kind in ("node", "edge", "station")}
         self.document: dict[str, Any] = {
             "top": {w: v for w, v in top.items() if w not in ("layouts", "origins")},
@@ -134,8 +135,9 @@ class _Reader:
         layout_id = row.get("layoutId")
         if not isinstance(layout_id, str) or not is_name(layout_id):
             raise_unreadable("a layout needs a string as its id", f"{location}.layoutId")
-        if any(head["layoutId"] == layout_id for head in self.heads):
+        if layout_id in self.layout_ids:
             raise_unreadable(f"duplicate layout {layout_id!r}: layout ids must be unique", f"{location}.layoutId")
+        self.layout_ids.add(layout_id)
         self.heads.append({w: v for w, v in row.items() if w not in LISTS})
         level = row.get("layoutLevelId")
         if level is None or level == "":
