@@ -7,7 +7,7 @@ addresses and no token: QGIS asks for it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 from lxml import etree
 from starlette.responses import Response
@@ -156,7 +156,8 @@ def _feature_source(service: Service, name: str) -> str:
 def _raster_source(service: Service, name: str) -> str:
     values = {"crs": "EPSG:3857", "format": PNG, "layers": name, "styles": "default",
               "tileMatrixSet": wmts.SET.id, "url": wmts.url(service)}  # fmt: skip
-    return urlencode(values, safe=":/@")  # QGIS 3.40 takes these as they are, and does not decode them
+    # QGIS 3.40 takes these characters as they are and does not decode them, and no version takes + for a space.
+    return urlencode(values, safe=":/@", quote_via=quote)
 
 
 def definition_file(service: Service, collections: list[Collection]) -> bytes:

@@ -13,6 +13,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ from PIL import Image
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
 from tests import qgis
-from tests.api.conftest import Api, running, settings_for
-from tests.api.samples import NODES, tmap2
+from tests.api.conftest import Api, create_farm, running, settings_for
+from tests.api.samples import NODES, grid, tmap2
 
 HERE = {"latitude": 53.2686, "longitude": -0.5245, "altitude": 0.0, "heading": 30.0}
 FRAME = local_frame(Datum(53.2686, -0.5245, heading=30.0))
@@ -369,3 +370,17 @@ def test_qgis_opens_the_layer_definition(open_site: tuple[Api, str], tmp_path: P
         if row["name"] == "Nodes":
             found = np.array([[west, south], [east, north]])
             assert np.abs(found - [places.min(axis=0), places.max(axis=0)]).max() < 1e-8
+
+
+def test_qgis_opens_grids_of_levels_with_a_space(open_site: tuple[Api, str], tmp_path: Path) -> None:
+    api, _ = open_site
+    env = create_farm(api, "floors")
+    api.upload(env, grid(), level="first floor & é")
+    definition = api.get(f"/ogc/{env}/layers.qlr").content
+    sources = [text for text in etree.fromstring(definition).xpath("//datasource/text()") if "tileMatrixSet" in text]
+    layers = [unquote(dict(pair.split("=", 1) for pair in source.split("&"))["layers"]) for source in sources]
+    assert "grid-map@first floor & é" in layers, "unquoted as Qt does, to which + is no space"
+    (tmp_path / "site.qlr").write_bytes(definition)
+    result = qgis.run(OPEN, tmp_path / "site.qlr", folder=tmp_path)
+    assert all(row["valid"] for row in result["rows"])
+    assert any("first floor" in row["name"] for row in result["rows"])
