@@ -29,7 +29,7 @@ from app.ogc.item_query import ItemQuery, invalid, parse_bbox, parse_items_query
 from app.ogc.negotiation import GEOJSON, HTML, JSONFG, PAGES, SCHEMA, Representation
 from app.ogc.routing import both, ogc_router
 from app.ogc.schemas import OgcFeatureOut, OgcFeaturesOut
-from app.ogc.service import Link, Service, link
+from app.ogc.service import Link, Service, etag_of, link
 from app.ogc.tables import Table
 from app.ogc.vector import RESERVED, TITLES, find_box_table, find_item_table, find_table, queryables, tables, title_of
 
@@ -266,25 +266,47 @@ async def get_item(
             unknown[0][:80], "is unknown", f"unknown query parameter {unknown[0][:80]!r}{near}; accepted: crs, f"
         )
     output = _output(service, systems, parse_crs(given["crs"], systems, "crs") if "crs" in given else None)
+    row = await _row(service, collection, table, feature)
+    links = _item_links(service, collection, feature, output, [("crs", given["crs"])] if "crs" in given else [])
+    if output.used == "html":
+        return item_pages.respond_page(service, item_pages.item_page(service, collection, table, row, links))
+    body = await run_in_threadpool(_write_item, table, row, output, collection, links)
+    return service.respond(body, ITEMS[output.used], {"content-crs": output.content_crs})
+
+
+async def item_etag(service: Service, collection: str, feature: str) -> str:
+    """Return the ETag of a feature's GeoJSON in CRS84, whatever the request accepts. Raises NotFound."""
+    table = await find_item_table(service, collection, feature) or await _table(service, collection)
+    output = Output("json", reference_systems(service, table.datum)[CRS84], None)
+    row = await _row(service, collection, table, feature)
+    links = _item_links(service, collection, feature, output, [])
+    return etag_of(await run_in_threadpool(_write_item, table, row, output, collection, links))
+
+
+async def _row(service: Service, collection: str, table: Table, feature: str) -> int:
     row = await run_in_threadpool(table.row_of, feature)
     if row is None:
         listed = service.url("collections", collection, "items")
         raise NotFound(f"{collection} has no feature {feature[:80]!r}: list them at {listed}")
-    rows = np.array([row])
-    pairs = [("crs", given["crs"])] if "crs" in given else []
+    return row
+
+
+def _item_links(
+    service: Service, collection: str, feature: str, output: Output, pairs: Sequence[tuple[str, str]]
+) -> list[Link]:
+    """Link a feature to itself, its other representations and its collection."""
     url = service.url("collections", collection, "items", feature, pairs=pairs)
     links = service.alternates(url, ITEMS, output.used)
-    links.append(
-        link(service.url("collections", collection), "collection", PAGES["json"], title_of(service, collection))
-    )
-    if output.used == "html":
-        return item_pages.respond_page(service, item_pages.item_page(service, collection, table, row, links))
-    (text,) = await run_in_threadpool(feature_texts, table, rows, output, collection)
+    title = title_of(service, collection)
+    return [*links, link(service.url("collections", collection), "collection", PAGES["json"], title)]
+
+
+def _write_item(table: Table, row: int, output: Output, collection: str, links: list[Link]) -> bytes:
+    (text,) = feature_texts(table, np.array([row]), output, collection)
     members = {**_fg_members(output, collection, table.datum), "links": links}
     if output.used == "jsonfg":
         members.pop("featureType")  # it is a member of the feature itself
-    body = text[:-1] + b"," + orjson.dumps(members)[1:]
-    return service.respond(body, ITEMS[output.used], {"content-crs": output.content_crs})
+    return text[:-1] + b"," + orjson.dumps(members)[1:]
 
 
 # --- schemas ---
@@ -327,7 +349,7 @@ def collection_schema(service: Service, collection: str, table: Table) -> dict[s
     for number, (name, types) in enumerate(table.types.items(), start=2):
         if name not in listed:
             listed[name] = {"title": name, **_property_schema(name, types), "x-ogc-propertySeq": number}
-    return _schema(service, collection, "schema", listed)
+    return _schema(service, collection, "schema", listed)  # features may have others, too
 
 
 def queryables_schema(service: Service, collection: str, table: Table) -> dict[str, Any]:
@@ -340,7 +362,7 @@ def queryables_schema(service: Service, collection: str, table: Table) -> dict[s
     }
     for name, types in queryables(table).items():
         listed.setdefault(name, {"title": name, **_property_schema(name, types)})
-    return _schema(service, collection, "queryables", listed)
+    return {**_schema(service, collection, "queryables", listed), "additionalProperties": False}
 
 
 def _schema(service: Service, collection: str, page: str, listed: dict[str, Any]) -> dict[str, Any]:
@@ -350,7 +372,6 @@ def _schema(service: Service, collection: str, page: str, listed: dict[str, Any]
         "type": "object",
         "title": title_of(service, collection),
         "properties": listed,
-        "additionalProperties": False,
     }
 
 

@@ -95,7 +95,7 @@ class Service:
 
         etag: strong one of the body by default. A weak one starts with ``W/``.
         """
-        etag = etag or f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+        etag = etag or etag_of(body)
         sent = {
             "etag": etag,
             "vary": "accept, authorization, cookie",
@@ -119,6 +119,11 @@ class Service:
     def choose(self, offers: Mapping[str, str] = PAGES) -> str:
         """Return the requested representation."""
         return choose(self.request, offers)
+
+
+def etag_of(body: bytes) -> str:
+    """Return the strong ETag of a body."""
+    return f'"{hashlib.sha256(body).hexdigest()[:32]}"'
 
 
 async def current_service(env: EnvironmentPath, request: Request, services: ServicesDep, _: Viewer) -> Service:

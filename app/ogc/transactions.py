@@ -22,7 +22,7 @@ from app.ogc.drafts import DRAFT, draft_service, own_draft
 from app.ogc.extensions import Extension
 from app.ogc.feature_edits import FeatureEditor
 from app.ogc.footprints import raster_parts
-from app.ogc.items import FeaturePath, get_item
+from app.ogc.items import FeaturePath, item_etag
 from app.ogc.property_types import property_types
 from app.ogc.routing import LONG, SHORT, ogc_router
 from app.ogc.service import Service
@@ -136,8 +136,8 @@ async def _check_item(service: Service, collection: str, feature: str, if_match:
     """Check If-Match with a feature's ETag; returns the tag of the draft for which it holds. Raises StaleParent."""
     if if_match is None:
         return None
-    shown = await get_item(service, collection, feature)
-    if not none_match(if_match, shown.headers["etag"]):  # weakly: compression makes tags of the same content weak
+    etag = await item_etag(service, collection, feature)
+    if not none_match(if_match, etag):  # weakly: compression makes tags of the same content weak
         raise StaleParent(
             f"the feature {feature[:80]!r} has changed, or the tag is not that of its GeoJSON in CRS84: read it again "
             "so, and repeat the change"
@@ -146,7 +146,7 @@ async def _check_item(service: Service, collection: str, feature: str, if_match:
     return None if pending is None else f'"{pending.tag}"'
 
 
-async def _write_item(
+async def _change_item(
     service: Service,
     principal: Principal,
     collection: str,
@@ -155,10 +155,14 @@ async def _write_item(
     content_crs: str | None,
     if_match: str | None,
 ) -> Response:
-    """Apply one edit of a feature that exists."""
+    """Change a feature; the response has the ETag of its GeoJSON, unless it is in another collection now."""
     tag = await _check_item(service, collection, feature, if_match)
-    await _write(service, principal, collection, content_crs, edit, tag)
-    return Response(status_code=204)
+    after = await _write(service, principal, collection, content_crs, edit, tag)
+    try:
+        headers = {"etag": await item_etag(after, collection, feature)}
+    except NotFound:
+        headers = {}
+    return Response(status_code=204, headers=headers)
 
 
 _BODY: Mapping[str, Any] = {
@@ -253,7 +257,7 @@ async def replace_item(
     def edit(editor: FeatureEditor) -> Mapping[str, Any]:
         return editor.change(feature, body, replaces=True)
 
-    return await _write_item(service, principal, collection, feature, edit, content_crs, if_match)
+    return await _change_item(service, principal, collection, feature, edit, content_crs, if_match)
 
 
 @router.patch(
@@ -282,7 +286,7 @@ async def update_item(
     def edit(editor: FeatureEditor) -> Mapping[str, Any]:
         return editor.change(feature, body, replaces=False)
 
-    return await _write_item(service, principal, collection, feature, edit, content_crs, if_match)
+    return await _change_item(service, principal, collection, feature, edit, content_crs, if_match)
 
 
 @router.delete(
@@ -299,7 +303,9 @@ async def delete_item(
     if_match: IfItemMatch = None,
 ) -> Response:
     """Delete one feature. A node with edges is refused: delete the edges first."""
-    return await _write_item(service, principal, collection, feature, lambda e: e.delete(feature), None, if_match)
+    tag = await _check_item(service, collection, feature, if_match)
+    await _write(service, principal, collection, None, lambda editor: editor.delete(feature), tag)
+    return Response(status_code=204)
 
 
 # --- methods ---
@@ -350,7 +356,7 @@ for _path, _allowed in ((_ITEMS, allow_items), (_ITEM, allow_item)):
 
 
 def _conformance(service: Service) -> tuple[str, ...]:
-    names = ("create-replace-delete", "update", "optimistic-locking", "features")
+    names = ("create-replace-delete", "update", "optimistic-locking-etags", "features")
     return tuple(f"{PART4}/{name}" for name in names) if service.draft is not None else ()
 
 

@@ -137,6 +137,8 @@ def test_methods_are_told_as_programs_ask_for_them(api: Api, gis: Gis) -> None:
     assert {"PUT", "PATCH", "DELETE"} <= set(methods.split(", "))
     classes = api.get(f"{gis.at}/conformance").json()["conformsTo"]
     assert any("features-4" in one and one.endswith("/create-replace-delete") for one in classes)
+    assert any(one.endswith("ogcapi-features-4/1.0/conf/optimistic-locking-etags") for one in classes)
+    assert "additionalProperties" not in api.get(f"{gis.at}/collections/nodes/schema").json(), "a POST adds them"
     described = api.get(f"{gis.at}/api").json()["paths"]
     assert set(described["/collections/edges/items"]) == {"get", "post"}
     assert set(described["/collections/edges/items/{featureId}"]) == {"get", "put", "patch", "delete"}
@@ -284,10 +286,16 @@ def test_fractions_are_numbers_where_all_were_whole(gis: Gis) -> None:
 def test_if_match_names_the_feature(gis: Gis) -> None:
     at = f"{gis.at}/collections/nodes/items/barn"
     tag = gis.api.get(at).headers["etag"]
-    gis.patch("nodes", "barn", headers={"if-match": tag}, properties={"a": 1})
+    changed = gis.patch("nodes", "barn", headers={"if-match": tag, "accept": "text/html"}, properties={"a": 1})
     refused = gis.patch("nodes", "barn", 412, headers={"if-match": tag}, properties={"a": 2})
     assert "read it again" in refused.json()["detail"]
     assert gis.item("nodes", "barn")["properties"]["a"] == 1
+    plain = {"accept-encoding": "identity"}  # compression makes tags weak
+    assert changed.headers["etag"] == gis.api.get(at, headers=plain).headers["etag"]
+    body = {"type": "Feature", "geometry": point(10, 1), "properties": {}}
+    headers = {**GEOJSON, **gis.local, "if-match": changed.headers["etag"]}
+    replaced = gis.api("PUT", at, 204, json=body, headers=headers)
+    assert replaced.headers["etag"] == gis.api.get(at, headers=plain).headers["etag"] != changed.headers["etag"]
 
 
 @pytest.mark.parametrize(("collection", "item"), [("nodes", "barn"), ("edges", "barn_field")])
