@@ -161,7 +161,8 @@ class Views:
         assert isinstance(part, Features)
         frame = local_frame(datum)
         if crs == LOCAL:
-            geometry = part.in_local(frame)
+            geometry = part.geometry.copy()
+            geometry[~part.local] = frame.near_geometries_to_local(geometry[~part.local])
         else:
             geometry = shapely.force_2d(part.in_wgs84(frame))
             geometry = cut_at_antimeridian(geometry) if crs in GLOBES else geometry

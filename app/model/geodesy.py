@@ -140,6 +140,15 @@ class LocalFrame:
         """Convert shapely geometries from degrees to metres. Raises Invalid if one is too far from the datum."""
         return _transform(geometry, self._to_bounded_local)
 
+    def near_geometries_to_local(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
+        """Convert shapely geometries from degrees to metres; those too far from the datum become empty."""
+        out = _transform(geometry, self.to_local)
+        points, index = shapely.get_coordinates(out, return_index=True)
+        far = np.unique(index[~(np.abs(points) <= MAX_METRES).all(axis=1)])
+        if len(far):
+            out[far] = shapely.GeometryCollection()
+        return out
+
     def geometries_to_wgs84(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
         """Convert shapely geometries from metres to degrees."""
         return _transform(geometry, self.to_wgs84)

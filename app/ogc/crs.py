@@ -61,11 +61,11 @@ class ReferenceSystem:
         return self.is_geographic or self.code == MERCATOR
 
     def from_wgs84(self, geometry: NDArray[np.object_], datum: Datum) -> NDArray[np.object_]:
-        """Convert geometries from CRS84."""
+        """Convert geometries from CRS84; those too far from the datum for the local frame become empty."""
         if self.kind == "crs84":
             return geometry
         if self.kind == "local":
-            return geodesy.local_frame(datum).geometries_to_local(geometry)
+            return geodesy.local_frame(datum).near_geometries_to_local(geometry)
         return swap_axes(geometry) if self.swap else geodesy.geometries_from_wgs84(self.code, geometry)
 
     def to_wgs84(self, geometry: NDArray[np.object_], datum: Datum) -> NDArray[np.object_]:

@@ -235,7 +235,7 @@ class Table:
         return _converted(self.geometry[rows], self.local[rows], local_frame(self.datum))
 
     def in_crs(self, rows: NDArray[np.intp], crs: ReferenceSystem) -> NDArray[np.object_]:
-        """Return the geometries of rows in a CRS. Raises Invalid if one is too far away for the local frame."""
+        """Return the geometries of rows in a CRS; in the local frame those too far away are empty."""
         if crs.kind != "local":
             geometry = self.in_wgs84(rows) if crs.ends_at_antimeridian else self._in_degrees(rows)
             return crs.from_wgs84(geometry, self.datum)

@@ -313,6 +313,28 @@ def test_site_without_a_datum_has_none(api: Api) -> None:
     assert not [link for link in get(api, f"/ogc/{env}/")["links"] if "tile" in link["href"].rpartition("/")[2]][1:]
 
 
+def test_a_feature_far_away_does_not_hide_the_others_in_the_local_frame(api: Api, farm: str) -> None:
+    places = {"tree": (-0.52449, 53.26859), "far": (-170.0, -50.0), "pole": (0.0, 90.0)}
+    trees = [
+        {"type": "Feature", "id": name, "properties": {"kind": "tree"},
+         "geometry": {"type": "Point", "coordinates": list(at)}}
+        for name, at in places.items()
+    ]  # fmt: skip
+    api.upload(farm, {"o.geojson": json.dumps({"type": "FeatureCollection", "features": trees}).encode()})
+    base = f"/ogc/{farm}/collections/objects-points"
+    local = f"{api.url}/ogc/{farm}/crs/local"
+    shown = {one["id"]: one for one in api.get(f"{base}/items?f=jsonfg").json()["features"]}
+    assert shown["tree"]["place"]["coordinates"] == pytest.approx([0.67, -1.11], abs=0.01)
+    assert shown["far"]["place"] is None
+    assert shown["far"]["geometry"]["coordinates"] == [-170, -50]
+    rows = api.get(f"{base}/items?crs={local}").json()["features"]
+    assert {one["id"] for one in rows if one["geometry"] is None} >= {"far"}
+    near = api.get(f"{base}/items?bbox=-5,-5,5,5&bbox-crs={local}").json()["features"]
+    assert [one["id"] for one in near] == ["tree"]
+    assert b"tree" in api.get(f"{base}/tiles/local/9/256/256").content
+    api.get(f"{base}/map/tiles/local/9/256/256")
+
+
 # --- programs ---
 
 
