@@ -70,6 +70,9 @@ export function rasterKey(part: { layer: string; name: string }): string {
   return `${part.layer}/${part.name}`;
 }
 
+/** Returns whether it took the click. */
+export type Picker = (feature: Feature | null, point: Position, event: PointerEvent | MouseEvent) => boolean;
+
 export class SiteMap {
   readonly map: OlMap;
   /** Place of the pointer in local metres. */
@@ -85,14 +88,13 @@ export class SiteMap {
   /** Features shown instead of the version's, such as those of a draft; null: the version's. */
   readonly shown = signal<readonly Feature[] | null>(null);
   index = new FeatureIndex([]);
-  /** Views may take clicks and drags instead of selection. */
   readonly pan = new DragPan();
-  onPick: ((feature: Feature | null, point: Position, event: PointerEvent | MouseEvent) => boolean) | null = null;
 
   private readonly layers: Record<"zones" | "objects" | "topology" | "location", FeatureLayer>;
   private readonly selection: FeatureLayer;
   private readonly rasters = new Map<string, RasterLayer>();
   private readonly stops: (() => void)[] = [];
+  private pickers: { pick: Picker; isAbove: boolean }[] = [];
   private drawn: { level: string; features: readonly Feature[] } = { level: "", features: [] };
   private streets = new Streets([]);
   private base: Layer | null = null;
@@ -246,6 +248,22 @@ export class SiteMap {
     return this.index.near(point, reach).filter((feature) => !isHidden(feature.layer));
   }
 
+  /** Lets a view take clicks instead of selection. Returns the function that ends this; the views may end in any order.
+   *
+   * isAbove: it acts before all others, however late they begin. */
+  takePicks(pick: Picker, { isAbove = false } = {}): () => void {
+    const own = { pick, isAbove };
+    this.pickers = [...this.pickers, own];
+    return () => {
+      this.pickers = this.pickers.filter((one) => one !== own);
+    };
+  }
+
+  /** The one of those that take clicks that acts now. */
+  get picker(): Picker | undefined {
+    return (this.pickers.findLast(({ isAbove }) => isAbove) ?? this.pickers.at(-1))?.pick;
+  }
+
   private listen(): void {
     const view = this.map.getView();
     this.map.on("pointermove", (event) => {
@@ -258,7 +276,7 @@ export class SiteMap {
       const point = event.coordinate as Position;
       const source = event.originalEvent as PointerEvent;
       const feature = this.pick(point, source.pointerType === "touch" ? 22 : PICK_PIXELS)[0] ?? null;
-      if (this.onPick?.(feature, point, source)) return;
+      if (this.picker?.(feature, point, source)) return;
       this.select(feature);
     });
     const showView = () => {

@@ -129,11 +129,11 @@ function Measure({ map }: { map: SiteMap }) {
       classOf: () => "line",
       paints: () => ({ line: { stroke: colour("accent"), width: 2, dash: [4, 4], dot: 9 } }),
     });
-    const before = map.onPick;
-    map.onPick = (_, point) => {
+    const measure = (_: unknown, point: Position) => {
       measured.value = [...(measured.value ?? []), point];
       return true;
     };
+    const release = map.takePicks(measure, { isAbove: true });
     const stop = measured.subscribe((list) => {
       if (!list) return;
       const common = { layer: "drawn" as const, level: "", part: "", properties: {} };
@@ -150,7 +150,7 @@ function Measure({ map }: { map: SiteMap }) {
     addEventListener("keydown", press);
     return () => {
       stop();
-      map.onPick = before;
+      release();
       map.removeLayer(layer);
       removeEventListener("keydown", press);
     };

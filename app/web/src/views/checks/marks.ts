@@ -3,7 +3,7 @@ import { effect } from "@preact/signals";
 import { useEffect } from "preact/hooks";
 import type { Finding } from "../../checks";
 import type { FeatureStyle } from "../../map/feature-layer";
-import { distanceTo, type Feature, type Position } from "../../map/features";
+import { distanceTo, type Feature } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
 import { colour, theme } from "../../theme";
 import { keyOf } from "./fixes";
@@ -73,8 +73,7 @@ export function useMarks(
     const marks = here.map(markOf);
     const layer = map.addLayer(MARKS, Z_MARKS);
     layer.setFeatures(marks);
-    const earlier = map.onPick;
-    map.onPick = (_, point: Position) => {
+    const release = map.takePicks((_, point) => {
       const reach = REACH * map.resolution.peek();
       const near = marks
         .map((mark, index) => ({ index, distance: distanceTo(mark.geometry, point) }))
@@ -83,14 +82,14 @@ export function useMarks(
       const finding = near && here[near.index];
       if (finding) choose(finding);
       return finding !== undefined;
-    };
+    });
     const stop = effect(() => {
       theme.value;
       requestAnimationFrame(() => layer.repaint());
     });
     return () => {
       stop();
-      map.onPick = earlier;
+      release();
       map.removeLayer(layer);
     };
   }, [map, findings, level]);

@@ -54,16 +54,15 @@ export class Desk {
     this.sketch = new Sketch(this.editor, map);
     const context: Context = { editor: this.editor, map, sketch: this.sketch };
     const take = () => true;
-    const before = map.onPick;
-    map.onPick = take;
     this.pointer = new EditPointer(
       this.editor,
       map,
       () => this.tool.peek(),
-      () => map.onPick === take,
+      () => map.picker === take,
     );
     map.map.addInteraction(this.pointer);
     this.stops.push(
+      map.takePicks(take),
       effect(() => {
         const name = this.editor.tool.value;
         this.tool.peek()?.close();
@@ -82,7 +81,6 @@ export class Desk {
         map.map.removeInteraction(this.pointer);
         this.pointer.stop();
         this.pointer.dispose();
-        map.onPick = before;
       },
     );
   }

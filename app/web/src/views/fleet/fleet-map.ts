@@ -47,9 +47,9 @@ export class FleetMap {
     this.drawn = map.addLayer({ classOf: () => "drawn", paints: drawnPaints }, 24);
     this.robots = new RobotLayer({ zIndex: 23 });
     map.map.addLayer(this.robots);
-    map.onPick = (feature, point, event) => this.pick(feature, point, event);
     this.menu = new MenuPress(map.map.getViewport() as HTMLElement, (event) => this.closeStreet(event));
     this.stops = [
+      map.takePicks((feature, point, event) => this.pick(feature, point, event)),
       () => this.menu.close(),
       effect(() => this.showRobots()),
       effect(() => this.showClosures()),
@@ -60,7 +60,6 @@ export class FleetMap {
   close(): void {
     for (const stop of this.stops) stop();
     clearTimeout(this.painting);
-    this.map.onPick = null;
     for (const layer of [this.route, this.closures, this.drawn]) this.map.removeLayer(layer);
     this.map.map.removeLayer(this.robots);
     this.robots.dispose();

@@ -147,15 +147,15 @@ function useCompareMap({ map }: Pick<ViewProps, "map">) {
   const view = useRef<CompareMap | null>(null);
   if (!view.current) view.current = new CompareMap(map);
   useEffect(() => {
-    map.onPick = (feature, point, event) => {
+    const release = map.takePicks((feature, point, event) => {
       const pixels = (event as PointerEvent).pointerType === "touch" ? 22 : 10;
       const key = view.current?.pick(point, pixels * map.resolution.peek()) ?? null;
       if (key) go({ change: key }, { replace: true });
       else if (!feature) go({ change: null }, { replace: true });
       return key !== null;
-    };
+    });
     return () => {
-      map.onPick = null;
+      release();
       view.current?.close();
       view.current = null;
     };
