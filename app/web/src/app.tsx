@@ -27,7 +27,7 @@ export function App({ starting }: { starting: Promise<void> }) {
   return (
     <>
       {site.value ? <SiteView key={site.value.name} site={site.value} /> : <Sites />}
-      <Dialog open={expired.value} title="Sign in again" onClose={() => undefined}>
+      <Dialog open={expired.value} title="Sign in again">
         <p>Your session has ended. Nothing on this page is lost: sign in to go on.</p>
         <SignIn inDialog />
       </Dialog>

@@ -1,12 +1,13 @@
 import { X } from "lucide-preact";
 import type { ComponentChildren } from "preact";
-import { useEffect, useId, useRef } from "preact/hooks";
+import { useEffect, useId, useRef, useState } from "preact/hooks";
 import { Button } from "./button";
 
 interface DialogProps {
   open: boolean;
   title: string;
-  onClose: () => void;
+  /** Without it, the dialog stays until its owner closes it. */
+  onClose?: () => void;
   children: ComponentChildren;
   /** Buttons at the end, the main one last. */
   actions?: ComponentChildren;
@@ -17,6 +18,7 @@ interface DialogProps {
 export function Dialog({ open, title, onClose, children, actions, wide }: DialogProps) {
   const element = useRef<HTMLDialogElement>(null);
   const id = useId();
+  const [, setCloses] = useState(0);
   useEffect(() => {
     const dialog = element.current;
     if (!dialog) return;
@@ -28,17 +30,21 @@ export function Dialog({ open, title, onClose, children, actions, wide }: Dialog
       ref={element}
       class={wide ? "dialog wide" : "dialog"}
       aria-labelledby={id}
-      onClose={() => open && onClose()}
+      onClose={() => {
+        if (!open) return;
+        onClose?.();
+        setCloses((number) => number + 1); // the browser heeds preventDefault of `cancel` only once in a row
+      }}
       onCancel={(event) => {
         event.preventDefault(); // the owner may keep it open
-        onClose();
+        onClose?.();
       }}
     >
       {open && (
         <>
           <header>
             <h2 id={id}>{title}</h2>
-            <Button icon={X} label="Close" quiet onClick={onClose} />
+            {onClose && <Button icon={X} label="Close" quiet onClick={onClose} />}
           </header>
           <div class="dialog-body">{children}</div>
           {actions && <footer>{actions}</footer>}

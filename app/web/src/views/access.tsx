@@ -10,22 +10,22 @@ const Tokens = lazy(() => import("./access/tokens"));
 
 export function Access({ open, onClose }: { open: boolean; onClose: () => void }) {
   const [created, setCreated] = useState<Schemas["NewTokenOut"] | null>(null);
-  const [asks, setAsks] = useState(0);
+  const [asks, setAsks] = useState(false);
   const show = (token: Schemas["NewTokenOut"] | null) => {
     setCreated(token);
-    setAsks(0);
+    setAsks(false);
   };
   const close = () => {
     show(null);
     onClose();
   };
   return (
-    <Dialog open={open} title="Tokens" onClose={() => (created ? setAsks(asks + 1) : close())} wide>
-      {asks > 0 && created && (
+    <Dialog open={open} title="Tokens" onClose={() => (created ? setAsks(true) : close())} wide>
+      {asks && created && (
         <div class="problem" role="alertdialog" aria-label="Close without the token?">
           <p>The token of “{created.name}” can never be shown again. Close without it?</p>
           <div class="actions">
-            <Button main onClick={() => setAsks(0)}>
+            <Button main onClick={() => setAsks(false)}>
               Back to the token
             </Button>
             <Button danger onClick={close}>
