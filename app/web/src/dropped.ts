@@ -1,6 +1,7 @@
 /** Files dropped onto a site: any view receives them, the Upload view takes them. */
 import { signal } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
+import { attempt } from "./ui/toast";
 
 /** A file with its path inside the folder that was picked or dropped. */
 export interface PickedFile {
@@ -10,8 +11,6 @@ export interface PickedFile {
 
 /** Files that wait for the Upload view. */
 export const dropped = signal<PickedFile[]>([]);
-
-const MAX_FILES = 5000;
 
 /** Watches for files dragged onto the page. Returns whether some are above it. */
 export function useFileDrop(isEnabled: boolean, onDrop: () => void): boolean {
@@ -34,8 +33,9 @@ export function useFileDrop(isEnabled: boolean, onDrop: () => void): boolean {
       setOver(false);
       if (!hasFiles(event) || !event.dataTransfer) return;
       event.preventDefault();
-      void filesOf(event.dataTransfer).then((files) => {
-        dropped.value = [...dropped.peek(), ...files];
+      const { dataTransfer } = event;
+      void attempt(async () => {
+        dropped.value = [...dropped.peek(), ...(await filesOf(dataTransfer))];
         onDrop();
       });
     };
@@ -48,7 +48,7 @@ export function useFileDrop(isEnabled: boolean, onDrop: () => void): boolean {
   return isOver;
 }
 
-/** Returns the files of a drop; folders with all that is in them. */
+/** Returns the files of a drop; folders with all that is in them. Throws an error that names what cannot be read. */
 export async function filesOf(data: DataTransfer): Promise<PickedFile[]> {
   const entries = [...data.items].map((item) => item.webkitGetAsEntry?.() ?? null); // at once: they end with the event
   if (!entries.some((entry) => entry)) return [...data.files].map((file) => ({ path: file.name, file }));
@@ -58,15 +58,21 @@ export async function filesOf(data: DataTransfer): Promise<PickedFile[]> {
 }
 
 async function readEntry(entry: FileSystemEntry, out: PickedFile[]): Promise<void> {
-  if (out.length >= MAX_FILES) return;
+  const path = entry.fullPath.replace(/^\//, "");
+  const refuse = (reject: (error: Error) => void) => (error: Error) =>
+    reject(new Error(`nothing was added: “${path}” cannot be read (${error.message})`));
   if (entry.isFile) {
-    const file = await new Promise<File>((resolve, reject) => (entry as FileSystemFileEntry).file(resolve, reject));
-    out.push({ path: entry.fullPath.replace(/^\//, ""), file });
+    const file = await new Promise<File>((resolve, reject) =>
+      (entry as FileSystemFileEntry).file(resolve, refuse(reject)),
+    );
+    out.push({ path, file });
     return;
   }
   const reader = (entry as FileSystemDirectoryEntry).createReader();
   for (;;) {
-    const batch = await new Promise<FileSystemEntry[]>((resolve, reject) => reader.readEntries(resolve, reject));
+    const batch = await new Promise<FileSystemEntry[]>((resolve, reject) =>
+      reader.readEntries(resolve, refuse(reject)),
+    );
     if (!batch.length) return; // a folder is read in batches of 100
     for (const one of batch) await readEntry(one, out);
   }
