@@ -39,6 +39,9 @@ KEEP_ALIVE_SECONDS: Final = 2.0
 MAX_URL: Final = 2000
 
 _NAT64: Final = ipaddress.IPv6Network("64:ff9b::/96")
+_PUBLIC_V6: Final = ipaddress.IPv6Network("2000::/3")
+"""All that is assigned as global unicast; what lies outside is local, or leads to IPv4 by a translator."""
+
 _PLATFORMS: Final = (ipaddress.ip_network("168.63.129.16/32"),)
 """Public addresses at which a cloud answers its own machines: Azure's platform."""
 
@@ -58,7 +61,8 @@ class OutgoingRules:
         inner = embedded_address(address)
         if any(inner in network for network in self.networks):
             return None
-        if not inner.is_global or inner.is_multicast or any(inner in network for network in _PLATFORMS):
+        is_public = inner.is_global and not inner.is_multicast and (inner.version == 4 or inner in _PUBLIC_V6)
+        if not is_public or any(inner in network for network in _PLATFORMS):
             return f"{address} is not a public address: FLEETMAP_WEBHOOK_NETWORKS must allow it"
         if scheme != "https":
             return f"plain http to {address} is not allowed: use https, or allow it with FLEETMAP_WEBHOOK_NETWORKS"

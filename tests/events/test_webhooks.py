@@ -367,6 +367,8 @@ def test_waits_grow_and_obey_the_receiver() -> None:
         ("0.0.0.0", "https", "public"), ("10.8.0.1", "https", "public"), ("192.168.1.1", "https", "public"),
         ("169.254.169.254", "https", "public"), ("fe80::1", "https", "public"), ("fd00:ec2::254", "https", "public"),
         ("100.100.100.200", "https", "public"), ("168.63.129.16", "https", "public"), ("224.0.0.1", "https", "public"),
+        ("fec0::1", "https", "public"), ("4000::1", "https", "public"), ("64:ff9b:1::7f00:1", "https", "public"),
+        ("::7f00:1", "https", "public"), ("::ffff:0:7f00:1", "https", "public"), ("5f00::1", "https", "public"),
         ("64:ff9b::7f00:1", "https", "public"), ("64:ff9b::a9fe:a9fe", "https", "public"),
         ("2002:7f00:1::", "https", "public"), ("255.255.255.255", "https", "public"), ("::", "https", "public"),
     ],
