@@ -26,7 +26,7 @@ from app.model.features import Features, concatenate, features
 from app.model.frame import Anchor, Datum
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
-from app.model.layers import MAP, Layers, Part, PartKey
+from app.model.layers import MAP, Layers, PartKey
 from app.store.values import Bounds, Box, PartEntry, Provenance, Version
 
 if TYPE_CHECKING:
@@ -67,22 +67,32 @@ def drop_areas(version: Version) -> Version:
 def load(store: Store, version: Version, keys: Collection[PartKey]) -> Layers:
     """Load parts of a version, with its closed areas and without marks that an earlier release put into versions."""
     areas = {} if version.closures is None else {k: closed for k, closed in _areas(version).items() if k in keys}
-    loaded = store.content.load(version, [key for key in keys if key not in areas])
-    parts: dict[PartKey, Part] = {**loaded.parts, **{key: _zones(closed) for key, closed in areas.items()}}
-    return drop_timed_marks(replace(loaded, parts=parts), areas)
+    loaded = drop_timed_marks(store.content.load(version, [key for key in keys if key not in areas]))
+    zones = {key: _zones([c for c in closed if not _is_kept(c, loaded)]) for key, closed in areas.items()}
+    return replace(loaded, parts={**loaded.parts, **zones})
 
 
-def drop_timed_marks(layers: Layers, areas: Collection[PartKey] = ()) -> Layers:
+def _is_kept(area: Closure, layers: Layers) -> bool:
+    """Return whether a zone of the version is this closed area for good: with its id, its kind and its shape."""
+    item, shape, _ = _zone(area)
+    for zones in layers.vector("zones", area.level).values():
+        k = zones.index().get(item)
+        if k is None or zones.properties[k].get("kind") != KEEPOUT or zones.local[k] != (area.crs != "wgs84"):
+            continue
+        if zones.geometry[k].equals(shape):
+            return True
+    return False
+
+
+def drop_timed_marks(layers: Layers) -> Layers:
     """Drop marks in the layers that block something until a time: only closures block temporarily.
 
     Releases without closures stored such marks in versions, and exported maps with closures may be uploaded again.
-    areas: parts that are closed areas.
     """
     return replace(
         layers,
         parts={
-            key: _drop_timed_marks(part) if isinstance(part, Features) and key not in areas else part
-            for key, part in layers.parts.items()
+            key: _drop_timed_marks(part) if isinstance(part, Features) else part for key, part in layers.parts.items()
         },
     )
 

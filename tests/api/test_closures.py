@@ -397,6 +397,20 @@ def test_zones_may_be_called_like_the_closed_areas(api: Api, farm: str) -> None:
     assert "z" in api.get(f"/maps/{farm}/geojson?closures=ignore").text
 
 
+def test_kept_area_is_one_zone_while_its_closure_is_in_force(api: Api, farm: str) -> None:
+    area = {"polygon": {"type": "Polygon", "coordinates": [[[0, -1], [2, -1], [2, 0.5], [0, -1]]]}, "crs": "local"}
+    closure, other = (close(api, farm, **area) for _ in range(2))
+    api.post(f"environments/{farm}/overlays/{closure['id']}/keep", expect=200)
+    listed = [f["id"] for f in api.get(f"/maps/{farm}/geojson").json()["features"]]
+    assert listed.count(f"overlay-{closure['id']}") == listed.count(f"overlay-{other['id']}") == 1
+    lines = api.get(f"environments/{farm}/versions/latest/reports/geojson").json()["closures"]
+    assert all("zone" in line["effect"].split(", ") for line in lines)
+    end(api, farm, other)
+    listed = [f["id"] for f in api.get(f"/maps/{farm}/geojson").json()["features"]]
+    assert listed.count(f"overlay-{closure['id']}") == 1, "no other closed area is left"
+    assert (pgm(api.get(f"/maps/{farm}/occupancy_grid/keepout.pgm").content) == 0).any()
+
+
 def test_robots_get_the_mask_of_a_closed_area_with_the_whole_site(api: Api, fresh: Any) -> None:
     """This includes a level without a mask of its own, beside a stored mask on another level."""
     env = fresh()
