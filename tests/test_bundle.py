@@ -149,6 +149,13 @@ def test_grid_name_is_folder_in_a_template_and_file_elsewhere() -> None:
     assert {k.name for k in read_upload({"hall.yaml": GRID, "map.pgm": PGM}, grid="keepout").parts} == {"keepout"}
 
 
+def test_grid_is_not_named_like_the_parameters_of_a_mask() -> None:
+    """Its YAML file would be listed in manifests, and a request for it would select the mask."""
+    for name, grid in (("keepout_filter_info", None), ("a", "b_filter_info")):
+        with pytest.raises(BadUpload, match="is named like the parameters of a mask"):
+            read_upload({f"{name}.yaml": GRID, "map.pgm": PGM}, grid=grid)
+
+
 def test_zip_of_a_folder_equals_its_files() -> None:
     files = {"config/location/datum.yaml": FENCED, "config/topological/n.kml": kml(PATH)}
     buffer = io.BytesIO()

@@ -13,8 +13,6 @@ from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.masks import KEEPOUT, SPEED_METRES, SPEED_PERCENT, FilterInfo
 from app.syntax import yaml
 
-SUFFIX = "_filter_info"
-
 _BY_NAME = (
     (re.compile(r"keep_?out|no_?go|preferred", re.IGNORECASE), FilterInfo(KEEPOUT, 0.0, 1.0)),
     (re.compile(r"speed", re.IGNORECASE), FilterInfo(SPEED_PERCENT, 100.0, -1.0)),
@@ -27,7 +25,7 @@ def companions(main: str, names: Sequence[str]) -> list[str]:
     folder, _, base = main.rpartition("/")
     stem = base.rpartition(".")[0]
     stems = dict.fromkeys([stem, stem.removesuffix("_mask")])
-    ends = [s + more + end for more in (SUFFIX, "_params") for s in stems for end in (".yaml", ".yml")]
+    ends = [s + more + end for more in (masks.INFO_SUFFIX, "_params") for s in stems for end in (".yaml", ".yml")]
     name_set = set(names)
     return [n for n in (f"{folder}/{end}".lstrip("/") for end in ends) if n in name_set and n != main]
 
@@ -100,7 +98,7 @@ def _to_floats(value: Any, depth: int) -> Any:
 
 def write(grid: OccupancyGrid, stem: str, context: WriteContext) -> dict[str, bytes]:
     """Write ``<grid>_filter_info.yaml`` for a mask; nothing for other grids. stem: of the grid's files."""
-    file = f"{stem}{SUFFIX}.yaml"
+    file = f"{stem}{masks.INFO_SUFFIX}.yaml"
     document = _kept_parameters(grid)
     if document is None:
         info = next((info for pattern, info in _BY_NAME if pattern.search(stem)), None)

@@ -27,6 +27,9 @@ MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
 KEEPOUT_MASKS = frozenset({"keepout", "nogo"})
 """Those of them that mark where robots must not drive."""
 
+INFO_SUFFIX = "_filter_info"
+"""End of a mask's name in the name of its parameter file; no grid may have such a name itself."""
+
 MAX_NAMESPACES = 4
 """Maximum depth of namespaces around a node."""
 

@@ -20,6 +20,7 @@ from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFil
 from app.formats import FileGroup, Files, Format, ReadContext
 from app.formats.environment import content as exact_content
 from app.limits import Limits
+from app.model import masks
 from app.model.features import Features, from_columns
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
 from app.model.geodesy import local_frame
@@ -390,6 +391,13 @@ def _is_regions(name: str) -> bool:
     return "region" in PurePosixPath(name).name.lower()
 
 
+def _check_grid_names(layers: Layers, file: str) -> None:
+    """Raise UnreadableFile for a grid whose YAML file would have the name of a mask's parameter file."""
+    for name in (key.name for key in layers.grids() if key.name.endswith(masks.INFO_SUFFIX)):
+        reason = f"the grid {name[:80]!r} is named like the parameters of a mask: give it another name with grid=…"
+        raise UnreadableFile(f"{file}: {reason}", [Problem(reason, file)])
+
+
 def _read_group(
     group: FileGroup, hints: UploadHints, upload_context: EnvironmentContext, limits: Limits, bundle: Bundle
 ) -> list[ParsedPart]:
@@ -415,6 +423,7 @@ def _read_group(
         folder=_folder_reader(hints, upload_context, limits, bundle),
     )
     layers = formats.read(group, context)
+    _check_grid_names(layers, group.main)
     for file in group.files:
         bundle.files[file] = FileUse(group.format.name, used=True)
     bundle.warnings += context.warnings

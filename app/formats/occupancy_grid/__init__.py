@@ -26,6 +26,7 @@ from app.formats.occupancy_grid.reading import IMAGE_ENDS, TIFF_ENDS, YAML_ENDS,
 from app.formats.occupancy_grid.words import NAME
 from app.formats.occupancy_grid.writing import WriteOptions, choose, write
 from app.limits import Limits
+from app.model import masks
 from app.syntax import geotiff, yaml
 
 _BLOCK = re.compile(
@@ -82,7 +83,7 @@ def options_from_filename(name: str) -> dict[str, str]:
             return {"grid": name.removesuffix(end), "file_type": "png", "world_file": "true"}
     stem, _, end = name.rpartition(".")
     if f".{end}" in YAML_ENDS:
-        stem = stem.removesuffix(_masks.SUFFIX)
+        stem = stem.removesuffix(masks.INFO_SUFFIX)
     if not stem or f".{end}" not in (*YAML_ENDS, ".pgm", ".png", ".tif"):
         return {}
     return {"grid": stem, **({"file_type": end} if end in ("pgm", "png", "tif") else {})}
