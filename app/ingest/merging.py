@@ -230,10 +230,18 @@ def _merged(
         )
     order: tuple[Information, ...] = ("raw", "derived", "generated", "template")
     old = [entry.provenance for entry in entries]
+    information = next(kind for kind in order if any(p.information == kind for p in old))
+    if any(p.information != information for p in old):
+        kinds = ", ".join(f"{entry.key.name}: {entry.provenance.information}" for entry in entries)
+        notes.warn(f"the grids differ in their information ({kinds}); the merged grid counts as {information}")
+    steps: list[Mapping[str, Any]] = []
+    for step in (step for p in old for step in p.steps):
+        if step not in steps:
+            steps.append(step)
     provenance = Provenance(
-        next(kind for kind in order if any(p.information == kind for p in old)),
+        information,
         sources=tuple(sorted({source for p in old for source in p.sources})),
-        steps=({"step": MERGED, "parameters": report},),
+        steps=(*steps, {"step": MERGED, "parameters": report}),
         attribution=tuple(dict.fromkeys(text for p in old for text in p.attribution)),
     )
     return merged, provenance

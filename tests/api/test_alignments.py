@@ -202,6 +202,26 @@ def test_merge_replaces_first_grid_and_is_undone_by_a_revert(api: Api, robots: s
     assert api.get(f"environments/{robots}/versions/latest/maps/occupancy_grid/one.pgm").content == pgm
 
 
+def test_merged_grid_keeps_the_steps_of_its_sources(api: Api, env: str) -> None:
+    """A part that a generator made up stays visible as such."""
+    size = {"width": 8.0, "depth": 8.0, "resolution": 0.1}
+    hall = {"generator": "cluttered_hall", "seed": 7, "parameters": size, "replace": True}
+    api.post(f"environments/{env}/generations", hall)
+    align(api, env, pairs=[[[4, -1], [0, 0]], [[5, -1], [1, 0]]])
+    stays = [[[0, 0], [0, 0]], [[1, 0], [1, 0]]]
+    result = merge(api, env, merge={"grids": ["map", "other"], "name": "site", "pairs": {"other": stays}})
+    (warning,) = [w["problem"] for w in result["warnings"] if "information" in w["problem"]]
+    assert "map: generated, other: raw" in warning
+    assert steps_of(api, env, "site") == ["cluttered_hall", "aligned", "merged"]
+    merge(api, env, merge={"grids": ["site", "map"], "name": "all", "pairs": {"map": stays}})
+    assert steps_of(api, env, "all") == ["cluttered_hall", "aligned", "merged", "merged"]
+
+
+def steps_of(api: Api, env: str, grid: str) -> list[str]:
+    lines = api.get(f"environments/{env}/versions/latest/reports/occupancy_grid?grid={grid}").json()["layers"]
+    return [step["step"] for line in lines if line["layer"] == "occupancy" for step in line["steps"]]
+
+
 def test_merge_refuses_what_it_cannot_decide(api: Api, robots: str) -> None:
     apart = {"grids": ["one", "apart"]}
     refused = merge(api, robots, 422, merge=apart)
