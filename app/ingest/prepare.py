@@ -82,7 +82,8 @@ def prepare_upload(
     renamed: dict[str, dict[str, str]] = {}
     # Sorted: objects come before the topology that was read from the same drawing.
     operations: list[Operation] = [
-        operation_for(store, base, upload_bundle, key, mode, files, renamed) for key in sorted(upload_bundle.parts)
+        operation_for(store, base, upload_bundle, key, mode, files, renamed, limits)
+        for key in sorted(upload_bundle.parts)
     ]
     operations += _stale_clouds(base, upload_bundle)
     warnings = [*upload_bundle.warnings, *_unused_hints(hints, upload_bundle)]
@@ -207,6 +208,7 @@ def operation_for(
     mode: Mode,
     files: Mapping[str, bytes],
     renamed: dict[str, dict[str, str]],
+    limits: Limits,
 ) -> Replace | Put:
     """Build the operation that stores one part.
 
@@ -235,7 +237,8 @@ def operation_for(
     elif mode == "merge" and entry is not None:
         old = store.content.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
-            part, provenance = merge_grids(old, part, key.name), merge_provenance(entry.provenance, provenance)
+            part = merge_grids(old, part, key.name, limits.pixels)
+            provenance = merge_provenance(entry.provenance, provenance)
         elif isinstance(part, Resources) and isinstance(old, Resources):
             part, provenance = Resources({**old.files, **part.files}), merge_provenance(entry.provenance, provenance)
     return Replace(key, part, provenance)
@@ -309,7 +312,7 @@ def _attribution(part: Part) -> list[str]:
     return [str(line) for line in stated]
 
 
-def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyGrid:
+def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str, max_cells: int) -> OccupancyGrid:
     """Merge two grids: known cells of the new grid overwrite the old ones, unknown cells overwrite nothing.
 
     The result covers both. Both must have the same resolution and yaw, and origins a whole number of cells apart (to a
@@ -336,6 +339,11 @@ def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyG
     left, bottom = min(0, column), min(0, row)
     width = max(old.width, column + new.width) - left
     height = max(old.height, row + new.height) - bottom
+    if width * height > max_cells:
+        raise Invalid(
+            f"grid {name}: the merged grid would have {width} × {height} cells, the limit is {max_cells}: the "
+            f"origins are {np.hypot(dx, dy):.0f} m apart; check the origin, or use mode=replace"
+        )
     stored = np.s_[-bottom : -bottom + old.height, -left : -left + old.width]
     window = np.s_[row - bottom : row - bottom + new.height, column - left : column - left + new.width]
     cells, grey = np.full((height, width), UNKNOWN, np.uint8), np.zeros((height, width), bool)

@@ -201,7 +201,7 @@ def _compose_parts(
         renamed: dict[str, dict[str, str]] = {}
         for key in sorted(upload_bundle.parts):
             with contextlib.suppress(FleetMapError):
-                operation = operation_for(store, start, upload_bundle, key, mode, files, renamed)
+                operation = operation_for(store, start, upload_bundle, key, mode, files, renamed, limits)
                 draft = store.chunks.stage()
                 stored_entries = {key: entries[key]} if isinstance(operation, Put) and key in entries else {}
                 encoded_part = compose_operation(draft, dict(stored_entries), operation)

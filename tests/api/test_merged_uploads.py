@@ -93,3 +93,13 @@ def test_merged_grid_keeps_credits_and_steps(api: Api, bare: str) -> None:
     assert report["information"] == "raw"
     assert [step["step"] for step in report["steps"]] == ["cluttered_hall"]
     assert report["attribution"] == ["ODbL 1.0, (c) 2024 Somebody (LICENSE)"]
+
+
+def test_merged_grid_has_as_many_cells_as_an_uploaded_one(api: Api, bare: str) -> None:
+    """Two small grids may be far apart: the grid around both would be too large to be uploaded again."""
+    api.upload(bare, saved_grid(np.full((2, 2), CLEAR)))
+    far = saved_grid(np.full((2, 2), WALL), origin=(16_400.0, 16_400.0))
+    refused = api.upload(bare, far, mode="merge", expect=422).json()
+    assert "16402 × 16402 cells" in refused["detail"]
+    assert "23193 m apart" in refused["detail"]
+    assert written_pixels(api, bare).shape == (2, 2)
