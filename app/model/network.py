@@ -26,6 +26,11 @@ Places = NDArray[np.intp]
 JOIN = 0.1
 """Default join distance in metres: drawings snapped by eye are off by millimetres, robots' goals are farther apart."""
 
+MIN_JOIN = 1e-6
+"""Minimum distance in metres within which vertices join: with less, only equal ones do, and a cell's number would
+overflow.
+"""
+
 CARRIED = ("action", "speed_limit", "width", "tmap2")
 """Properties of a line that its edges inherit; the rest stays with the drawing."""
 
@@ -180,7 +185,7 @@ def _cluster(xy: Metres, join: float, fixed: int) -> Places:
     # equal positions first: they are the majority, and vectorised
     _, first, inverse = np.unique(xy.view(np.complex128).ravel(), return_index=True, return_inverse=True)
     node[fixed:] = first[inverse[fixed:]]
-    if join <= 0.0:
+    if join < MIN_JOIN:
         return node
     heads = np.flatnonzero(node == np.arange(n))
     cell = np.floor(xy[heads] / join).astype(np.int64)

@@ -89,6 +89,13 @@ def test_near_vertices_join_at_first_position() -> None:
     assert ("a/1", "c/0") in edges(network), "c starts on b's segment"
 
 
+@pytest.mark.parametrize("join", [0.0, 1e-300, 5e-324, 1e-7])
+def test_tiny_join_distance_joins_equal_vertices_only(join: float) -> None:
+    """Cells of such a size have no number; all vertices were in one of them, and each was compared with all others."""
+    far = drawing(a=line((0, 0), (1000, 0)), b=line((1000, 0), (1000, 5)), c=line((1000, 7), (1000.001, 5)))
+    assert set(nodes(from_drawing(far, join=join))) == {"a/0", "a/1", "b/1", "c/0", "c/1"}
+
+
 def test_dense_line_does_not_shrink_to_node() -> None:
     x = np.arange(0, 10, 0.01)
     network = from_drawing(drawing(a=shapely.linestrings(np.column_stack([x, 0 * x]))))
