@@ -46,6 +46,10 @@ if that is less.
 """
 
 MAX_CELLS = 2**28
+
+MAX_SIDE_CELLS = 32767
+"""Maximum number of cells along a side: Nav2's map_server rejects larger maps."""
+
 _LIMIT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCII)
 
 
@@ -195,7 +199,7 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
     first = [math.floor(v / cell + 1e-6) for v in low_high[:2]]
     end = [math.ceil(v / cell - 1e-6) for v in low_high[2:]]
     width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
-    if width * height > MAX_CELLS:
+    if width * height > MAX_CELLS or max(width, height) > MAX_SIDE_CELLS:
         raise CannotConvert(f"a mask of {width} × {height} cells is too large: use a coarser resolution")
     return _Frame(round(first[0] * cell, 9), round(first[1] * cell, 9), cell, width, height)
 
@@ -203,7 +207,9 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
 def _coarse_enough(cell: float, low_high: Any) -> float:
     """Double the cell size, up to MAX_RESOLUTION_METRES, until a mask of this extent is small enough."""
     width, height = float(low_high[2] - low_high[0]), float(low_high[3] - low_high[1])
-    while (width / cell) * (height / cell) > MAX_CELLS / 4 and cell * 2.0 <= MAX_RESOLUTION_METRES:
+    while cell * 2.0 <= MAX_RESOLUTION_METRES and (
+        (width / cell) * (height / cell) > MAX_CELLS / 4 or max(width, height) / cell + 1.0 > MAX_SIDE_CELLS
+    ):
         cell *= 2.0
     return cell
 

@@ -201,9 +201,19 @@ def test_missing_zones_raise_missing_layer() -> None:
         derive_masks(zones((shapely.box(0, 0, 1e-4, 1e-4), {"kind": "keepout"}), anchor="wgs84"))
     with pytest.raises(CannotConvert, match="coarser"):
         derive_masks(zones((shapely.box(0, 0, 1e5, 1e5), {"kind": "keepout"})))
+    with pytest.raises(CannotConvert, match="125004 × 10 cells is too large"):
+        derive_masks(zones((shapely.box(0, 0, 1e5, 5), {"kind": "keepout"})))
     earth = zones((shapely.box(0, 0, 1e-4, 1e-4), {"kind": "keepout"}), anchor="wgs84", datum=Datum(0.0, 0.0))
     width = grid(derive_masks(earth)[0], KEEPOUT).width
     assert width == pytest.approx((11.13 + 2) / 0.05, abs=3)
+
+
+@pytest.mark.parametrize(("length", "resolution"), [(1630, 0.05), (1637, 0.1), (10_000, 0.4)])
+def test_mask_of_long_zones_has_no_more_cells_along_a_side_than_nav2_loads(length: float, resolution: float) -> None:
+    mask = grid(derive_masks(zones((shapely.box(0, 0, length, 5), {"kind": "keepout"})))[0], KEEPOUT)
+    assert mask.resolution == pytest.approx(resolution)
+    assert mask.width <= 32767
+    assert mask.width * mask.resolution == pytest.approx(length + 2, abs=2 * resolution)
 
 
 def test_masks_do_not_serve_as_map() -> None:
