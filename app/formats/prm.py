@@ -8,7 +8,8 @@ Pixels need their image to become positions: we write ``picture`` ({resolution, 
 the two lists. Without it the map's YAML and image are looked up in the upload (``metric/map/`` of an
 environment_template, else beside the roadmap, else the only map.yaml), or options give all three. A node is at the
 centre of its pixel, metres in the local frame. On writing, pixels are those of the stored grid ``map``, else of the
-image that the roadmap came with, else of an assumed image that just contains the network.
+image that the roadmap came with, else of an assumed image that just contains the network. Weights of the source are
+scaled to these pixels.
 
 Canonical: a node's id is its ``id`` as a text, an edge's ``<from>-<to>``; see ``_undirected`` for edges of both
 directions. ``properties.prm`` contains ``more`` (further keys) and ``id`` if it is not an integer; the document's
@@ -81,6 +82,12 @@ SHAPE = record(
 
 MAX_ROUNDING_PIXELS = 1e-4
 """Maximum distance from a whole pixel that counts as that pixel; metres are stored to a nanometre."""
+
+SAME_SCALE = 1e-6
+"""Relative difference within which two sizes of pixels are equal: files round them."""
+
+SAME_LENGTH = 0.01
+"""Relative difference from an edge's length within which a weight counts as that length."""
 
 RESOLUTION = 0.05
 """Default size of a pixel of an assumed image, in metres."""
@@ -327,7 +334,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     top = {key: v for key, v in top.items() if key not in OWN_KEYS} if isinstance(top, dict) else {}
     out = [yaml.mapping(top, 0)] if top else []
     out += ["nodes:\n", *_node_texts(net, ids, pixels, context)] if net.nodes else ["nodes: []\n"]
-    line_texts = _line_texts(net, ids, pixels, document, context)
+    source = _source_picture(document)
+    scale = 1.0 if source is None else source.resolution / picture.resolution
+    line_texts = _line_texts(net, ids, pixels, scale, document, context)
     out += ["edges:\n", *line_texts] if line_texts else ["edges: []\n"]
     out.append(yaml.mapping({PICTURE: picture.as_dict()}, 0))
     return {FILE: "".join(out).encode()}
@@ -370,17 +379,27 @@ def _node_texts(net: MergedNetwork, ids: Sequence[Any], pixels: Array, context: 
 
 
 def _line_texts(
-    net: MergedNetwork, ids: Sequence[Any], pixels: Array, document: Mapping[str, Any], context: WriteContext
+    net: MergedNetwork,
+    ids: Sequence[Any],
+    pixels: Array,
+    scale: float,
+    document: Mapping[str, Any],
+    context: WriteContext,
 ) -> list[str]:
-    """Return the texts of the edges, and of the source's dangling edges."""
-    weighed = 0
+    """Return the texts of the edges, and of the source's dangling edges. scale: pixels per pixel of the source."""
+    weighed = other = 0
     out = []
     for line in lines(net, context, NAME):
         members = {key: v for key, v in line.members.items() if key not in ("from", "to")}
-        if not isinstance(members.get("weight"), (int, float)):
-            a, b = pixels[line.a], pixels[line.b]
-            members["weight"] = round(float(np.hypot(*(a - b))), 9)
+        length = round(float(np.hypot(*(pixels[line.a] - pixels[line.b]))), 9)
+        weight = members.get("weight")
+        if not isinstance(weight, (int, float)):
+            members["weight"] = length
             weighed += 1
+        else:
+            if not math.isclose(scale, 1.0, rel_tol=SAME_SCALE):
+                members["weight"] = weight = round(weight * scale, 9)
+            other += abs(weight - length) > max(1.0, SAME_LENGTH * length)
         out.append(_edge(ids[line.a], ids[line.b], members))
     dangling = document.get("dangling")
     dangling = (
@@ -389,6 +408,8 @@ def _line_texts(
         else []
     )
     out += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in dangling]
+    if other:
+        context.warn(f"{other} edges have a weight that is not their length in pixels; it is kept", where="edges")
     if weighed:
         context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format without weights")
     return out
@@ -448,10 +469,9 @@ def _select_picture(layers: Layers, document: Mapping[str, Any], xy: Array, cont
     if keys:
         grid: OccupancyGrid = grids[keys[0]]
         return _Picture(grid.resolution, grid.origin, grid.height)
-    source_picture = document.get("picture")
-    if isinstance(source_picture, dict):
-        with contextlib.suppress(UnreadableFile):  # the document may have been edited
-            return _parse_picture(source_picture)
+    source_picture = _source_picture(document)
+    if source_picture is not None:
+        return source_picture
     low = np.floor(xy.min(axis=0) - MARGIN) if len(xy) else np.zeros(2)
     high = np.ceil(xy.max(axis=0) + MARGIN) if len(xy) else np.ones(2)
     size = context.options.pixel_size if isinstance(context.options, WriteOptions) else RESOLUTION
@@ -460,6 +480,15 @@ def _select_picture(layers: Layers, document: Mapping[str, Any], xy: Array, cont
     item = "picture: resolution, origin, height"
     context.fill(item, picture.as_dict(), "no map's image is known", "pixel_size")
     return picture
+
+
+def _source_picture(document: Mapping[str, Any]) -> _Picture | None:
+    """Return the image that the roadmap came with."""
+    picture = document.get("picture")
+    if isinstance(picture, dict):
+        with contextlib.suppress(UnreadableFile):  # the document may have been edited
+            return _parse_picture(picture)
+    return None
 
 
 def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
@@ -498,7 +527,7 @@ register(
         read_options=ReadOptions,
         write_options=WriteOptions,
         extensions=(".yaml", ".yml"),
-        version=2,
+        version=3,
         selection=Selection(choose),
         claims=Claims(priority=3, related_files=related_files, gives_way=True),
         traits=Traits(outlines=True, keeps_bends="nodes"),

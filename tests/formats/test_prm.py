@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +140,39 @@ picture: {resolution: 0.1, origin: [0, 0, 0], height: 50}
     assert sorted((sorted(e.items()) for e in now["edges"]), key=key) == sorted(
         (sorted(e.items()) for e in once["edges"]), key=key
     )
+
+
+WEIGHED = b"""nodes:
+- {id: 0, x: 10, y: 10}
+- {id: 1, x: 50, y: 10}
+- {id: 2, x: 50, y: 40}
+edges:
+- {from: 0, to: 1, weight: 40.0}
+- {from: 1, to: 2, weight: %d}
+picture: {resolution: 0.05, origin: [0.0, 0.0, 0.0], height: 100}
+"""
+
+
+@pytest.mark.parametrize("weight", [30, 90])
+def test_weights_follow_the_pixels_of_another_map(weight: int) -> None:
+    part, _ = read({"prm.yaml": WEIGHED % weight})
+    fine = OccupancyGrid(np.zeros((500, 500), np.uint8), 0.01, (0.0, 0.0, 0.0))
+    roadmap, context = write(Layers({NETWORK: part, PartKey("occupancy", "ground", "map"): fine}))
+    assert [e["weight"] for e in roadmap["edges"]] == [200.0, 5.0 * weight]
+    assert [w.problem for w in context.warnings] == (
+        [] if weight == 30 else ["1 edges have a weight that is not their length in pixels; it is kept"]
+    )
+
+
+def test_weight_of_moved_node_is_reported() -> None:
+    part, _ = read({"prm.yaml": WEIGHED % 30})
+    roadmap, context = write(Layers({NETWORK: part}))
+    assert context.warnings == []
+    geometry = part.geometry.copy()
+    geometry[0] = shapely.Point(geometry[0].x - 0.5, geometry[0].y)
+    roadmap, context = write(Layers({NETWORK: replace(part, geometry=geometry)}))
+    assert [e["weight"] for e in roadmap["edges"]] == [40.0, 30]
+    assert "1 edges have a weight that is not their length" in context.warnings[0].problem
 
 
 def test_network_of_another_format_gets_pixels_of_stored_map() -> None:
