@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import posixpath
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -96,6 +97,7 @@ MARGIN = 1.0
 """Margin around the network in an assumed image, in metres."""
 
 MAPS = ("map.yaml", "map.yml", "map_autogen.yaml")
+MAP_STEMS = {name.partition(".")[0] for name in MAPS}
 PICTURES = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
 
 
@@ -200,9 +202,7 @@ def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Pi
             continue
         try:
             beside = yaml.load(files[name], context.limits)
-            base = re.split(r"[/\\]", str(beside["image"]))[-1]
-            image = files[f"{name.rpartition('/')[0]}/{base}".lstrip("/")]
-            rows = images.read_size(image, context.limits)[1]
+            rows = images.read_size(_image_of(name, str(beside["image"]), files), context.limits)[1]
             return _parse_picture({**beside, "height": rows})
         except (*BAD_INPUT, FleetMapError):  # the map's own reader reports its errors
             continue
@@ -211,6 +211,13 @@ def _picture(members: Any, files: Files, main: str, context: ReadContext) -> _Pi
         "options resolution, origin and height"
     )
     raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
+
+
+def _image_of(name: str, image: str, files: Files) -> bytes:
+    """Return the image that a map's YAML file names: at its path, else by its name beside the YAML file."""
+    folder = posixpath.dirname(name)
+    beside = posixpath.join(folder, re.split(r"[/\\]", image)[-1])
+    return files.get(posixpath.normpath(posixpath.join(folder, image))) or files[beside]
 
 
 def _parse_picture(members: Any) -> _Picture:
@@ -238,7 +245,10 @@ def _check_origin(origin: Sequence[float], file: str) -> None:
 
 
 def related_files(main: str, names: Sequence[str]) -> Iterable[str]:
-    """Return maps of the upload that the pixels may belong to, likeliest first, and the images beside them."""
+    """Return maps of the upload that the pixels may belong to, likeliest first, and their images.
+
+    Images are those beside them, and in folders below those that are named like a map.
+    """
     folder = main.rpartition("/")[0]
     root = folder.rpartition("/")[0] if folder.rpartition("/")[2] == "topological" else None
     likely = [] if root is None else [f"{root}/metric/map".lstrip("/")]
@@ -250,8 +260,11 @@ def related_files(main: str, names: Sequence[str]) -> Iterable[str]:
         every = [n for n in sorted(name_set) if n.rpartition("/")[2] in MAPS]
         maps = every if len({n.rpartition("/")[0] for n in every}) == 1 else []
     homes = {n.rpartition("/")[0] for n in maps}
-    pictures = [n for n in sorted(name_set) if n.rpartition("/")[0] in homes and n.lower().endswith(PICTURES)]
-    return [*(n for n in maps if n != main), *pictures]
+    pictures = [n for n in sorted(name_set) if n.lower().endswith(PICTURES)]
+    beside = [n for n in pictures if n.rpartition("/")[0] in homes]
+    above = tuple(f"{home}/".lstrip("/") for home in homes)
+    below = [n for n in pictures if n.startswith(above) and posixpath.basename(n).rpartition(".")[0] in MAP_STEMS]
+    return [*(n for n in maps if n != main), *dict.fromkeys([*beside, *below])]
 
 
 def _nodes(entries: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any]]]:

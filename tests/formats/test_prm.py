@@ -245,3 +245,17 @@ def test_invalid_values_are_refused_with_location(text: str, where: str) -> None
     with pytest.raises(BadUpload) as caught:
         formats.read(FileGroup(FORMAT, "prm.yaml", {**MEADOW, "prm.yaml": text.encode()}), ReadContext())
     assert [p.where for p in caught.value.problems] == [where]
+
+
+@pytest.mark.parametrize(("image", "path"), [("img/map.pgm", "img/map.pgm"), ("/home/me/map.pgm", "map.pgm")])
+def test_map_is_found_with_its_image_in_a_folder(image: str, path: str) -> None:
+    roadmap = b"nodes:\n- {id: 0, x: 1, y: 1}\n- {id: 1, x: 2, y: 1}\nedges:\n- {from: 0, to: 1, weight: 1.0}\n"
+    grid = "resolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    files = {"site/prm.yaml": roadmap, "site/map.yaml": f"image: {image}\n{grid}".encode()}
+    picture = b"P5\n4 3\n255\n" + bytes(12)
+    taller = b"P5\n4 9\n255\n" + bytes(36)
+    files |= {f"site/{path}": picture, "site/other/map.pgm": taller}
+    bundle = read_bundle(files, UploadHints(), EnvironmentContext(), Limits())
+    part = bundle.parts[NETWORK]
+    assert isinstance(part, Features)
+    assert nodes(part)["0"] == pytest.approx([0.75, 0.75])
