@@ -516,13 +516,22 @@ def test_items_of_other_formats_get_tags() -> None:
     }
     tags = [v[2] for v in elements(served).values()]
     assert {"name": 'North "field"', "kind": "region", "crop": "wheat", "area": "yes"} in tags
-    assert {"name": "pond", "kind": "region", "type": "multipolygon"} in tags
-    assert {"name": "tree", "kind": "poi", "height": "3.5", "alive": "yes"} in tags
-    assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in tags
-    assert {"name": "up", "kind": "path", "level": "L2"} in tags
-    assert not any(t.get("name") == "drawn" for t in tags), "the network derived from it is written already"
+    assert {"kind": "region", "type": "multipolygon"} in tags, "an id is no name"
+    assert {"kind": "poi", "height": "3.5", "alive": "yes"} in tags
+    assert {"kind": "keepout", "zone": "keepout", "area": "yes"} in tags
+    paths = [t for t in tags if t.get("kind") == "path"]
+    assert paths == [{"kind": "path", "level": "L2"}], "the network derived from the other is written already"
     lost = {d.subject for d in context.dropped}
-    assert {"GNSS fence", "datum", "items without a geometry"} <= lost
+    assert {"GNSS fence", "datum", "items without a geometry", "zones"} <= lost
+    back = [dict(p) for p in part(read(served), OBJECTS).properties]
+    assert sorted(p["kind"] for p in back if "kind" in p["osm"].get("tags", {})) == [
+        "keepout",
+        "path",
+        "poi",
+        "region",
+        "region",
+    ]
+    assert [p["name"] for p in back if "name" in p] == ['North "field"']
     assert any("nested" in item for item in lost)
 
 

@@ -19,18 +19,20 @@ members    (relations) [type, id, role] in order
 children   elements that OSM does not define: [name, attributes], then text and a list of such elements, if any
 ========== ============================================================================================================
 
-An object's kind is its main tag's key (``building``, ``barrier``, ``highway`` …), or ``tree`` and ``water``, else
-``point``, ``line`` or ``relation``; its ``height``, ``base`` and ``width`` also come from tags (the rules are in
-``app.model.osm_tags``). An edge has its way's ``speed_limit`` (of its direction), ``width`` (else the lanes'),
-``surface`` and ``access``, and ``stairs``. Ways are connected only by a common node: a bridge and what is below it are
-not. Elements marked as deleted (``action="delete"``, ``visible="false"``) are stored but not part of the network.
+An object's kind is its main tag's key (``building``, ``barrier``, ``highway`` …), or ``tree`` and ``water``, else the
+tag ``kind``, else ``point``, ``line`` or ``relation``; its ``height``, ``base`` and ``width`` also come from tags (the
+rules are in ``app.model.osm_tags``). An edge has its way's ``speed_limit`` (of its direction), ``width`` (else the
+lanes'), ``surface`` and ``access``, and ``stairs``. Ways are connected only by a common node: a bridge and what is
+below it are not. Elements marked as deleted (``action="delete"``, ``visible="false"``) are stored but not part of the
+network.
 
 Writing. Canonical content takes precedence: a feature's geometry over stored node positions, and its name, height,
 speed limit … over tags with another value; a highway way is written unchanged while all its edges are in the network,
 and is split if edges were removed, became one-way or have other tags (the first piece keeps the id, the others get
 negative ones, and relations are updated). Edges without a stored way become new ways with negative ids. Objects of
-other formats, and zones, are written as ways and nodes with the tags ``name`` and ``kind``. Sorted as OSM tools
-require: nodes, ways, relations, each by id.
+other formats, and zones, are written as ways and nodes with their plain properties as tags, such as ``name`` and
+``kind``; zones also have the tag ``zone`` and are read back as objects. Sorted as OSM tools require: nodes, ways,
+relations, each by id.
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ register(
         check=rules.check,
         write=write,
         needs=LayerRequirements(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
-        version=3,
+        version=4,
         extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
         claims=Claims(priority=20),
         traits=Traits(own_ids=True, own_network=True),

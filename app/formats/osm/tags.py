@@ -105,8 +105,10 @@ KINDS: Mapping[str, Mapping[Any, str]] = {
 
 
 def object_kind(tags: Mapping[str, Any], otherwise: str) -> str:
-    """Return the key of the main tag, or a more specific kind from its value."""
+    """Return the key of the main tag, or a more specific kind from its value; without one, the tag ``kind``."""
     main_key = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
+    if main_key is None and tags.get("kind"):
+        return str(tags["kind"])  # of an object of another format, as it is written
     if main_key is None:
         return str(tags["type"]) if otherwise == "relation" and tags.get("type") else otherwise
     if main_key in KINDS:

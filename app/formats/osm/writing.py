@@ -67,6 +67,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     for key, part in sorted(layers.parts.items()):
         if key.layer not in CARRIES and isinstance(part, Features) and key.layer == "location":
             context.drop("GNSS fence", len(part), "OSM cannot express it; its box is written as the map's bounds")
+    zones = sum(map(len, layers.vector("zones").values()))
+    context.drop("zones", zones, "they become areas with a tag zone, which are read as objects")
     if layers.datum is not None:
         context.drop("datum", 1, "OSM positions are in wgs84, without a local frame")
     return {"map.osm": out.text()}
@@ -111,7 +113,7 @@ class _Writer:
         for part in topology:
             self.network_nodes(part, level)
             drawn.update(i for p in part.properties if isinstance(i := p.get("drawn_from"), str))
-        new_items: list[tuple[str, Any, Properties, bool]] = []
+        new_items: list[tuple[Any, Properties, bool]] = []
         own_items: list[tuple[str, int, Any, Mapping[str, Any], Mapping[str, Any]]] = []
         for layer in ("objects", "zones"):
             for key, part in self.layers.vector("objects" if layer == "objects" else "zones", name).items():
@@ -126,13 +128,13 @@ class _Writer:
                         # The network derived from this drawing is written; this line would duplicate it.
                         continue
                     else:
-                        new_items.append((i, geometry, properties, layer == "zones"))
+                        new_items.append((geometry, properties, layer == "zones"))
         for kind, osm_id, geometry, source_properties, _ in own_items:
             if kind == "n":
                 self.node(level, osm_id, geometry, source_properties)
         for kind, osm_id, geometry, source_properties, properties in own_items:
             if kind == "w" and not self.write_way(level, osm_id, geometry, source_properties):
-                new_items.append((f"w{osm_id}", geometry, properties, False))
+                new_items.append((geometry, properties, False))
         for kind, osm_id, _, _, _ in own_items:
             if kind == "r":
                 level.relations[osm_id] = self.next_id("relation") if osm_id in self.relations else osm_id
@@ -142,8 +144,8 @@ class _Writer:
                 self.relation(level, osm_id, source_properties)
         for part in topology:
             self.add_ways(part, level)
-        for i, geometry, properties, zone in new_items:
-            self.other(level, i, geometry, properties, zone)
+        for geometry, properties, zone in new_items:
+            self.other(level, geometry, properties, zone)
 
     def network_nodes(self, part: Features, level: _Level) -> None:
         level.has_network = True
@@ -175,7 +177,10 @@ class _Writer:
             else:
                 # A street node that was converted by another format has its id as name, which is not a real name.
                 nameless = is_own and properties.get("name", i) == i
-                tags, attributes = NO_ATTRIBUTES if nameless else self.tags(i, properties, ("name",)), NO_ATTRIBUTES
+                tags, attributes = (
+                    NO_ATTRIBUTES if nameless else {"name": i, **self.tags(properties, ("name",))},
+                    NO_ATTRIBUTES,
+                )
             if geometry.has_z and geometry.geom_type == "Point" and not geometry.is_empty and "ele" not in tags:
                 tags = {**tags, "ele": repr(float(geometry.z))}
             self.nodes[new] = Node(x, y, tags, attributes)
@@ -463,9 +468,9 @@ class _Writer:
 
     # --- items of other formats ---
 
-    def tags(self, i: str, p: Properties, keys: Iterable[str] = (), level: str = GROUND) -> dict[str, str]:
-        """Build tags for an item of another format: its name, and the plain values of these properties (or of all)."""
-        tags = {"name": str(p.get("name") or i)}
+    def tags(self, p: Properties, keys: Iterable[str] = (), level: str = GROUND) -> dict[str, str]:
+        """Build tags for an item of another format: the plain values of these properties (or of all)."""
+        tags: dict[str, str] = {}
         names = list(keys) or [k for k in p if k not in ("drawn_from",)]
         for k in names:
             value = p.get(k)
@@ -479,8 +484,8 @@ class _Writer:
             tags.setdefault("level", level)
         return {k: v for k, v in tags.items() if k and v}
 
-    def other(self, level: _Level, i: str, geometry: Any, properties: Properties, zone: bool) -> None:
-        tags = self.tags(i, properties, level=level.name)
+    def other(self, level: _Level, geometry: Any, properties: Properties, zone: bool) -> None:
+        tags = self.tags(properties, level=level.name)
         source_properties = properties.get("osm")
         if isinstance(source_properties, Mapping):
             tags = {**as_texts(source_properties.get("tags")), **tags}
