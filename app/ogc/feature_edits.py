@@ -206,6 +206,8 @@ class FeatureEditor:
         if sent is None:
             return None
         problems = [Problem("invalid", where="geometry")]
+        if not _has_only_numbers(sent):
+            raise Invalid("invalid GeoJSON geometry: coordinates must be numbers", problems)
         try:
             shape = shapely.geometry.shape(sent)
         except Exception as error:
@@ -214,6 +216,10 @@ class FeatureEditor:
             raise Invalid("the geometry has a coordinate that is not finite: give numbers", problems)
         if self._crs.kind != "local":
             degrees = self._crs.to_wgs84(np.array([shape], object), self._datum)
+            beyond = np.abs(shapely.get_coordinates(degrees)) > (180.0, 90.0)
+            if self._crs.is_geographic and beyond.any():
+                detail = f"the geometry is beyond ±180° of longitude or ±90° of latitude: {self._crs.uri} has "
+                raise Invalid(detail + ("latitude" if self._crs.swap else "longitude") + " first", problems)
             shape = join_at_antimeridian(degrees[0])  # it was sent in two pieces
         parts = shapely.get_parts(shape)
         if self._layer == "topology" and shape.geom_type.startswith("Multi") and len(parts) == 1:
@@ -323,6 +329,20 @@ def _merge_patch(old: Mapping[str, Any], patch: Mapping[str, Any]) -> dict[str, 
         else:
             out[name] = value
     return out
+
+
+def _has_only_numbers(geometry: Any) -> bool:
+    """Return whether all coordinates of a GeoJSON geometry are numbers: shapely reads text, too."""
+    front = [geometry]
+    while front:
+        one = front.pop()
+        if isinstance(one, Mapping):
+            front += [one[name] for name in ("coordinates", "geometries") if name in one]
+        elif isinstance(one, list):
+            front += one
+        elif isinstance(one, bool) or not isinstance(one, int | float):
+            return False
+    return True
 
 
 def _apart(a: Any, b: Any) -> float:

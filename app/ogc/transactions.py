@@ -82,6 +82,13 @@ async def _body(request: Request) -> Mapping[str, Any]:
     return body
 
 
+async def _feature_body(request: Request) -> Mapping[str, Any]:
+    body = await _body(request)
+    if body.get("type") != "Feature":
+        raise Invalid("the body must be one GeoJSON Feature", [Problem("must be 'Feature'", where="type")])
+    return body
+
+
 async def _write(
     service: Service,
     principal: Principal,
@@ -220,7 +227,7 @@ async def create_item(
     The ends of an edge are put onto the nodes within 0.5 m; `source` and `target` are set by them. An edge that ends at
     no node is refused.
     """
-    body = await _body(request)
+    body = await _feature_body(request)
     created: list[str] = []
 
     def edit(editor: FeatureEditor) -> Mapping[str, Any]:
@@ -252,7 +259,7 @@ async def replace_item(
     if_match: IfItemMatch = None,
 ) -> Response:
     """Replace geometry and properties. Edges move with their nodes; ends of edges are put onto nodes."""
-    body = await _body(request)
+    body = await _feature_body(request)
 
     def edit(editor: FeatureEditor) -> Mapping[str, Any]:
         return editor.change(feature, body, replaces=True)

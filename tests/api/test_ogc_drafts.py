@@ -13,6 +13,7 @@ from tests.api.conftest import Api
 Json = dict[str, Any]
 
 CRS84 = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+EPSG4326 = "http://www.opengis.net/def/crs/EPSG/0/4326"
 MERCATOR = "http://www.opengis.net/def/crs/EPSG/0/3857"
 UTM = "http://www.opengis.net/def/crs/EPSG/0/32630"
 MERGE = {"content-type": "application/merge-patch+json"}
@@ -267,6 +268,26 @@ def test_what_was_read_can_be_put_back(gis: Gis, *, is_listed_before: bool) -> N
 def test_types_are_those_of_the_schema(gis: Gis) -> None:
     wrong = gis.patch("nodes", "barn", 400, properties={"name": 5}).json()
     assert "must be string, as the schema of nodes says" in wrong["detail"]
+
+
+@pytest.mark.parametrize(
+    ("crs", "body", "words"),
+    [
+        (CRS84, {"type": "Feature", "geometry": point(365, 53.2686)}, "longitude first"),
+        (CRS84, {"type": "Feature", "geometry": point(-0.5245, 95)}, "±90°"),
+        (EPSG4326, {"type": "Feature", "geometry": point(-120.5, 53.2686)}, "latitude first"),
+        (CRS84, {"type": "Feature", "geometry": {"type": "Point", "coordinates": ["-0.5", "53.2"]}}, "numbers"),
+        (CRS84, {"type": "Feature", "geometry": {"type": "Point", "coordinates": [True, 53.2]}}, "numbers"),
+        (CRS84, {"type": "FeatureCollection", "features": []}, "one GeoJSON Feature"),
+        (CRS84, {"geometry": point(-0.5245, 53.2686)}, "one GeoJSON Feature"),
+    ],
+)
+def test_what_no_upload_may_have_is_refused(gis: Gis, crs: str, body: Json, words: str) -> None:
+    at = f"{gis.at}/collections/nodes/items"
+    headers = {**GEOJSON, "content-crs": f"<{crs}>"}
+    for method, path in (("POST", at), ("PUT", f"{at}/barn")):
+        assert words in gis.api(method, path, 400, json=body, headers=headers).json()["detail"]
+    assert all(not draft["changes"] for draft in gis.drafts())
 
 
 def test_fractions_are_numbers_where_all_were_whole(gis: Gis) -> None:
