@@ -110,13 +110,16 @@ class FeatureEditor:
         if self._layer == "topology":
             merged["kind"] = stored.properties.get("kind", "node")
         is_moved = replaces or "geometry" in sent
-        geometry = self._geometry(sent.get("geometry")) if is_moved else self._local(stored.geometry, stored.local)
+        is_tied = self._collection == "edges" and any(
+            merged.get(end) != stored.properties.get(end) for end in ("source", "target")
+        )
+        if not is_moved and not is_tied:
+            return self._put(stored.item, stored.geometry, merged, _place_of(stored.key), local=stored.local)
+        before = self._local(stored.geometry, stored.local)
+        geometry = self._geometry(sent.get("geometry")) if is_moved else before
         if self._collection == "edges":
             _, geometry = self._tie(geometry, merged, stored, {})
-        elif not is_moved:
-            return self._put(stored.item, stored.geometry, merged, _place_of(stored.key), local=stored.local)
         elif geometry is not None:
-            before = self._local(stored.geometry, stored.local)
             merged |= moved_pose(before, geometry, stored.properties, merged)
         return self._put(stored.item, geometry, merged, _place_of(stored.key))
 
@@ -245,24 +248,28 @@ class FeatureEditor:
     ) -> tuple[PartKey, Any]:
         """Put the ends of an edge onto nodes, and set ``source`` and ``target``; returns its part and its geometry.
 
-        An end that was moved goes to the node within SNAP metres of it, an unmoved one stays at its node. Raises
+        An end that was moved goes to the node within SNAP metres of it, an unmoved one stays as it is. Raises
         Invalid if there is none.
         """
         if line is None or line.geom_type != "LineString" or line.is_empty:
             problem = Problem("must be a LineString", where="geometry")
             raise Invalid("an edge needs a LineString from node to node", [problem])
-        before = None if stored is None else self._local(stored.geometry, stored.local)
+        old = None
+        if stored is not None and not stored.geometry.is_empty:
+            old = shapely.get_coordinates(self._local(stored.geometry, stored.local))
         vertices = shapely.get_coordinates(line, include_z=line.has_z)
         keys = [stored.key] if stored is not None else self._networks(place)
         for end, k in (("source", 0), ("target", -1)):
-            is_moved = (
-                before is None or before.is_empty or _apart(shapely.get_coordinates(before)[k], vertices[k]) > SAME
-            )
+            is_moved = old is None or _apart(old[k], vertices[k]) > SAME
             wanted = properties.get(end)
             is_renamed = wanted is not None and (stored is None or wanted != stored.properties.get(end))
-            if is_renamed or not is_moved:
+            if stored is not None and old is not None and not is_moved and not is_renamed:
+                properties[end] = stored.properties.get(end)
+                vertices[k, :2] = old[k]
+                continue
+            if is_renamed:
                 key, node = self._node(keys, str(wanted), end)
-                if is_renamed and is_moved and _apart(node, vertices[k]) > SNAP:
+                if is_moved and _apart(node, vertices[k]) > SNAP:
                     raise self._end_error(end, f"is {_apart(node, vertices[k]):.2f} m from its node {wanted!r}")
             else:
                 key, name, node = self._nearest(keys, vertices[k], end)
