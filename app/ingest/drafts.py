@@ -73,6 +73,11 @@ class DraftEditor:
 
         return self._on_current(environment, id, writer, if_match, once)
 
+    def check(self, version: Version, changes: Sequence[Mapping[str, Any]]) -> None:
+        """Check edits that are the first ones on top of a version. Raises Invalid, NotFound."""
+        check_depth(changes)
+        edit_changes(self._store, version, changes)
+
     def rebase(
         self, environment: str, id: str, writer: Writer, if_match: str | None = None, prefer: Side | None = None
     ) -> RebaseResult:

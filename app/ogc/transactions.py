@@ -110,16 +110,21 @@ async def _write(
     if collection not in TITLES or service.version.datum is None:
         raise unknown_collection_error(service, collection, list(await tables(service)))
     services, env = service.services, service.environment.name
+    systems = reference_systems(service, service.version.datum)
+    crs = parse_crs((content_crs or CRS84).strip().removeprefix("<").removesuffix(">"), systems, "Content-Crs")
+    content = services.store.content
+    if service.version.pending is None:  # what is refused must not leave an empty draft
+        types = await property_types(service, service.version, collection)
+        change = await run_in_threadpool(edit, FeatureEditor(content, service.version, collection, types, crs))
+        await run_in_threadpool(services.ingest.drafts.check, service.version, [change])
     draft = await run_in_threadpool(own_draft, services, env, service.draft or "", principal)
     base = await run_in_threadpool(services.store.versions.get, env, draft.base)
     types = await property_types(service, base, collection)
-    systems = reference_systems(service, service.version.datum)
-    crs = parse_crs((content_crs or CRS84).strip().removeprefix("<").removesuffix(">"), systems, "Content-Crs")
 
     def once() -> None:
         version = services.store.versions.get(env, DRAFT_PREFIX + draft.id)
         assert version.pending is not None
-        editor = FeatureEditor(services.store.content, version, collection, types, crs)
+        editor = FeatureEditor(content, version, collection, types, crs)
         tag = if_match or f'"{version.pending.tag}"'
         services.ingest.drafts.edit(env, draft.id, [edit(editor)], principal.as_writer(), tag)
 

@@ -169,7 +169,7 @@ def test_methods_are_told_as_programs_ask_for_them(api: Api, gis: Gis) -> None:
 )
 def test_edge_that_would_leave_its_nodes_is_refused(gis: Gis, change: Json, words: str) -> None:
     assert words in gis.patch("edges", "gate_barn", 400, **change).json()["detail"]
-    assert all(not draft["changes"] for draft in gis.drafts())
+    assert gis.drafts() == [], "what is refused leaves no draft"
 
 
 def test_moved_end_takes_the_node_at_that_place(gis: Gis) -> None:
@@ -207,6 +207,9 @@ def test_edge_away_from_its_nodes_stays_there_unless_it_is_moved(gis: Gis) -> No
 def test_deleted_node_with_edges_is_refused(api: Api, gis: Gis) -> None:
     refused = api("DELETE", f"{gis.at}/collections/nodes/items/barn", 400).json()
     assert "delete the edge" in refused["detail"]
+    gis.patch("nodes", "barn", 400, headers={"content-crs": "<urn:x>"}, properties={"a": 1})
+    gis.patch("nodes", "nowhere", 404, properties={"a": 1})
+    assert gis.drafts() == []
 
 
 def test_coordinates_in_other_systems(api: Api, gis: Gis) -> None:
@@ -287,7 +290,7 @@ def test_what_no_upload_may_have_is_refused(gis: Gis, crs: str, body: Json, word
     headers = {**GEOJSON, "content-crs": f"<{crs}>"}
     for method, path in (("POST", at), ("PUT", f"{at}/barn")):
         assert words in gis.api(method, path, 400, json=body, headers=headers).json()["detail"]
-    assert all(not draft["changes"] for draft in gis.drafts())
+    assert gis.drafts() == [], "what is refused leaves no draft"
 
 
 def test_fractions_are_numbers_where_all_were_whole(gis: Gis) -> None:
