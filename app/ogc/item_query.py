@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from app.api.http.parameters import parse_number, parse_numbers
 from app.errors import Invalid, Problem
 from app.model.names import did_you_mean
 from app.ogc.crs import CRS84, ReferenceSystem, parse_crs
@@ -23,8 +23,6 @@ from app.store.values import Box
 MAX_FILTERS = 20
 FILTERS_OF_PART_3 = frozenset({"filter", "filter-lang", "filter-crs"})
 _TIME = re.compile(r"\d{4}-\d{2}-\d{2}(?:[Tt]\d{2}:\d{2}:\d{2}(?:\.\d{1,9})?(?:[Zz]|[+-]\d{2}:\d{2}))?", re.ASCII)
-
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 Rows = NDArray[np.intp]
 
@@ -99,16 +97,6 @@ def parse_limit(text: str) -> int:
     return MAX_LIMIT if len(digits) > len(str(MAX_LIMIT)) else min(int(digits), MAX_LIMIT)
 
 
-def parse_numbers(text: str) -> list[float]:
-    """Parse finite numbers separated by commas; none if one is something else (Python reads `1_0`, too)."""
-    parts = [part.strip(" ") for part in text.split(",")] if len(text) <= 1000 else []
-    return [float(part) for part in parts] if all(map(_is_finite, parts)) else []
-
-
-def _is_finite(text: str) -> bool:
-    return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
-
-
 def parse_bbox(text: str, crs: ReferenceSystem) -> tuple[Box, tuple[float, float] | None]:
     """Parse a box of 4 numbers, or 6 with heights, in the axis order of its CRS. Raises Invalid."""
     numbers = parse_numbers(text)
@@ -166,11 +154,8 @@ def _readings(text: str, types: frozenset[str]) -> list[object]:
     if "boolean" in types and text in ("true", "false"):
         out.append(text == "true")
     if types & {"number", "integer"}:
-        try:
-            number = float(text)
-        except ValueError:
-            return out
-        out += [number] if math.isfinite(number) else []
+        number = parse_number(text)
+        out += [] if number is None else [number]
     return out
 
 

@@ -14,6 +14,7 @@ from PIL import ImageColor
 from starlette.responses import Response
 
 from app.api.http.caching import none_match
+from app.api.http.parameters import parse_numbers
 from app.convert.drawing import Colour
 from app.convert.views import MAX_SIDE, View, view_key
 from app.errors import Invalid, NotFound, Problem
@@ -24,7 +25,6 @@ from app.ogc.crs import EPSG, MERCATOR, ReferenceSystem, parse_crs, reference_sy
 from app.ogc.description import operation
 from app.ogc.extensions import Collection, Extension, all_collections
 from app.ogc.extent import site_box
-from app.ogc.item_query import parse_numbers
 from app.ogc.negotiation import Representation
 from app.ogc.rasters import check_collection, content_of
 from app.ogc.routing import both, ogc_router

@@ -304,7 +304,7 @@ REFUSED = [
     ("limit", ""), ("limit", "٣"), ("datetime", "yesterday"), ("datetime", "2018-02-30T00:00:00Z"), ("datetime", ".."),
     ("datetime", "../.."), ("datetime", "2019-01-01T00:00:00Z/2018-01-01T00:00:00Z"), ("datetime", "2018-01-01/a/b"),
     ("cursor", "!"), ("cursor", "WzFd"), ("filter", "name='x'"), ("filter-lang", "cql2-text"), ("nam", "x"),
-    ("f", "xml"), ("rank", "many"), ("orientation", "1"),
+    ("f", "xml"), ("rank", "many"), ("rank", "1_0"), ("rank", "nan"), ("orientation", "1"),
 ]  # fmt: skip
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from urllib.parse import parse_qsl
 
 from app import formats
@@ -10,14 +12,25 @@ from app.formats import Format
 from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import Box
 
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+def parse_number(text: str) -> float | None:
+    """Parse a finite number; None if it is something else (Python reads `1_0`, too)."""
+    number = float(text) if _NUMBER.fullmatch(text) else math.inf
+    return number if math.isfinite(number) else None
+
+
+def parse_numbers(text: str) -> list[float]:
+    """Parse finite numbers separated by commas; none if one is something else."""
+    values = [parse_number(part.strip(" ")) for part in text.split(",")] if len(text) <= 1000 else []
+    return [value for value in values if value is not None] if None not in values else []
+
 
 def numbers(text: str, parameter: str, names: str) -> tuple[float, ...]:
     """Parse comma-separated numbers. Raises Invalid unless there is one per name in ``names`` (``LAT,LON``)."""
     count = names.count(",") + 1
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
+    values = tuple(parse_numbers(text))
     if len(values) != count or not all(abs(v) <= 1e9 for v in values):
         raise Invalid(
             f"{parameter} must be {names}: {count} comma-separated numbers", [Problem(names, where=parameter)]
