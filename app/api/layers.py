@@ -132,7 +132,13 @@ def get_layer(
     name: Annotated[
         str | None, Query(max_length=256, description="Name of the part, for example of a grid or a network.")
     ] = None,
-    bbox: Annotated[str | None, Query(description="Only content that intersects this box, given in `crs`.")] = None,
+    bbox: Annotated[
+        str | None,
+        Query(
+            description="Only content in this box, given in `crs`: features whose bounding box intersects it, the cells "
+            "of a grid, or columns of a voxel map."
+        ),
+    ] = None,
     crs: Crs = None,
     q: Annotated[
         str | None,
@@ -164,7 +170,7 @@ def get_layer(
 
     `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`. `voxels` are JSON (`counts` in voxels
     of the finest resolution, whether or not leaves are merged), or an OctoMap `.bt` with `Accept:
-    application/octet-stream`.
+    application/octet-stream`. Grids and voxel maps are in local metres; `crs` is that of `bbox` only.
     """
     version = services.store.versions.get(env, parse_version_ref(v))
     accept = request.headers.get("accept", "*/*")
@@ -398,7 +404,7 @@ def _box(text: str | None, crs: Anchor) -> Box | None:
 def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | None:
     """Convert a box to the local frame; a WGS 84 box becomes the bounding box of its edges.
 
-    Grids default to the local frame.
+    Without a CRS, the box is in degrees if there is a datum.
     """
     if text is None or crs != "wgs84":
         anchor: Anchor = "wgs84" if crs is None and version.datum else "local"
