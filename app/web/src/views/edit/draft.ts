@@ -260,11 +260,11 @@ export class Draft {
   }
 }
 
-function endsOf(edge: Feature): string[] {
+export function endsOf(edge: Feature): string[] {
   return [String(edge.properties.source), String(edge.properties.target)];
 }
 
-function add(map: Map<string, Set<string>>, id: string, key: string): void {
+export function add(map: Map<string, Set<string>>, id: string, key: string): void {
   const keys = map.get(id);
   if (keys) keys.add(key);
   else map.set(id, new Set([key]));

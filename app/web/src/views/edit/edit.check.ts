@@ -133,7 +133,43 @@ function checkFields(): void {
   require(same(met(null, named).conflicts[0]?.fields, []), "deleting what they changed is a conflict");
 }
 
+/** A network that was moved as a whole is merged in a time that grows with its size, not with its square. */
+function checkLargeMerge(): void {
+  const size = 70;
+  const start = new Draft([]);
+  const drawing = new Transaction(start);
+  const nodes = Array.from({ length: size * size }, (_, index) =>
+    drawing.put({
+      ...WHERE,
+      id: `n${index}`,
+      layer: "topology",
+      geometry: { type: "Point", coordinates: [index % size, Math.floor(index / size)] },
+      properties: { kind: "node" },
+    }),
+  );
+  nodes.forEach((node, index) => {
+    const next = [index % size < size - 1 ? nodes[index + 1] : undefined, nodes[index + size]];
+    for (const other of next) {
+      if (!other) continue;
+      drawing.addEdge(node, other);
+      drawing.addEdge(other, node);
+    }
+  });
+  start.execute(drawing.command("start"));
+  const base = start.features();
+  const draft = new Draft(base);
+  const outcome = operations.move(draft, base.filter(isNode), 0.5, 0);
+  if (typeof outcome === "object") draft.execute(outcome);
+  const theirs = base.map((one) =>
+    one.id === "n0" ? { ...one, properties: { ...one.properties, name: "Gate" } } : one,
+  );
+  const merge = compare(draft.changes(), new Map(theirs.map((one) => [keyOf(one), one])));
+  const { command } = merged(theirs, merge, new Map(), (key) => draft.before(key), "merge");
+  require(command?.edits.length === base.length, "all is moved");
+}
+
 checkFields();
+checkLargeMerge();
 
 for (let run = 0; run < RUNS; run++) {
   seed = run + 7;

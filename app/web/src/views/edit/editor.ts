@@ -5,7 +5,7 @@ import type { Feature, LayerName } from "../../map/features";
 import type { SiteMap } from "../../map/site-map";
 import type { Site } from "../../site";
 import { notify } from "../../ui/toast";
-import { type Change, type Command, core, Draft, isEdge, isNode, keyOf, same } from "./draft";
+import { type Change, type Command, core, Draft, isEdge, keyOf, same } from "./draft";
 import { Head } from "./head";
 import type { Outcome } from "./operations";
 import { keepOptions, loadOptions, type Options, type ToolName, TOOLS } from "./options";
@@ -240,10 +240,7 @@ export class Editor {
       // A lane that comes back needs its nodes; lanes of a node that goes back follow it.
       if (isEdge(to)) for (const end of ["source", "target"] as const) this.bringBack(edits, to, end);
     }
-    for (const { to } of edits.edits()) {
-      if (isNode(to)) for (const edge of edits.edgesOf(to)) edits.put(edits.tied(edge));
-      else if (isEdge(to)) edits.put(edits.tied(to));
-    }
+    edits.tie();
     this.run(edits.command("Take back"));
   }
 

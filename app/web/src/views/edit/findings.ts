@@ -9,7 +9,7 @@ import {
   type WireFeature,
 } from "../../map/features";
 import type { Frame } from "../../map/frame";
-import { type Command, type Draft, isEdge, isNode, keyOf, toWire } from "./draft";
+import { type Command, type Draft, keyOf, toWire } from "./draft";
 import type { Editor } from "./editor";
 import { mapPositions } from "./geometry";
 import { Transaction } from "./transaction";
@@ -93,21 +93,13 @@ export function fixCommand(draft: Draft, finding: Finding, frame: Frame | null):
     if (!geometry) return "This repair is not possible without a location";
     edits.put({ ...feature, geometry });
   }
-  tie(edits);
+  edits.tie();
   return edits.command(finding.fix?.title ?? "Repair");
 }
 
 function toLocal(geometry: Geometry, frame: Frame | null): Geometry | null {
   if (!frame) return null;
   return mapPositions(geometry, (at) => [...frame.toLocal(at as Position), ...at.slice(2)]);
-}
-
-/** Lanes follow the nodes that a repair moves. */
-function tie(edits: Transaction): void {
-  for (const { to } of edits.edits()) {
-    if (isNode(to)) for (const edge of edits.edgesOf(to)) edits.put(edits.tied(edge));
-    else if (isEdge(to)) edits.put(edits.tied(to));
-  }
 }
 
 export function featuresOf(draft: Draft, finding: Finding): Feature[] {

@@ -183,10 +183,7 @@ export function merged(
   }
   restoreNodes(edits, before, notes);
   keepNodes(edits, notes);
-  for (const { to } of edits.edits()) {
-    if (isNode(to)) for (const edge of edits.edgesOf(to)) edits.put(edits.tied(edge));
-    else if (isEdge(to)) edits.put(edits.tied(to));
-  }
+  edits.tie();
   const command = edits.command(title);
   const changes = command.edits.filter(({ from, to }) => !same(from, to));
   return { command: changes.length ? { ...command, edits: changes } : null, notes };

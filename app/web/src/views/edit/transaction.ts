@@ -1,10 +1,12 @@
 /** Edits that belong together, before they become one command. Edges stay tied to their nodes. */
 import { type Feature, type Geometry, pointsOf, type Position } from "../../map/features";
-import { type Command, type Draft, type Edit, isEdge, isNode, keyOf } from "./draft";
+import { add, type Command, type Draft, type Edit, endsOf, isEdge, isNode, keyOf } from "./draft";
 import { movedTo, translate } from "./geometry";
 
 export class Transaction {
   private readonly staged = new Map<string, Feature | null>();
+  /** Keys of the edges that were put, by the ids of their ends. */
+  private readonly edges = new Map<string, Set<string>>();
   private readonly newIds = new Set<string>();
 
   constructor(readonly draft: Draft) {}
@@ -14,7 +16,9 @@ export class Transaction {
   }
 
   put(feature: Feature): Feature {
-    this.staged.set(keyOf(feature), feature);
+    const key = keyOf(feature);
+    this.staged.set(key, feature);
+    if (isEdge(feature)) for (const end of endsOf(feature)) add(this.edges, end, key);
     return feature;
   }
 
@@ -81,8 +85,7 @@ export class Transaction {
   }
 
   edgesOf(node: Feature): Feature[] {
-    const keys = new Set(this.draft.edgeKeys(node.id));
-    for (const [key, feature] of this.staged) if (isEdge(feature)) keys.add(key);
+    const keys = new Set([...this.draft.edgeKeys(node.id), ...(this.edges.get(node.id) ?? [])]);
     const out: Feature[] = [];
     for (const key of keys) {
       const edge = this.get(key);
@@ -142,6 +145,14 @@ export class Transaction {
       return node ? movedTo(at, placeOf(node)[0] ?? 0, placeOf(node)[1] ?? 0) : at;
     });
     return { ...edge, geometry: { type: "LineString", coordinates } };
+  }
+
+  /** Ties the edges to the nodes that were put, and those that were put to their nodes. */
+  tie(): void {
+    for (const { to } of this.edits()) {
+      if (isNode(to)) for (const edge of this.edgesOf(to)) this.put(this.tied(edge));
+      else if (isEdge(to)) this.put(this.tied(to));
+    }
   }
 
   edits(): Edit[] {
