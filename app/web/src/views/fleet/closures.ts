@@ -146,13 +146,15 @@ export async function decide(store: FleetStore, closure: Closure, decision: Deci
 /** Changes when a closure ends, in all its directions. Throws ApiError. */
 export async function moveEnd(store: FleetStore, closure: Closure, expires: string): Promise<void> {
   const out: Overlay[] = [];
-  for (const { id } of closure.overlays) {
-    const params = { path: { env: store.site.name, id } };
-    out.push(await ask(api.PATCH("/api/v1/environments/{env}/overlays/{id}", { params, body: { expires } })));
-  }
+  for (const { id } of closure.overlays) out.push(await patchEnd(store, id, expires));
   batch(() => {
     for (const overlay of out) store.putOverlay(overlay);
   });
+}
+
+function patchEnd(store: FleetStore, id: string, expires: string): Promise<Overlay> {
+  const params = { path: { env: store.site.name, id } };
+  return ask(api.PATCH("/api/v1/environments/{env}/overlays/{id}", { params, body: { expires } }));
 }
 
 export interface NewClosure {
@@ -161,7 +163,7 @@ export interface NewClosure {
   level?: string;
   detail: string;
   expires: string;
-  /** Kept by the caller over a failure, so that a repetition reports only what is missing. */
+  /** Kept by the caller over a failure, so that a repetition reports only what is missing, and gives all the same end. */
   done: Map<string, Overlay>;
 }
 
@@ -173,12 +175,14 @@ export async function close(store: FleetStore, wanted: NewClosure): Promise<Over
     ? [["area", { ...common, polygon: wanted.polygon, crs: "local", level: wanted.level }]]
     : (wanted.edges ?? []).map((edge) => [edge, { ...common, edge }]);
   for (const [key, body] of bodies) {
-    if (done.has(key)) continue;
-    const overlay = await requestJson<Overlay>(apiPath(store.site.path("overlays")), {
-      method: "POST",
-      headers: { "content-type": "application/json" },
-      body: JSON.stringify(body),
-    });
+    const reported = done.get(key);
+    const overlay = reported
+      ? await patchEnd(store, reported.id, expires)
+      : await requestJson<Overlay>(apiPath(store.site.path("overlays")), {
+          method: "POST",
+          headers: { "content-type": "application/json" },
+          body: JSON.stringify(body),
+        });
     done.set(key, overlay);
     store.putOverlay(overlay);
   }
