@@ -1,6 +1,7 @@
 /** What robots' reports mean: standing, lag in plain words, how far a channel has converged. No DOM. */
 import type { Channel } from "../../api/client";
 import { ago, count } from "../../ui/text";
+import { percent } from "../history/when";
 import type { Robot } from "./types";
 
 /** Every robot has one standing: what an operator wants to tell apart at a glance. */
@@ -192,17 +193,14 @@ export function plannedText(channel: Channel, found: Convergence): string | null
   if (rollout?.state === "waiting") {
     const parts = [`Roll-out of v${rollout.version}:`];
     if (rollout.ready !== null)
-      parts.push(
-        `${found.ready} of ${found.total} have it, it starts at ${Math.ceil(rollout.ready * 100)} % of those online`,
-      );
+      parts.push(`${found.ready} of ${found.total} have it, it starts at ${percent(rollout.ready)} of those online`);
     if (rollout.activate_at) parts.push(`not before ${clock(rollout.activate_at)}`);
     if (rollout.deadline) parts.push(`given up at ${clock(rollout.deadline)}`);
     return parts.join(" ");
   }
   if (rollout?.state === "watching") {
     const end = rollout.moved ? new Date(Date.parse(rollout.moved) + rollout.window * 1000).toISOString() : null;
-    const back =
-      rollout.failed !== null ? `: goes back to v${rollout.before} if ${Math.ceil(rollout.failed * 100)} % fail` : "";
+    const back = rollout.failed !== null ? `: goes back to v${rollout.before} if ${percent(rollout.failed)} fail` : "";
     return `Watching v${rollout.version}${end ? ` until ${clock(end)}` : ""}${back}`;
   }
   if (!planned) return null;
