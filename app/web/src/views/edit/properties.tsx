@@ -36,12 +36,12 @@ export function Properties({ editor, features }: { editor: Editor; features: Fea
 function Property({ name, values, set }: { name: string; values: unknown[]; set: (value: unknown) => void }) {
   const first = values[0];
   const isMixed = values.some((value) => !same(value, first));
-  const shown = isMixed || first === undefined ? "" : toText(first);
+  const shown = isMixed || first === undefined ? "" : toText(name, first);
   const [text, setText] = useState(shown);
   useEffect(() => setText(shown), [shown]);
   const commit = () => {
     if (text === shown) return;
-    set(text.trim() === "" ? undefined : fromText(text));
+    set(text.trim() === "" ? undefined : fromText(name, text));
   };
   const isLong = shown.length > 40;
   const fields = {
@@ -79,7 +79,7 @@ function NewProperty({ set }: { set: (name: string, value: unknown) => void }) {
   const submit = (event: Event) => {
     event.preventDefault();
     if (!name.trim() || !text.trim()) return;
-    set(name.trim(), fromText(text));
+    set(name.trim(), fromText(name.trim(), text));
     setName("");
     setText("");
   };
@@ -112,12 +112,13 @@ function NewProperty({ set }: { set: (name: string, value: unknown) => void }) {
   );
 }
 
-function toText(value: unknown): string {
-  return typeof value === "string" && fromText(value) === value ? value : JSON.stringify(value);
+export function toText(name: string, value: unknown): string {
+  return typeof value === "string" && fromText(name, value) === value ? value : JSON.stringify(value);
 }
 
-/** Reads JSON; anything else is a text. */
-function fromText(text: string): unknown {
+/** Reads JSON; anything else is a text, and so is what people call something. */
+export function fromText(name: string, text: string): unknown {
+  if (name === "name") return text.trim();
   try {
     return JSON.parse(text) as unknown;
   } catch {
