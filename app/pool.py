@@ -74,15 +74,15 @@ class _AnswerReader(pickle.Unpickler):
         if name in _VALUE_TYPES.get(module, ()):
             return super().find_class(module, name)
         if module.startswith("app.") and not module.endswith("__main__"):
-            found = super().find_class(module, name)
-            if isinstance(found, type) and found.__module__ == module and _is_of_values(found):
-                return found
+            kind = super().find_class(module, name)
+            if isinstance(kind, type) and kind.__module__ == module and _is_of_values(kind):
+                return kind
         log.error("pool: a worker sent %s.%s, which is no type of values; its answer is refused", module, name)
         raise pickle.UnpicklingError(f"a worker sent {module}.{name}, which is no type of values")
 
 
-def _is_of_values(found: type) -> bool:
-    return dataclasses.is_dataclass(found) or issubclass(found, FleetMapError | tuple | str | Enum)
+def _is_of_values(kind: type) -> bool:
+    return dataclasses.is_dataclass(kind) or issubclass(kind, FleetMapError | tuple | str | Enum)
 
 
 class WorkerDied(FleetMapError):
