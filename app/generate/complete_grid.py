@@ -17,7 +17,7 @@ from app.derive import DerivationNotes
 from app.errors import CannotGenerate
 from app.generate import MAX_CELLS, RandomSource, _evidence, _wfc, generates
 from app.generate._site import invalid_option_error
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey
+from app.model.grid import FREE, OCCUPIED, SLICE, UNKNOWN, OccupancyGrid, unknown_grey
 from app.model.layers import Layers, Part, PartKey
 from app.model.selection import grey_warning, grid_label, select_grids
 from app.parameters import parameter
@@ -60,7 +60,7 @@ class Options:
     )
 
 
-@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=4)
+@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=5)
 def complete_grid(given: Layers, options: Options, source: RandomSource, notes: DerivationNotes) -> Layers:
     """Fill in unknown cells of a grid that are certain: walls that continue, free cells between free ones.
 
@@ -129,7 +129,8 @@ def _complete_grid(
         left = count - int(np.count_nonzero((cells != UNKNOWN) & (grid.cells == UNKNOWN)))
         why = f"they stay unknown: free cells need a confidence of {options.confidence:g}"
         notes.drop("unknown cells", left, f"{name}: {why}")
-    return replace(grid, cells=cells)
+    properties = {word: value for word, value in grid.properties.items() if word != SLICE}
+    return replace(grid, cells=cells, properties=properties)
 
 
 def _fill(

@@ -22,7 +22,7 @@ from app.ingest.prepare import datum_moved_warnings
 from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
-from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, without_unknown_grey
+from app.model.grid import OCCUPIED, SLICE, UNKNOWN, OccupancyGrid, without_unknown_grey
 from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey, join_levels
 from app.model.names import did_you_mean
 from app.store.changes import KEEP, Changes, Delete, Provenance, Put, Replace
@@ -410,7 +410,7 @@ class _Session:
         cells[mask] = value
         # An edited grid has more information than the objects that it was derived from.
         grid = without_unknown_grey(grid, mask)
-        properties = {word: value for word, value in grid.properties.items() if word != "slice"}
+        properties = {word: value for word, value in grid.properties.items() if word != SLICE}
         self._grids[key] = replace(grid, cells=cells, properties=properties)
 
     def _grid_key(self, change: Mapping[str, Any]) -> PartKey:

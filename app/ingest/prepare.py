@@ -21,6 +21,7 @@ from app.limits import Limits
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
 from app.model.grid import (
+    SLICE,
     UNKNOWN,
     UNKNOWN_GREY,
     OccupancyGrid,
@@ -354,6 +355,8 @@ def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str, max_cells: in
     np.copyto(cells[window], new.cells, where=is_seen | new_grey)
     grey[window] = (grey[window] & ~is_seen) | new_grey
     properties = dict(old.properties)
+    if not np.array_equal(cells, old.cells):
+        properties.pop(SLICE, None)
     if grey.any():
         properties[UNKNOWN_GREY] = pack_cells(grey)
     else:

@@ -114,6 +114,10 @@ free_thresh; whether they were observed is unknown.
 """
 
 
+SLICE = "slice"
+"""Property of a grid that shows nothing but the objects beside it. Whoever changes its cells removes it."""
+
+
 def pack_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
     """Encode chosen cells of a grid, bool [height, width], as a JSON-like value."""
     packed = zlib.compress(np.packbits(chosen).tobytes(), 9)

@@ -103,3 +103,17 @@ def test_merged_grid_has_as_many_cells_as_an_uploaded_one(api: Api, bare: str) -
     assert "16402 × 16402 cells" in refused["detail"]
     assert "23193 m apart" in refused["detail"]
     assert written_pixels(api, bare).shape == (2, 2)
+
+
+def test_gazebo_has_the_walls_of_an_upload(api: Api, bare: str) -> None:
+    """A grid that shows nothing but the objects makes no walls of its own, and one that was merged into it does."""
+    generate_hall(api, bare)
+    assert "walls_map" not in gazebo_world(api, bare)
+    api.upload(bare, saved_grid(np.full((2, 2), GREY)), mode="merge", expect=200)
+    assert "walls_map" not in gazebo_world(api, bare)
+    api.upload(bare, saved_grid(np.full((2, 2), WALL), origin=(3.0, 3.0)), mode="merge")
+    assert "walls_map" in gazebo_world(api, bare)
+
+
+def gazebo_world(api: Api, env: str) -> str:
+    return api.get(f"/maps/{env}/gazebo").text

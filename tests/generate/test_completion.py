@@ -64,6 +64,15 @@ def test_wall_is_continued_and_cells_beyond_stay_unknown() -> None:
     assert "confidence of 0.98" in left.why
 
 
+def test_completed_grid_shows_more_than_the_objects() -> None:
+    """Gazebo gets walls of a grid only if it is no slice of the objects that it has anyway."""
+    cells = room()
+    cells[30:70, 50:90] = UNKNOWN
+    given = Layers({KEY: OccupancyGrid(cells, 0.05, properties={"slice": {"of": "objects"}, "kept": 1})})
+    grid = generate.run("complete_grid", 7, {}, given, DerivationNotes()).grids()[KEY]
+    assert grid.properties == {"kept": 1}
+
+
 def walls_over(occupied: NDArray[np.bool_], hole: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return _evidence.walls(_evidence.Grid(occupied & ~hole, ~hole, 0.05), hole)
 

@@ -204,3 +204,9 @@ def test_merged_grid_has_a_limit() -> None:
     fine = replace(hall(0.1), resolution=1e-4)
     with pytest.raises(Invalid, match="leave out the finest"):
         stitching.merge_cells([hall(0.1), fine], [STAY, STAY], "evidence")
+
+
+def test_merged_grid_is_no_slice_of_the_objects() -> None:
+    first = OccupancyGrid(np.zeros((3, 3), np.uint8), 0.1, properties={"slice": {"of": "objects"}, "kept": 1})
+    second = OccupancyGrid(np.full((3, 3), 100, np.uint8), 0.1)
+    assert stitching.merge_cells([first, second], [STAY, STAY], "newest").grid.properties == {"kept": 1}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid, Problem
 from app.model.alignment import Fit, rotation
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, unknown_grey_as_unknown
+from app.model.grid import FREE, OCCUPIED, SLICE, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, unknown_grey_as_unknown
 
 Cells = NDArray[np.uint8]
 Seam = Literal["evidence", "newest"]
@@ -80,7 +80,7 @@ def merge_cells(
         freed += int((disputed & (block == FREE)).sum())
         out[row : row + shape[0]] = block
     middling = bool(((out > FREE) & (out < OCCUPIED)).any())
-    properties = {key: value for key, value in first.properties.items() if key != UNKNOWN_GREY}
+    properties = {key: value for key, value in first.properties.items() if key not in (SLICE, UNKNOWN_GREY)}
     origin = (round(float(corner[0]), 9), round(float(corner[1]), 9), yaw)
     mode = "scale" if middling and first.mode == "trinary" else first.mode
     merged = replace(first, cells=out, resolution=size, origin=origin, mode=mode, properties=properties)
