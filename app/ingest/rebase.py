@@ -16,7 +16,7 @@ import shapely
 from app.model.features import Features, Properties
 from app.model.frame import Datum
 from app.model.geodesy import local_frame
-from app.model.grid import OccupancyGrid
+from app.model.grid import FREE, SLICE, UNKNOWN_GREY, OccupancyGrid, pack_cells, unknown_grey
 from app.model.layers import PartKey, join_levels
 from app.store.changes import KEEP, Changes, Delete, Operation, Prepared, Put, Replace
 from app.store.encode import pack
@@ -30,6 +30,11 @@ DELETED: Final = "deleted"
 """Name of the field in a conflict of a feature that one side deleted and the other changed."""
 
 _ABSENT: Final = object()
+
+_GREY: Final = np.uint8(254)
+"""Value of a free cell with the grey of unknown ones, while cells are merged; no cell of a grid has it."""
+
+_STRIP_ROWS: Final = 512
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,28 +171,18 @@ class _Merge:
         key = ours.key
         if theirs is None:
             return self._with(key, self._grid(self.draft, key))
-        if ours.whole or theirs.whole or ours.deleted or theirs.deleted:
+        is_stored = all(version.part(key) is not None for version in (self.base, self.draft, self.head))
+        grids = [self._grid(version, key) for version in (self.base, self.draft, self.head)] if is_stored else []
+        if not grids or any(_frame_of(grid) != _frame_of(grids[0]) for grid in grids):
             reason = f"the draft and version {self.head.number} changed the grid, one of them as a whole"
             return (
                 self._with(key, self._grid(self.draft, key)) if self.takes_draft(key, None, ["grid"], reason) else None
             )
-        was, now = self._grid(self.base, key), self._grid(self.head, key)
-        cells = now.cells.copy()
-        contested = 0
-        for change in ours.rectangles:
-            rows = slice(change.row, change.row + change.cells.shape[0])
-            columns = slice(change.column, change.column + change.cells.shape[1])
-            old, new = was.cells[rows, columns], now.cells[rows, columns]
-            edited = change.cells != old
-            both = edited & (new != old) & (new != change.cells)
-            contested += int(both.sum())
-            if self.prefer == "head":
-                edited &= ~both
-            cells[rows, columns][edited] = change.cells[edited]
+        merged, contested = _merged_cells(*grids, takes_ours=self.prefer != "head")
         if contested and self.prefer is None:
             reason = f"the draft and version {self.head.number} changed {contested} cells differently"
             self.refuse(key, None, ["cells"], reason)
-        return self._with(key, replace(now, cells=cells))
+        return self._with(key, merged)
 
     def _grid(self, version: Version, key: PartKey) -> OccupancyGrid:
         part = self.store.content.load(version, [key]).parts[key]
@@ -368,6 +363,43 @@ def _merged_value(was: Any, ours: Any, theirs: Any, *, takes_ours: bool) -> tupl
     if _is_same(was, theirs):
         return ours, False
     return (ours if takes_ours else theirs), True
+
+
+def _frame_of(grid: OccupancyGrid) -> tuple[Any, ...]:
+    """Return what must be equal for grids to be merged cell by cell."""
+    properties = {word: value for word, value in grid.properties.items() if word not in (SLICE, UNKNOWN_GREY)}
+    rule = (grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
+    return grid.cells.shape, grid.resolution, grid.origin, rule, properties
+
+
+def _merged_cells(
+    was: OccupancyGrid, ours: OccupancyGrid, theirs: OccupancyGrid, *, takes_ours: bool
+) -> tuple[OccupancyGrid, int]:
+    """Merge cells of grids with one frame. Returns the grid and the number of cells that both changed differently.
+
+    A free cell with the grey of unknown ones has a value of its own: to confirm it as free is a change.
+    """
+    cells, grey = theirs.cells.copy(), np.zeros(theirs.cells.shape, bool)
+    masks = [unknown_grey(grid) for grid in (was, ours, theirs)]
+    contested = 0
+    for row in range(0, theirs.height, _STRIP_ROWS):  # in strips, to bound the memory of a large grid
+        strip = slice(row, row + _STRIP_ROWS)
+        old, new, other = (
+            grid.cells[strip] if mask is None else np.where(mask[strip], _GREY, grid.cells[strip])
+            for grid, mask in zip((was, ours, theirs), masks, strict=True)
+        )
+        edited = new != old
+        both = edited & (other != old) & (other != new)
+        contested += int(both.sum())
+        merged = np.where(edited if takes_ours else edited & ~both, new, other)
+        grey[strip] = merged == _GREY
+        cells[strip] = np.where(grey[strip], np.uint8(FREE), merged)
+    properties = {word: value for word, value in theirs.properties.items() if word != UNKNOWN_GREY}
+    if SLICE not in ours.properties:
+        properties.pop(SLICE, None)
+    if grey.any():
+        properties[UNKNOWN_GREY] = pack_cells(grey)
+    return replace(theirs, cells=cells, properties=properties), contested
 
 
 def _merged_shape(was: _Row | None, ours: _Row, theirs: _Row, *, takes_ours: bool) -> tuple[tuple[Any, bool], bool]:

@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.api.conftest import Api
+from tests.api.test_merged_uploads import CLEAR, GREY, WALL, generate_hall, saved_grid, written_pixels
 
 Json = dict[str, Any]
 
@@ -215,6 +217,51 @@ def test_rebase_merges_properties_ends_and_cells(desk: Desk) -> None:
     grid = rebased["changes"]["occupancy"]["map"]
     assert (grid["bbox"][0], grid["bbox"][2]) == pytest.approx((0, 1), abs=0.51), "their cells are no change"
     desk.commit()
+
+
+def test_rebase_merges_cells_of_a_generated_grid(api: Api, bare: str) -> None:
+    """The first edit of cells also changes what the grid says about itself, on each side."""
+    generate_hall(api, bare)
+    desk = Desk(api, bare, name="walls")
+    before = written_pixels(api, bare)
+    desk.edit(cells(100, 1, 1, 2, 2))
+    edit_head(desk, cells(100, 5, 5, 6, 6))
+    desk.rebase()
+    desk.commit()
+    changed = np.argwhere(written_pixels(api, bare) != before)
+    assert changed.tolist() == [[1, 1], [5, 5]]
+    assert "walls_map" in api.get(f"/maps/{bare}/gazebo").text
+
+
+def test_rebase_merges_cells_of_grey(api: Api, bare: str) -> None:
+    """Nav2 reads map_saver's grey of unknown cells as free: to confirm such a cell as free is a change, too."""
+    api.upload(bare, saved_grid(np.full((3, 4), GREY)))
+    desk = Desk(api, bare, name="grey")
+    desk.edit(cells(0, 0, 0, 1, 1), cells(0, 1, 0, 2, 1), cells(100, 2, 0, 3, 1))
+    edit_head(desk, cells(0, 1, 0, 2, 1), cells(100, 3, 0, 4, 1), cells(0, 0, 2, 1, 3))
+    desk.rebase()
+    desk.edit(cells(100, 3, 2, 4, 3))
+    edit_head(desk, cells(0, 3, 2, 4, 3))
+    (conflict,) = desk.rebase(409)["conflicts"]
+    assert "1 cells differently" in conflict["reason"]
+    desk.rebase(prefer="head")
+    desk.commit()
+    assert written_pixels(api, bare).tolist() == [
+        [CLEAR, CLEAR, WALL, WALL],
+        [GREY, GREY, GREY, GREY],
+        [CLEAR, GREY, GREY, CLEAR],
+    ]
+
+
+def test_rebase_of_a_grid_in_another_frame_is_a_conflict(api: Api, bare: str) -> None:
+    api.upload(bare, saved_grid(np.full((3, 4), CLEAR)))
+    desk = Desk(api, bare, name="wider")
+    desk.edit(cells(100, 0, 0, 1, 1))
+    api.upload(bare, saved_grid(np.full((3, 5), CLEAR)))
+    (conflict,) = desk.rebase(409)["conflicts"]
+    assert conflict["fields"] == ["grid"]
+    desk.rebase(prefer="head")
+    assert "occupancy" not in api.get(desk.at).json()["changes"]
 
 
 def test_conflicts_name_feature_and_field(api: Api, desk: Desk) -> None:
