@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from app.derive import DerivationNotes, derives
 from app.derive._row_features import ROWS, fields_of, row_items
 from app.model.features import features
-from app.model.grid import OCCUPIED
+from app.model.grid import is_occupied
 from app.model.layers import Layers, Part, PartKey
 from app.model.selection import grid_label, select_grids
 from app.parameters import parameter
@@ -25,7 +25,7 @@ class Parameters:
     )
 
 
-@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=3)
+@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=4)
 def occupancy_to_rows(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Rows in a grid: lines of kind ``row`` with their distance and direction, and headlands.
 
@@ -36,6 +36,6 @@ def occupancy_to_rows(layers: Layers, parameters: Parameters, notes: DerivationN
     parts: dict[PartKey, Part] = {}
     for key, grid in select_grids(layers, parameters.grid, "rows").items():
         label = grid_label(key)
-        fields = fields_of([grid.cells == OCCUPIED], grid.resolution, grid.origin, notes, label)
+        fields = fields_of([is_occupied(grid, grid.cells)], grid.resolution, grid.origin, notes, label)
         parts[PartKey("objects", key.level, ROWS)] = features(row_items(fields, parameters.headland_depth), "local")
     return Layers(parts, layers.datum, layers.levels)

@@ -17,7 +17,7 @@ from app.derive._rows import Course, Row, RowField, half_turn
 from app.errors import CannotConvert, Invalid, MissingLayer
 from app.model.aisles import stop_positions
 from app.model.features import Features, concatenate, features
-from app.model.grid import OCCUPIED, OccupancyGrid
+from app.model.grid import OccupancyGrid, is_occupied
 from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -270,7 +270,7 @@ def _meets(grid: OccupancyGrid, line: Any, radius: float) -> bool:
     first = np.maximum(np.floor(turned.min(axis=0) / grid.resolution).astype(int), 0)
     last = np.ceil(turned.max(axis=0) / grid.resolution).astype(int)
     part = grid.cells[first[1] : max(last[1], 0), first[0] : max(last[0], 0)]
-    rows, columns = np.nonzero(part == OCCUPIED)
+    rows, columns = np.nonzero(is_occupied(grid, part))
     if not len(rows):
         return False
     u, v = (columns + first[0] + 0.5) * grid.resolution, (rows + first[1] + 0.5) * grid.resolution

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Invalid, Problem
 from app.model.frame import MAX_METRES
-from app.model.grid import OCCUPIED, OccupancyGrid
+from app.model.grid import OccupancyGrid, is_occupied
 
 Array = NDArray[np.float64]
 
@@ -356,14 +356,14 @@ def subsample(points: Array, limit: int = POINTS) -> Array:
 
 def _occupied_points(grid: OccupancyGrid) -> Array:
     """Return the middles of occupied cells in metres, float64 [n, 2]."""
-    return _placed_cells(grid, grid.cells == OCCUPIED)
+    return _placed_cells(grid, is_occupied(grid, grid.cells))
 
 
 def outline(grid: OccupancyGrid) -> Array:
     """Return the middles of occupied cells next to others, in metres: the visible outline of walls of any thickness."""
     import cv2
 
-    solid = (grid.cells == OCCUPIED).astype(np.uint8)
+    solid = is_occupied(grid, grid.cells).astype(np.uint8)
     inner = cv2.erode(solid, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return _placed_cells(grid, (solid - inner).astype(bool))
 

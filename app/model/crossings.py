@@ -14,7 +14,7 @@ from app.errors import FleetMapError, Invalid, MissingDatum, Problem
 from app.model import masks
 from app.model.bends import is_identified
 from app.model.features import Features, Properties
-from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey_as_unknown
+from app.model.grid import UNKNOWN, OccupancyGrid, is_occupied, unknown_grey_as_unknown
 from app.model.layers import MAP, Layers, PartKey
 from app.model.obstacles import object_footprint
 from app.model.solids import Solids
@@ -146,12 +146,6 @@ def cells_at(grid: OccupancyGrid, points: Array) -> NDArray[np.uint8]:
     inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
     out = np.full(len(points), UNKNOWN, np.uint8)
     out[inside] = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million cells
-    return out
-
-
-def is_occupied(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return which cells are occupied by the grid's own threshold."""
-    out: NDArray[np.bool_] = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
     return out
 
 

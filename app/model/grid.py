@@ -95,6 +95,12 @@ class OccupancyGrid:
         return {"occupied": occupied, "free": free, "unknown": unknown, "other": other}
 
 
+def is_occupied(grid: OccupancyGrid, cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return which cells are occupied by the grid's own threshold; free and unknown ones never are."""
+    out: NDArray[np.bool_] = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN) & (cells != FREE)
+    return out
+
+
 def halve_cells(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Join 2 × 2 cells: the maximum of the known ones, unknown if there are none."""
     shifted: NDArray[np.uint8] = cells + np.uint8(256 - UNKNOWN)  # in uint8 arithmetic 255 becomes 0, the least

@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.model.crossings import cells_at, is_occupied
-from app.model.grid import OccupancyGrid
+from app.model.crossings import cells_at
+from app.model.grid import OccupancyGrid, is_occupied
 from app.model.layers import Layers
 from app.review.docks import Dock, find_docks
 from app.review.findings import point

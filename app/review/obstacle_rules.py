@@ -20,14 +20,13 @@ from app.model.crossings import (
     cells_at,
     ground_plans,
     is_body,
-    is_occupied,
     line_segments,
     obstacle_grid,
     plan_crossings,
     sample_points,
 )
 from app.model.features import Properties
-from app.model.grid import OccupancyGrid
+from app.model.grid import OccupancyGrid, is_occupied
 from app.model.layers import Layers
 from app.model.obstacles import object_role
 from app.review.findings import MAX_IDS, Finding, Site, name_list, point

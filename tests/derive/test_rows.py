@@ -184,6 +184,22 @@ def test_edges_through_occupied_cells_are_left_out() -> None:
     assert min(g.distance(box) for g, _ in of(site, "topology", "edge")) > 0.2
 
 
+def test_cells_above_the_threshold_of_their_grid_are_obstacles_and_plants() -> None:
+    """In a grid of mode scale, 80 and 90 of 100 are occupied from 0.65 on, as for all other derivations."""
+    mask = drawn(lines(0.0))
+    plants = OccupancyGrid(np.where(mask, 90, FREE).astype(np.uint8), SIZE, mode="scale")
+    rows = derived("occupancy_to_rows", Layers({PartKey("occupancy", "ground", MAP): plants}))
+    assert len(of(rows, "objects", "row")) == 5
+    for value, blocked in ((80, True), (60, False)):
+        cells = np.where(mask, 90, FREE).astype(np.uint8)
+        cells[120:130, 15:20] = value
+        box = OccupancyGrid(cells, SIZE, mode="scale")
+        notes = DerivationNotes()
+        site = Layers({**rows.parts, PartKey("occupancy", "ground", MAP): box})
+        run([all_derivations()["rows_to_topology"].step()], site, notes)
+        assert any(d.subject == "edges" for d in notes.dropped) == blocked
+
+
 def test_drawn_rows_give_network_and_narrow_ones_none() -> None:
     def site(kind: str, spacing: float) -> Layers:
         rows = [(f"r{k}", line, {"kind": kind}) for k, line in enumerate(lines(0.3, spacing=spacing))]

@@ -83,6 +83,14 @@ def test_align_grids_prefers_nearest_of_equal_fits() -> None:
     assert len([f for f in fits if f.score > 0.95]) >= 4, "a square fits four ways"
 
 
+def test_align_grids_counts_cells_from_the_threshold_on() -> None:
+    fixed = hall()
+    walls = np.where(fixed.cells == OCCUPIED, 80, fixed.cells).astype(np.uint8)
+    moved = OccupancyGrid(walls, fixed.resolution, (fixed.origin[0] + 0.4, fixed.origin[1] - 0.3, 0.0), "scale")
+    fit = alignment.align_grids(moved, fixed)[0]
+    assert away(fit, -0.4, 0.3, 0.0) == pytest.approx((0.0, 0.0), abs=0.05)
+
+
 def test_align_grids_rejects_grids_without_outline() -> None:
     nothing = OccupancyGrid(np.zeros((10, 10), np.uint8), 0.1)
     for a, b in ((nothing, hall()), (hall(), nothing)):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.model.alignment import Fit, outline, rotation, subsample
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, halve_cells, unknown_grey_as_unknown
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, halve_cells, is_occupied, unknown_grey_as_unknown
 from app.model.stitching.lines import Lines
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class Chart:
         self.resolution = size
         self.free = cells == FREE
         self.observed = cells != UNKNOWN
-        solid = (cells == OCCUPIED).astype(np.uint8)
+        solid = is_occupied(grid, cells).astype(np.uint8)
         self.away = cv2.distanceTransform(1 - solid, cv2.DIST_L2, 5) * np.float32(size)
         if not solid.any():
             self.away[:] = np.inf
