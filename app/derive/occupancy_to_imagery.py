@@ -88,6 +88,8 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Derivati
         size = grid.resolution * step
         if step > 1 and parameters.pixel is None:
             notes.warn(f"pixels are {step} cells wide, {size:g} m; a finer plan would be too large")
+        if parameters.pixel is not None and not math.isclose(size, parameters.pixel, rel_tol=1e-6):
+            notes.fill("pixel", round(size, 9), "pixels are whole cells of the grid", "pixel")
         pixels = _colour_cells(cells)
         frame = RasterFrame((0.0, 0.0), size, cells.shape[1], cells.shape[0])
         if parameters.draw_objects:

@@ -56,6 +56,18 @@ def test_each_cell_becomes_a_pixel_at_its_position(yaw: float) -> None:
     assert xy == pytest.approx([3.0 + c * u - s * v, -2.0 + s * u + c * v], abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("pixel", "size"), [(0.3, None), (0.1, None), (0.001, 0.1), (0.12, 0.1), (0.27, 0.3), (None, None)]
+)
+def test_another_size_of_pixels_than_asked_for_is_reported(pixel: float | None, size: float | None) -> None:
+    notes = DerivationNotes()
+    picture = drawn(Layers({GRID: OccupancyGrid(room(), 0.1)}), notes, pixel=pixel)
+    assert picture.transform[0] == pytest.approx(size or pixel or 0.1)
+    assert [(t.subject, t.value, t.option) for t in notes.template] == (
+        [] if size is None else [("pixel", pytest.approx(size), "pixel")]
+    )
+
+
 def test_costs_are_shades_between_paper_and_ink() -> None:
     cells = np.array([[0, 25, 50, 75, 100]], np.uint8)
     grey = drawn(Layers({GRID: OccupancyGrid(cells, 1.0)})).pixels[0, :, 0].astype(int)
