@@ -112,8 +112,8 @@ def _regular(data: bytes) -> _Network | None:
     if len(nodes) != count or waiting[b"edge_id"]:
         return None
     is_newest = DAY_FIRST.fullmatch(_time(data[:HEAD_BYTES])) is not None
-    found = _POINTSET.findall(data) if is_newest else []
-    return _Network(nodes, edges, {text.decode("utf-8", "replace").strip("'\"") for text in found}, is_newest)
+    values = set(_POINTSET.findall(data)) if is_newest else set()
+    return _Network(nodes, edges, {text.decode("utf-8", "replace").strip("'\"") for text in values}, is_newest)
 
 
 def _time(head: bytes) -> str:

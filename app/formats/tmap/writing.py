@@ -138,9 +138,9 @@ class _Writer:
     def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
         """Write the nodes of a network, each with its edges."""
         self.legacy = "tmap" in part.document
-        own = _mapping_text(part.document.get(NAME))
-        has_other_frame = not self.listed and child_frame(own) not in (None, child_frame(self.document))
-        self.foreign = own if has_other_frame else None
+        document = _mapping_text(part.document.get(NAME))
+        has_other_frame = not self.listed and child_frame(document) not in (None, child_frame(self.document))
+        self.foreign = document if has_other_frame else None
         is_point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
         kinds = [p.get("kind") for p in part.properties]
         places = [k for k, point in enumerate(is_point.tolist()) if point and kinds[k] == "node"]
