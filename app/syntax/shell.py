@@ -56,6 +56,7 @@ _PIECE = re.compile(
     | "(?>(?:[^"\\]|\\.)*)(?:"|\Z)
     | \\(?:.|\Z)                                 # an escaped character; an escaped line end continues the line
     | (?<![^\s;&|(){}])\#[^\n]*                  # a comment begins a word
+    | <<<                                        # a here-string is on its line
     | <<-?[ \t]*['"]?(?P<here>[A-Za-z0-9_]+)['"]?
     | (?P<word>[^\s'"\\;&|(){}<>]+)
     | (?P<sign>[;&|(){}]|\n)
@@ -99,7 +100,7 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
                 else:
                     variables[name] = value
         else:
-            end, depth, touched, leaves = _command(text, at, depth)
+            end, depth, touched, stop = _command(text, at, depth)
             for name in touched:
                 variables.pop(name, None)
                 if name not in names_with_warning:
@@ -107,8 +108,8 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
                 names_with_warning.add(name)
             if not touched:
                 other_lines.append(line)
-            if leaves and end < len(text):
-                warnings.append(f"line {line}: the script exits here; the lines after it are skipped")
+            if stop:
+                warnings.append(f"line {line}: {stop}; the lines after it are skipped")
                 break
         line += text.count("\n", at, end)
         at = end
@@ -207,18 +208,25 @@ def _value(text: str, at: int) -> tuple[str, int]:
     return "".join(parts), at
 
 
-def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], bool]:
-    """Skip a logical line. Returns its end, the block depth after it, variables it may set, whether it exits."""
+def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], str]:
+    """Skip a logical line. Returns its end, the block depth after it, variables it may set, why no line follows."""
     touched: dict[str, None] = {}
     heres: list[str] = []
     begins, leaves, first = True, False, ""
+    parentheses = arithmetic = 0  # open ones, and those of them up to the inner one of "((", where "<<" is a shift
     while at < len(text):
         piece = _PIECE.match(text, at)
         if piece is None:  # every character matches the last alternative
             break
         at = piece.end()
         token, sign = piece["word"], piece["sign"]
-        if piece["here"]:
+        if sign == "(":
+            parentheses += 1
+            arithmetic = arithmetic or (parentheses if text.startswith("((", at - 2) else 0)
+        elif sign == ")":
+            parentheses = max(parentheses - 1, 0)
+            arithmetic = arithmetic if parentheses >= arithmetic else 0
+        if piece["here"] and not arithmetic:
             heres.append(piece["here"])
         if sign in ("{", "}") and begins:
             token = sign
@@ -243,8 +251,11 @@ def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], bool]
             begins = False
     for end in heres:
         match = re.compile(rf"^\t*{re.escape(end)}$", re.MULTILINE).search(text, at)
-        at = len(text) if match is None else min(len(text), match.end() + 1)
-    return at, max(depth, 0), list(touched), leaves
+        if match is None:
+            stop = f"the here-document has no end mark {end[:80]}" if at < len(text) else ""
+            return len(text), max(depth, 0), list(touched), stop
+        at = min(len(text), match.end() + 1)
+    return at, max(depth, 0), list(touched), "the script exits here" if leaves and at < len(text) else ""
 
 
 def _past(pattern: re.Pattern[str], text: str, at: int) -> int:

@@ -98,6 +98,12 @@ def test_only_unconditional_literals_are_read() -> None:
         ("A='1\nB=2\n'\nC=3", {"C": "3"}),
         ("cat <<EOF\nA=1\nEOF\nB=2", {"B": "2"}),
         ("cat <<-'EOF'\nA=1\n\tEOF\nB=2", {"B": "2"}),
+        ("read X Y <<< 'hello world'\nB=2", {"B": "2"}),
+        ("cat <<<EOF\nB=2\nEOF\nC=3", {"B": "2", "C": "3"}),
+        ("(( FLAGS = 1<<4 ))\nB=2", {"B": "2"}),
+        ("N=$(( (1 << 3) + 2 ))\nB=2", {"B": "2"}),
+        ("N=$((1<<3)); cat <<EOF\nA=1\nEOF\nB=2", {"B": "2"}),
+        ("(cat <<EOF)\nA=1\nEOF\nB=2", {"B": "2"}),
         ("echo \\\nA=1\nB=2", {"B": "2"}),
         ("f() {\nA=1\n}\nB=2", {"B": "2"}),
         ("f()\n{\nA=1\n}\nB=2", {"B": "2"}),
@@ -130,6 +136,12 @@ def test_shell_lines_give_expected_values(text: str, expected: dict[str, str]) -
 )
 def test_skipped_assignments_are_reported(text: str) -> None:
     assert shell.assignments(text.encode())[1]
+
+
+def test_a_here_document_without_an_end_is_reported() -> None:
+    variables, warnings = shell.assignments(b"A=1\ncat <<EOF\nB=2\n")
+    assert variables == {"A": "1"}
+    assert "line 2: the here-document has no end mark EOF; the lines after it are skipped" in warnings
 
 
 def test_literals_alone_need_no_warning() -> None:
@@ -167,6 +179,7 @@ HOSTILE = [
     "if ",
     "A='x'\"y\"",
     "<<a\na\n",
+    "((1<<a",
     "$(",
     "export A=1;",
     "#",
