@@ -37,6 +37,7 @@ register(
         detect=detect,
         read=read,
         write=write,
+        version=2,
         needs=LayerRequirements(ANY_FEATURES, anchor="wgs84"),
         extensions=(".xml",),
         claims=Claims(companions=companions),
