@@ -146,8 +146,8 @@ def detect(name: str, data: bytes) -> bool:
     """Detect a first row with such columns."""
     if not name.lower().endswith(".csv"):
         return False
-    first = data[:4096].decode("utf-8-sig", "replace").partition("\n")[0]
-    return _axes([title.strip() for title in first.split(",")]) is not None
+    first = re.split("[\r\n]", data[:4096].decode("utf-8-sig", "replace"), maxsplit=1)[0]
+    return _axes([title.strip() for title in next(csv.reader([first]), [])]) is not None
 
 
 register(

@@ -39,6 +39,20 @@ def test_metres_and_yaw_become_nodes() -> None:
     assert part.properties[0]["orientation"] == pytest.approx([0, 0, half, half])
 
 
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ('"name","x","y"', True),
+        ('\ufeff"name",x,"y"\r', True),
+        ("name,x,y\rA,1,2", True),
+        ("name;x;y", False),
+        ("", False),
+    ],
+)
+def test_the_header_may_be_quoted(header: str, expected: bool) -> None:
+    assert FORMAT.detect("w.csv", f"{header}\n".encode()) is expected
+
+
 def test_degrees_are_latitude_then_longitude_and_come_back() -> None:
     text = "name,latitude,longitude\nbarn,53.2687,-0.5244\n"
     part, _ = read(text)
