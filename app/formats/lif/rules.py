@@ -1,7 +1,8 @@
 """Rules of the Layout Interchange Format's specification.
 
 Source: VDMA LIF 1.0.0, section 8 (members and their types, ids unique within the file, angles in radians from -π to π);
-the drafts of 2.0 call vehicle types mobile robot types and put layouts into origins.
+the drafts of 2.0 call vehicle types mobile robot types and put layouts into origins. ``stations`` may be absent: so say
+0.11 and 2.0, and so do the examples of 1.0.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def check(files: Files) -> Iterator[Problem]:
         location = f"{path}[{k}]"
         for key in missing(layout, ("layoutId", "nodes")):
             yield error_finding("the specification requires it", main, where=f"{location}.{key}")
-        for key in missing(layout, ("layoutVersion", "edges", "stations")):
+        for key in missing(layout, ("layoutVersion", "edges")):
             yield warning_finding("the specification requires it", main, where=f"{location}.{key}")
         ids["layoutId"].append(str(layout.get("layoutId")))
         yield from _items(layout, ids, ends, main, location)
