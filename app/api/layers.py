@@ -135,8 +135,8 @@ def get_layer(
     bbox: Annotated[
         str | None,
         Query(
-            description="Only content in this box, given in `crs`: features whose bounding box intersects it, the cells "
-            "of a grid, or columns of a voxel map."
+            description="Only content in this box, given in `crs`: features whose bounding box intersects it, cells of "
+            "a grid, or columns of a voxel map."
         ),
     ] = None,
     crs: Crs = None,
