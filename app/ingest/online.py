@@ -423,6 +423,12 @@ class Fetcher:
             return None
         return data if any(data.startswith(magic) for magic in MAGIC) else None
 
+    def forget(self, blocks: Iterable[TileRequest]) -> None:
+        """Remove responses from the cache: one of them may be damaged, and is fetched again next time."""
+        for file in filter(None, map(self._file, blocks)):
+            with contextlib.suppress(OSError):
+                file.unlink()
+
     def _write_cache(self, block: TileRequest, data: bytes) -> None:
         """Cache a response and evict the least recently used ones. Ignores a full disk."""
         file = self._file(block)

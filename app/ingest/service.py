@@ -207,9 +207,14 @@ class Ingest:
                 fetches.append((sheet, tuple(online.Fetcher(provider).fetch(sheet.blocks))))
             step, lines = provider.provenance_step(chosen), tuple(map(input_line, fences))
             fetched = online.FetchedImagery(sheet, fetches[-1][1], chosen, step, provider.attribution, lines)
-            prepared, warnings = self._run_in_worker(
-                online.prepare_picture, base, fetched, self._limits, failure="the fetched image could not be read"
-            )
+            failure = "the fetched image could not be read"
+            try:
+                prepared, warnings = self._run_in_worker(
+                    online.prepare_picture, base, fetched, self._limits, failure=failure
+                )
+            except (CannotDerive, UnreadableFile):
+                online.Fetcher(provider).forget(sheet.blocks)
+                raise
             return self._commit(environment, base, prepared, described, key, warnings)
 
         return self._commit_on_head(environment, key, commit.if_match, once, "commit the fetched image")

@@ -375,14 +375,14 @@ def test_invalid_provider_urls_are_refused(tmp_path: Path, values: dict[str, Any
 
 # --- through the server ----------------------------------------------------------------------------------------------
 @contextmanager
-def serving(folder: Path, at: Misbehaving, seconds: float = 60.0) -> Iterator[Api]:
+def serving(folder: Path, at: Misbehaving, seconds: float = 60.0, cache_bytes: int = 0) -> Iterator[Api]:
     more = {
         "imagery_url": at.url + "/tiles/{z}/{x}/{y}.png?key={token}",
         "imagery_token": SECRET,
         "imagery_attribution": "© Somebody; © Else",
         "imagery_tries": 1,
         "imagery_seconds": seconds,
-        "imagery_cache_bytes": 0,
+        "imagery_cache_bytes": cache_bytes,
     }
     with running(settings_for(folder, **more)) as api:
         yield api
@@ -449,6 +449,19 @@ def test_site_gets_its_image(provider: Misbehaving, tmp_path: Path) -> None:
         viewer = api.token_for("viewer")
         viewer.problem("POST", path, 403, json=request)
         assert api.get("environments/farm/versions/latest").json()["version"] == before
+
+
+def test_damaged_response_is_fetched_again(provider: Misbehaving, tmp_path: Path) -> None:
+    with serving(tmp_path, provider, cache_bytes=2**20) as api:
+        api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
+        request = {"method": "location_to_imagery", "parameters": {"resolution": 0.5, "radius": 20}}
+        provider.behaviour = "bomb"
+        api.problem("POST", "environments/farm/derivations", 422, json=request)
+        provider.behaviour = "fine"
+        api.post("environments/farm/derivations", request)
+        count = len(provider.paths)
+        api.post("environments/farm/derivations", request, expect=200)
+        assert len(provider.paths) == count, "good ones are cached"
 
 
 def test_image_that_does_not_come_in_time_creates_no_version(provider: Misbehaving, tmp_path: Path) -> None:
