@@ -222,8 +222,8 @@ def move_channel(
     and report `ready`. The channel moves when the share `ready` of its online robots has the version, but not before
     `activate_at`. If the share `failed` reports `failed` before the move, the move is cancelled. If it does within
     `window` seconds after the move, the channel moves back, with a higher sequence and `rollback: true`. The move is
-    also cancelled at `deadline`. While robots are watched after the move, no other move can be planned (409); a move at
-    once ends the watch.
+    also cancelled at `deadline`. While robots are watched after the move, no move can be planned without a rollout
+    (409); a move at once and another rollout end the watch.
     """
     if channel == LATEST:
         raise Invalid(

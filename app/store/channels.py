@@ -141,8 +141,8 @@ class Channels:
             activate_at: time of the planned move, aware.
             rollout: makes it a two-stage rollout; its version and root are set here.
 
-        A move at once ends any open rollout; a plan replaces one that still waits. Raises Conflict if a move is planned
-        while robots are watched: the plan would end the watch unnoticed.
+        A move at once and another rollout end any open rollout; a plan ends one that still waits. Raises Conflict if a
+        move is planned while robots are watched: the plan would end the watch unnoticed.
 
         The event has ``rollback: true`` if the version is lower than the channel's. Moving a channel to its current
         version changes nothing except that a plan is cancelled, with its event. ``latest`` cannot be moved.
@@ -390,7 +390,7 @@ def _plan(write: _ChannelWrite, number: int, author: str, at: datetime | None, r
     before = None
     if channel_row is not None and channel_row.version is not None:
         before = write.read_version(channel_row.version)
-    if channel_row is not None and channel_row.rollout_state == "watching":
+    if rollout is None and channel_row is not None and channel_row.rollout_state == "watching":
         watched = Rollout.from_row(channel_row.rollout)
         until = "" if watched.moved is None else f" until {rfc3339(watched.moved + timedelta(seconds=watched.window))}"
         raise Conflict(f"version {watched.version} is watched for failures{until}: plan after that, or move now")

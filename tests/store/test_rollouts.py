@@ -265,18 +265,24 @@ def test_another_move_ends_rollout(fleet: Fleet):
     assert fleet.tick(10) == (1, "")
 
 
-@pytest.mark.parametrize("stage", [None, {"ready": 1.0}])
-def test_planning_another_move_does_not_end_the_watch(fleet: Fleet, stage: dict[str, Any] | None):
+def test_planned_move_does_not_end_the_watch(fleet: Fleet):
     fleet.report("a", 1, "active")
     moved = fleet.roll(failed=0.1, window=60.0)
-    rollout = None if stage is None else Rollout(0, "", fleet.start, **stage)
     with pytest.raises(Conflict, match=re.escape(f"version 2 is watched for failures until {rfc3339(fleet.at(60))}")):
-        fleet.store.channels.move("farm", "production", 3, author="ann", activate_at=fleet.at(900), rollout=rollout)
+        fleet.store.channels.move("farm", "production", 3, author="ann", activate_at=fleet.at(900))
     assert fleet.channel() == moved
     fleet.report("a", 2, "failed", 2)
     assert fleet.tick(3) == (1, "rolled_back")
-    fleet.store.channels.move("farm", "production", 3, author="ann", activate_at=fleet.at(900), rollout=rollout)
+    fleet.store.channels.move("farm", "production", 3, author="ann", activate_at=fleet.at(900))
     assert fleet.channel().planned is not None
+
+
+def test_another_rollout_ends_the_watch(fleet: Fleet):
+    fleet.report("a", 1, "active")
+    fleet.roll(failed=0.1, window=60.0)
+    fleet.roll(3, ready=1.0)
+    fleet.report("a", 2, "failed", 2)
+    assert fleet.tick(3) == (2, "waiting")
 
 
 def test_first_move_has_no_version_to_move_back_to(fleet: Fleet):
