@@ -199,28 +199,7 @@ def _voxelise(
     cloud: Cloud, options: ReadOptions, context: ReadContext
 ) -> tuple[VoxelMap, dict[str, Any], Datum | None]:
     """Return the voxels, how the points were placed, and the datum if the cloud sets one."""
-    frame, corner = context.frame, None
-    local: Array | None = None
-    placed: dict[str, Any] = {}
-    crs, earth = _to_wgs84(cloud, options, context)
-    if earth is not None:
-        if frame is None:
-            corner = _corner(earth)
-            frame = local_frame(corner)
-            context.warn(
-                f"the environment has no datum; the cloud's south-west corner, latitude {corner.latitude!r}, longitude "
-                f"{corner.longitude!r}, is used: upload a datum.yaml or PATCH the environment to set another"
-            )
-        local = frame.to_local(earth)
-        placed |= {"crs": crs, "datum": frame.datum.as_dict()}
-    elif cloud.units is not None and options.crs is None:
-        context.warn(
-            f"the file names no CRS by a code, but units of {cloud.units[0]:.10g} m (x, y) and {cloud.units[1]:.10g} m "
-            "(z): the points are converted to local metres; set crs=EPSG:… to place them",
-            where="crs",
-        )
-        local = _in_metres(cloud.places(0, len(cloud)), cloud.units)
-        placed["units"] = list(cloud.units)
+    local, placed, corner = _place(cloud, options, context)
     n = len(cloud)
 
     def chunks() -> Iterator[Array]:
@@ -260,6 +239,38 @@ def _voxelise(
     depth = np.full(len(code), DEPTH, np.uint8)
     odds = np.full(len(code), LOG_ODDS[1], np.float32)
     return VoxelMap(resolution, depth, code, odds, colour, colour is None), placed, corner
+
+
+def _place(
+    cloud: Cloud, options: ReadOptions, context: ReadContext
+) -> tuple[Array | None, dict[str, Any], Datum | None]:
+    """Return the points in local metres, how they were placed, and the datum if the cloud sets one.
+
+    The points are None if the file's coordinates are local metres.
+    """
+    frame, corner = context.frame, None
+    local: Array | None = None
+    placed: dict[str, Any] = {}
+    crs, earth = _to_wgs84(cloud, options, context)
+    if earth is not None:
+        if frame is None:
+            corner = _corner(earth)
+            frame = local_frame(corner)
+            context.warn(
+                f"the environment has no datum; the cloud's south-west corner, latitude {corner.latitude!r}, longitude "
+                f"{corner.longitude!r}, is used: upload a datum.yaml or PATCH the environment to set another"
+            )
+        local = frame.to_local(earth)
+        placed |= {"crs": crs, "datum": frame.datum.as_dict()}
+    elif cloud.units is not None and options.crs is None:
+        context.warn(
+            f"the file names no CRS by a code, but units of {cloud.units[0]:.10g} m (x, y) and {cloud.units[1]:.10g} m "
+            "(z): the points are converted to local metres; set crs=EPSG:… to place them",
+            where="crs",
+        )
+        local = _in_metres(cloud.places(0, len(cloud)), cloud.units)
+        placed["units"] = list(cloud.units)
+    return local, placed, corner
 
 
 def _merge_codes(

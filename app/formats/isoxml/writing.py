@@ -170,8 +170,8 @@ class _Writer:
         return "other" if "other" in names else None
 
     def _report_properties(self, properties: Properties, *, has_width: bool) -> None:
-        known = {"kind", "name", NAME, "width"} if has_width else {"kind", "name", NAME}
-        further = [name for name in properties if name not in known]
+        written = {"kind", "name", NAME, "width"} if has_width else {"kind", "name", NAME}
+        further = [name for name in properties if name not in written]
         self.lost["further properties", "ISOXML shapes have a type and a name"] += len(further)
 
     def _polygon(self, parent: etree._Element, kind: str, shape: Any) -> etree._Element:
@@ -209,10 +209,10 @@ class _Writer:
         source = properties.get(NAME)
         kept = source.get("pattern") if isinstance(source, Mapping) else None
         for line in shapely.get_parts(shape):
-            known = self._pattern(line, kept if isinstance(kept, Mapping) else None)
-            if known is None:
+            drawn = self._pattern(line, kept if isinstance(kept, Mapping) else None)
+            if drawn is None:
                 continue
-            attributes, points = known
+            attributes, points = drawn
             pattern = etree.SubElement(self._group(key), "GPN", A=self._pattern_id(identifier))
             title = properties.get("name")
             if isinstance(title, str) and title:
