@@ -264,8 +264,8 @@ def _place(
         placed |= {"crs": crs, "datum": frame.datum.as_dict()}
     elif cloud.units is not None and options.crs is None:
         context.warn(
-            f"the file names no CRS by a code, but units of {cloud.units[0]:.10g} m (x, y) and {cloud.units[1]:.10g} m "
-            "(z): the points are converted to local metres; set crs=EPSG:… to place them",
+            f"the file's CRS has no code, but units of {cloud.units[0]:.10g} m (x, y) and {cloud.units[1]:.10g} m (z): "
+            "the points become local metres; set crs=EPSG:… to place them",
             where="crs",
         )
         local = _in_metres(cloud.places(0, len(cloud)), cloud.units)
