@@ -1,4 +1,4 @@
-"""Names of shell variables that no map may set: the server drops them, and a robot refuses them even if signed."""
+"""Names of shell variables that no map may set: server and robots leave them out, even signed ones."""
 
 from __future__ import annotations
 

@@ -123,8 +123,7 @@ class Agent:
         self._store.stage(state.in_boot(read_boot_id()))
         self._signed_clock.floor = state.newest_time
         self._activation.protect()
-        if installed is not None and name is not None:
-            self._folder.refresh(name, installed)
+        self._folder.refresh()
 
     def close(self) -> None:
         """Close the connections and unlock the map directory."""
@@ -548,6 +547,7 @@ class Agent:
             self._manifests.missing_remark(current),
             self._freshness.behind_remark(self._accepted_sequence),
             self._activation.hook_remark(),
+            self._manifests.variables_remark(current),
         )
         return "; ".join(remark for remark in remarks if remark) or None
 

@@ -146,6 +146,12 @@ class Manifests:
         reasons = [f"{name} ({manifest.missing[name]})" if name in manifest.missing else name for name in lacking]
         return f"missing optional formats: {', '.join(reasons)}" if reasons else None
 
+    @staticmethod
+    def variables_remark(manifest: Manifest) -> str | None:
+        """Return a remark about variables of the map that the robot does not set; None if there are none."""
+        names = ", ".join(manifest.variables_left_out)
+        return f"environment.sh lacks variables that no map may set: {names[:300]}" if names else None
+
     def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, Trust]:
         """Verify a manifest; return it, and why it is trusted. Raises Untrusted."""
         state = self._store.value

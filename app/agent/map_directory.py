@@ -204,11 +204,13 @@ class MapDirectory:
         """Store a newer manifest of an existing version: the same files with a later sequence or expiry."""
         self._describe(self.versions / name, manifest)
 
-    def refresh(self, name: str, manifest: Manifest) -> None:
-        """Rewrite the descriptive files of a version if the directory was moved or an older agent wrote them."""
-        for path, data in self._descriptions(self.versions / name, manifest):
-            if not path.exists() or path.read_bytes() != data:
-                write_atomically(path, data)
+    def refresh(self) -> None:
+        """Rewrite the descriptive files of all versions if the directory was moved or an older agent wrote them."""
+        for name in self._names():
+            manifest = self.manifest(name)
+            for path, data in self._descriptions(self.versions / name, manifest) if manifest else ():
+                if not path.exists() or path.read_bytes() != data:
+                    write_atomically(path, data)
 
     def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
         """Build a complete version folder, synced to disk, and return its name. ``current`` does not change.

@@ -82,6 +82,7 @@ class Manifest:
     Attributes:
         data, signature: signed bytes and signature header as received.
         variables: shell variables of the environment (``FARM_NAME`` …), for ``environment.sh``.
+        variables_left_out: names of signed variables that no map may set; they are not in ``variables``.
         layers: layer -> hash of its content.
         time: time of signing.
         levels: lowest first.
@@ -112,6 +113,7 @@ class Manifest:
     closures: str = "apply"
     parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     edge_sequence: int = 0
+    variables_left_out: tuple[str, ...] = ()
 
     @property
     def mark(self) -> Mark:
@@ -143,6 +145,7 @@ def parse(data: bytes, signature: str) -> Manifest:
         )
         signed_at = body.get("time")
         expires = read_time(body["expires"])
+        variables, left_out = _read_variables(body.get("variables", {}))
         manifest = Manifest(
             body["environment"],
             body.get("channel"),
@@ -153,7 +156,7 @@ def parse(data: bytes, signature: str) -> Manifest:
             files,
             data,
             signature,
-            dict(body.get("variables", {})),
+            variables,
             dict(body.get("layers", {})),
             body.get("epoch", 0),
             None if signed_at is None else read_time(signed_at),
@@ -164,6 +167,7 @@ def parse(data: bytes, signature: str) -> Manifest:
             body.get("closures", "apply"),
             {format_: dict(values) for format_, values in body.get("parameters", {}).items()},
             body.get("edge_sequence", 0),
+            left_out,
         )
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Untrusted(f"invalid manifest from the server: {type(error).__name__}: {error}") from None
@@ -184,7 +188,6 @@ def parse(data: bytes, signature: str) -> Manifest:
     if not (valid_numbers and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
         raise Untrusted("invalid manifest from the server: invalid number, hash or time of expiry, or too many files")
     _check_paths(files)
-    _check_variables(manifest.variables)
     _check_site(manifest)
     if not all(isinstance(t, str) for t in manifest.layers.values()) or not all(map(_LAYER.fullmatch, manifest.layers)):
         raise Untrusted("invalid manifest from the server: invalid name or hash of a layer")
@@ -251,14 +254,21 @@ def is_hash(text: str) -> bool:
     return _HASH.fullmatch(text) is not None
 
 
-def _check_variables(variables: Mapping[str, str]) -> None:
-    """Check for valid shell names and one-line values; refuse variables that affect the robot's programs."""
+def _read_variables(pairs: Any) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the variables for the robot, and the names of those left out since they affect its programs.
+
+    These are no reason to refuse the manifest: older servers sign some, and installed maps may have them.
+    Raises Untrusted if a name is not one of a shell, or a value not one line of text.
+    """
+    variables = dict(pairs)
     if len(variables) > MAX_VARIABLES:
         raise Untrusted(f"manifest has {len(variables)} variables, more than {MAX_VARIABLES}")
     for name, value in variables.items():
         fine = _VARIABLE.fullmatch(name) and isinstance(value, str) and (value.isprintable() or not value)
-        if not fine or DANGEROUS_VARIABLE.fullmatch(name):
-            raise Untrusted(f"manifest contains the forbidden or invalid variable {name[:80]!r}")
+        if not fine:
+            raise Untrusted(f"manifest contains the invalid variable {name[:80]!r}")
+    harmless = {name: value for name, value in variables.items() if not DANGEROUS_VARIABLE.fullmatch(name)}
+    return harmless, tuple(sorted(variables.keys() - harmless.keys()))
 
 
 def _check_paths(files: Sequence[ManifestFile]) -> None:

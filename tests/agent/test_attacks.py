@@ -124,15 +124,32 @@ def recover(robot: Start, gate: Gate) -> None:
     assert whole(one.into)["version"] == 2
 
 
-VARIABLES = (
-    *({name: "/x"} for name in ("LD_PRELOAD", "PATH", "PROMPT_COMMAND", "GAZEBO_PLUGIN_PATH", "A B", "A;rm")),
-    *({name: "/x"} for name in ("OPENSSL_CONF", "ZENOH_CONFIG_OVERRIDE", "ROS_MASTER_URI")),
-    *({"A": "1\n2"}, {"A": 7}, [1], "x"),
+DANGEROUS = (
+    *("LD_PRELOAD", "PATH", "PROMPT_COMMAND", "GAZEBO_PLUGIN_PATH"),
+    *("OPENSSL_CONF", "ZENOH_CONFIG_OVERRIDE", "ROS_MASTER_URI", "FLEETMAP_TOKEN"),
 )
 
 
-def test_variables_that_change_how_programs_run_are_refused(lagging: str, robot: Start, gate: Gate, keys: Keys) -> None:
-    for variables in VARIABLES:
+def test_variables_that_change_how_programs_run_are_left_out(
+    lagging: str, robot: Start, gate: Gate, keys: Keys
+) -> None:
+    gate.change = signed(keys, variables={**dict.fromkeys(DANGEROUS, "/x"), "FARM_NAME": "Riseholme"})
+    one = robot(server=gate.url)
+    assert one.good, one.lines
+    assert whole(one.into)["version"] == 2
+    text = (one.into / "current" / "environment.sh").read_text()
+    assert "export FARM_NAME=Riseholme\n" in text
+    assert not [name for name in DANGEROUS if name in text]
+    assert "/x" not in text
+    assert gate.statuses[-1]["state"] == "active"
+    assert all(name in gate.statuses[-1]["detail"] for name in DANGEROUS), gate.statuses[-1]
+
+
+INVALID_VARIABLES = ({"A B": "/x"}, {"A;rm": "/x"}, {"A": "1\n2"}, {"A": 7}, {"PATH": 7}, [1], [[1, "x"]], "x")
+
+
+def test_invalid_variables_are_refused(lagging: str, robot: Start, gate: Gate, keys: Keys) -> None:
+    for variables in INVALID_VARIABLES:
         gate.change = signed(keys, variables=variables)
         attacked(robot, gate, word="manifest")
     recover(robot, gate)

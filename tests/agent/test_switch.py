@@ -313,6 +313,49 @@ def test_state_of_an_older_agent_is_read(fake: Fake, robot: Robot, tmp_path: Pat
     assert state(one)["form"] == 2
 
 
+def put_dangerous_variable(one: One) -> Path:
+    """Make the installed map one of an older agent, whose list had not this variable. Return its folder."""
+    version = (one.into / "current").resolve()
+    body = json.loads((version / "manifest.json").read_text())
+    (version / "manifest.json").write_text(json.dumps({**body, "variables": {"ROS_DOMAIN_ID": "7", "FIELD_ID": "p1"}}))
+    (version / "environment.sh").write_text("export ROS_DOMAIN_ID=7\nexport FIELD_ID=p1\n")
+    return version
+
+
+def test_installed_map_with_dangerous_variable_is_held(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    assert robot(loads(taken)).once()
+    version = put_dangerous_variable(robot())
+    fake.put(B)
+    fake.instead = unavailable
+    assert not robot(loads(taken)).once()
+    text = (version / "environment.sh").read_text()
+    assert "ROS_DOMAIN_ID" not in text, "cleaned at the start, also without a server"
+    assert "export FIELD_ID=p1\n" in text
+    fake.instead = lambda _: False
+    one = robot(loads(taken))
+    assert not one.once()
+    assert "version 1 is restored" in one.detail
+    assert (one.into / "current").resolve() == version
+    assert taken.read_bytes() == A["kml/map.kml"]
+
+
+def test_dangerous_variable_of_an_earlier_map_is_left_out_after_rollback(
+    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert robot("true").once()
+    version = put_dangerous_variable(robot())
+    fake.put(B)
+    with monkeypatch.context() as patch:
+        patch.setattr(activation.Activation, "load", lambda _: activation.ACTIVE)  # power goes before the hooks run
+        robot("true").once()
+    (version / "environment.sh").write_text("export ROS_DOMAIN_ID=7\n")
+    one = robot("test $FLEETMAP_VERSION = 1")
+    assert not one.once()
+    assert (one.into / "current").resolve() == version
+    assert "ROS_DOMAIN_ID" not in (version / "environment.sh").read_text()
+
+
 def test_kill_at_random_moments_of_hooks_ends_consistently(fake: Fake, tmp_path: Path) -> None:
     into, taken, dice = tmp_path / "robot", tmp_path / "taken", random.Random(3)
     hook = f"sleep 0.1; {loads(taken)}; sleep 0.1"
