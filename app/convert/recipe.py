@@ -195,7 +195,9 @@ def available_layers(version: Version) -> AvailableLayers:
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
     drawn = frozenset(
-        e.key for e in entries if not e.provenance.is_edited and derive.ends_in_display_step(e.provenance.steps)
+        e.key
+        for e in entries
+        if not e.provenance.is_edited and derive.is_display_only(e.provenance.information, e.provenance.steps)
     )
     return AvailableLayers(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned, drawn)
 

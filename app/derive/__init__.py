@@ -149,10 +149,13 @@ def all_derivations() -> Mapping[str, Derivation]:
     return _registry.all()
 
 
-def ends_in_display_step(steps: Iterable[Mapping[str, Any]]) -> bool:
-    """Return whether provenance steps include a terminal derivation (``is_terminal``)."""
+def is_display_only(information: str, steps: Iterable[Mapping[str, Any]]) -> bool:
+    """Return whether a part with this provenance was derived for display only (``is_terminal``), so is no evidence.
+
+    A measured grid that was merged into such a one keeps its steps.
+    """
     derivations = all_derivations()
-    return any(
+    return information == "derived" and any(
         name in derivations and derivations[name].is_terminal for name in (str(step.get("step")) for step in steps)
     )
 

@@ -127,7 +127,8 @@ def _last_share(chain: Sequence[Step]) -> float:
 
 def _is_display_only(entry: PartEntry) -> bool:
     """Return whether a part was created for display only, so that it is no evidence."""
-    return not entry.provenance.is_edited and derive.ends_in_display_step(entry.provenance.steps)
+    provenance = entry.provenance
+    return not provenance.is_edited and derive.is_display_only(provenance.information, provenance.steps)
 
 
 def _steps(derivation: derive.Derivation, available: frozenset[Layer], without: frozenset[str]) -> tuple[Step, ...]:

@@ -239,7 +239,8 @@ def operation_for(
         old = store.content.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
             part = merge_grids(old, part, key.name, limits.pixels)
-            provenance = merge_provenance(entry.provenance, provenance)
+            # What was measured does not get stale with the inputs of what it was laid onto.
+            provenance = replace(merge_provenance(entry.provenance, provenance), inputs=())
         elif isinstance(part, Resources) and isinstance(old, Resources):
             part, provenance = Resources({**old.files, **part.files}), merge_provenance(entry.provenance, provenance)
     return Replace(key, part, provenance)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
+from tests.api import samples
 from tests.api.conftest import Api
 
 WALL, CLEAR, GREY = 0, 254, 205
@@ -69,6 +71,46 @@ def test_grey_is_unknown_by_the_thresholds_of_the_stored_grid(api: Api, bare: st
     api.upload(bare, saved_grid(stored, free=EARLIER))
     api.upload(bare, saved_grid(uploaded), mode="merge")
     assert written_pixels(api, bare).tolist() == [[WALL, WALL, GREY], [GREY, GREY, CLEAR]]
+
+
+def make_placeholder(api: Api, env: str) -> dict[str, Any]:
+    """Derive a grid without obstacles, in cells of 1 m, from a fence; returns its map.yaml."""
+    api.upload(env, {"datum.yaml": samples.DATUM})
+    api.post(f"environments/{env}/derivations", {"method": "location_to_occupancy", "parameters": {"resolution": 1.0}})
+    text = api.get(f"environments/{env}/versions/latest/maps/occupancy_grid/map.yaml").text
+    return dict(yaml.safe_load(text))
+
+
+def derive_voxels(api: Api, env: str) -> tuple[list[str], list[Any]]:
+    """Derive voxels from the grids; returns the names of their steps, and what is stale."""
+    api.post(f"environments/{env}/derivations", {"method": "occupancy_to_voxels"})
+    lines = api.get(f"environments/{env}/versions/latest/reports/octomap").json()["layers"]
+    steps = next(line["steps"] for line in lines if line["layer"] == "voxels")
+    return [step["step"] for step in steps], api.get(f"environments/{env}/versions/latest").json()["stale"]
+
+
+def test_grid_merged_onto_a_placeholder_is_used_by_derivations(api: Api, bare: str) -> None:
+    """The placeholder, derived from the fence, shows no obstacles; what a robot saw does, whatever the fence becomes."""
+    x, y, _ = make_placeholder(api, bare)["origin"]
+    seen = np.full((30, 30), CLEAR)
+    seen[:, 7] = WALL
+    api.upload(bare, saved_grid(seen, origin=(x + 2.0, y + 2.0)), mode="merge")
+    assert [step["step"] for step in occupancy_report(api, bare)["steps"]] == ["location_to_occupancy"]
+    assert np.count_nonzero(written_pixels(api, bare) == WALL) == 30
+    api.upload(bare, {"datum.yaml": samples.DATUM.replace(b"53.2690", b"53.2691")})
+    assert api.get(f"environments/{bare}/versions/latest").json()["stale"] == []
+    assert derive_voxels(api, bare) == (["occupancy_to_voxels"], [])
+
+
+def test_placeholder_merged_with_a_robots_grid_is_used_by_derivations(api: Api, bare: str) -> None:
+    make_placeholder(api, bare)
+    seen = np.full((30, 30), CLEAR)
+    seen[:, 7] = WALL
+    api.upload(bare, saved_grid(seen), grid="robot")
+    corners = [[[x, y], [x, y]] for x, y in ((0.0, 0.0), (9.0, 0.0), (0.0, 9.0))]
+    request = {"grids": ["map", "robot"], "pairs": {"robot": corners}, "drop": True}
+    api.post(f"environments/{bare}/alignments", {"merge": request})
+    assert derive_voxels(api, bare) == (["occupancy_to_voxels"], [])
 
 
 def generate_hall(api: Api, env: str) -> None:
