@@ -387,6 +387,7 @@ def is_geographic(crs: str) -> bool:
         raise Invalid(f"unknown CRS {_short(crs)!r}: use a code such as EPSG:32632") from error
 
 
+@lru_cache(maxsize=64)
 def _vertical_unit(crs: str) -> float:
     """Return the metres of one unit of height; 1 if the CRS has no vertical axis."""
     axes = CRS.from_user_input(crs).axis_info

@@ -14,7 +14,7 @@ from pyproj import CRS, Geod, Transformer
 from app.errors import Invalid, MissingDatum
 from app.model.features import NO_GEOMETRY, concatenate, features
 from app.model.frame import Datum
-from app.model.geodesy import LocalFrame, distance, local_frame, surface
+from app.model.geodesy import LocalFrame, crs_to_wgs84, distance, is_geographic, local_frame, surface
 
 WGS84 = Geod(ellps="WGS84")
 PLACES = [
@@ -147,6 +147,16 @@ def test_to_local_returns_infinite_points_without_error() -> None:
 def test_local_frames_are_cached() -> None:
     assert local_frame(Datum(1.0, 2.0)) is local_frame(Datum(1.0, 2.0))
     assert local_frame(Datum(1.0, 2.0)) is not local_frame(Datum(1.0, 2.0, 0.0, 1.0))
+
+
+def test_a_known_crs_is_not_parsed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parsing takes as long as converting thousands of points."""
+    points = np.array([[12.0, 53.0, 100.0]])
+    first = crs_to_wgs84("EPSG:4326+6360", points)
+    assert is_geographic("EPSG:4326")
+    monkeypatch.setattr("app.model.geodesy.CRS", None)
+    assert np.array_equal(crs_to_wgs84("EPSG:4326+6360", points), first)
+    assert is_geographic("EPSG:4326")
 
 
 def mixed() -> list[shapely.Geometry]:
