@@ -72,7 +72,9 @@ def resample(
             return _rotate_back(points, back)
         out = _rotate_back(between(source, target, points), back)
         if around_globe:  # points in a row that cross the antimeridian continue beyond ±180 degrees
-            out[:, 0] = np.unwrap(out[:, 0], period=360.0)
+            unwrapped = np.unwrap(out[:, 0], period=360.0)
+            if abs(unwrapped[-1] - unwrapped[0]) <= 180.0:  # else they are all around a pole
+                out[:, 0] = unwrapped
         return out
 
     height, width = picture.pixels.shape[:2]

@@ -108,6 +108,21 @@ def test_image_on_the_antimeridian_is_resampled_to_degrees_beyond_it(longitude: 
     assert default.pixels.shape[0] * default.pixels.shape[1] < 10_000, "about as many pixels as the image has"
 
 
+@pytest.mark.parametrize("crs", ["EPSG:3413", "EPSG:3031"])
+def test_image_around_a_pole_has_longitudes_of_the_globe(crs: str) -> None:
+    """The image is 160 × 120 km with the pole in its middle; before, its longitudes began at -540 degrees."""
+    forth = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    source = numbered(crs=crs, transform=(2000.0, 0.0, -80_000.0, 0.0, -2000.0, 60_000.0), nodata=0)
+    image = to_wgs84(source, method="nearest", resolution=0.05)
+    west, east = image.transform[2], image.transform[2] + 0.05 * image.pixels.shape[1]
+    assert -180.051 < west < -175.0
+    assert 175.0 < east < 180.051
+    expected, edge = truth(image, source, lambda p: np.column_stack(forth.transform(p[:, 0], p[:, 1])))
+    sure = edge > 1e-3
+    assert np.array_equal(image.pixels[..., 0][sure], expected[sure])
+    assert image.pixels.any()
+
+
 def test_resampled_plane_stays_plane() -> None:
     """On a plane of heights, values between pixels equal the plane to a millimetre."""
     rows, columns = np.mgrid[0:60, 0:80] + 0.5
