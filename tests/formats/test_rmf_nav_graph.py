@@ -234,6 +234,18 @@ def test_repeated_names_of_other_formats_give_way_to_ids() -> None:
     assert "2 names occur more than once: Dock, Hall;" in context.warnings[0].problem
 
 
+@pytest.mark.parametrize(("numbers", "names"), [((12, 13.5), ["12", "13.5"]), ((12, 12), ["a", "b"])])
+def test_numbers_are_names(numbers: tuple[float, float], names: list[str]) -> None:
+    named = zip("ab", numbers, strict=True)
+    rows: list[Any] = [(i, shapely.Point(n, 0), {"kind": "node", "name": n}) for i, n in named]
+    rows += [("a_b", shapely.LineString([(12, 0), (13, 0)]), {"kind": "edge", "source": "a", "target": "b"})]
+    layers = Layers({PartKey("topology", "L", "network"): features(rows, "local")})
+    graphs, _ = write(layers)
+    assert [v[2]["name"] for v in graphs["0.yaml"]["levels"]["L"]["vertices"]] == names
+    building = yaml.safe_load(formats.write(get_format("openrmf"), layers, WriteContext())["building.yaml"])
+    assert [v[3] for v in building["levels"]["L"]["vertices"]] == names
+
+
 def test_name_of_open_rmf_stays_where_another_format_repeats_it() -> None:
     layers, _ = read(
         "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {}]], lanes: [[0, 1, {}]]}}\n"

@@ -275,6 +275,8 @@ class VertexNames:
 def _vertex_name(i: str, p: Properties) -> str:
     """Return the name of a node's vertex, its id if it has none and comes from another format."""
     name = p.get("name")
+    if isinstance(name, (int, float)) and not isinstance(name, bool):
+        name = str(name)
     return name if isinstance(name, str) and name else "" if p.keys() & {BUILDING, NAV_GRAPH} else i
 
 

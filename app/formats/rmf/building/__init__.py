@@ -72,7 +72,7 @@ register(
         needs=LayerRequirements(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         write_options=common.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
-        version=4,
+        version=5,
         selection=Selection(common.choose_building),
         claims=Claims(priority=40, companions=companion_hook(_FILENAME)),
         traits=Traits(keeps_bends="nodes", has_title=True),

@@ -71,7 +71,7 @@ register(
         ),
         write_options=common.WriteOptions,
         extensions=(".yaml", ".yml"),
-        version=4,
+        version=5,
         selection=Selection(choose),
         claims=Claims(priority=30, sort=one_map_per_folder),
         traits=Traits(keeps_bends="nodes", has_title=True),
