@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -232,6 +233,37 @@ def test_repeated_names_of_other_formats_give_way_to_ids() -> None:
     names = [v[3] for level in ("L1", "L2") for v in building["levels"][level]["vertices"]]
     assert sorted(names) == ["Dock", "L1/lone", "L2/lone", "a", "b", "c"]
     assert "2 names occur more than once: Dock, Hall;" in context.warnings[0].problem
+
+
+@pytest.mark.parametrize(
+    ("levels", "names"),
+    [
+        ({"L": [("Hall", "Dock"), ("q", "Dock"), ("z", "Hall")]}, ["Hall#2", "q", "Hall"]),
+        ({"L": [("z", "Hall"), ("q", "Dock"), ("Hall", "Dock")]}, ["Hall", "q", "Hall#2"]),
+        ({"L1": [("n1", "Dock"), ("n2", "")], "L2": [("n1", "Dock"), ("n2", "")]}, ["n1", "n2", "n1#2", "n2#2"]),
+    ],
+)
+def test_ids_that_replace_names_are_unique(levels: dict[str, list[tuple[str, str]]], names: list[str]) -> None:
+    """An id may be the name of another node, and occur on other levels."""
+    parts = {}
+    for level, nodes in levels.items():
+        rows: list[Any] = [(i, shapely.Point(k, 0), {"kind": "node", "name": n}) for k, (i, n) in enumerate(nodes)]
+        for k, ((a, _), (b, _)) in enumerate(pairwise(nodes)):
+            line = shapely.LineString([(k, 0), (k + 1, 0)])
+            rows.append((f"e{k}", line, {"kind": "edge", "source": a, "target": b}))
+        parts[PartKey("topology", level, "network")] = features(rows, "local")
+    graphs, context = write(Layers(parts))
+    assert [v[2]["name"] for level in graphs["0.yaml"]["levels"].values() for v in level["vertices"]] == names
+    assert ["names occur more than once" in w.problem for w in context.warnings] == [True]
+    building = yaml.safe_load(formats.write(get_format("openrmf"), Layers(parts), WriteContext())["building.yaml"])
+    assert sorted(v[3] for level in building["levels"].values() for v in level["vertices"]) == sorted(names)
+
+
+def test_same_id_in_two_networks_of_a_level_becomes_two_names() -> None:
+    rows: list[Any] = [("n", shapely.Point(0, 0), {"kind": "node"})]
+    parts = {PartKey("topology", "L", name): features(rows, "local") for name in ("a", "b")}
+    building = yaml.safe_load(formats.write(get_format("openrmf"), Layers(parts), WriteContext())["building.yaml"])
+    assert [v[3] for v in building["levels"]["L"]["vertices"]] == ["n", "n#2"]
 
 
 @pytest.mark.parametrize(("numbers", "names"), [((12, 13.5), ["12", "13.5"]), ((12, 12), ["a", "b"])])

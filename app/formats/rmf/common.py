@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from app.errors import Problem, UnreadableFile
 from app.formats import WriteContext
 from app.formats._network import natural_sort_key, shorten_list
-from app.model.features import Features, Properties
+from app.model.features import Features, Properties, unique_ids
 from app.model.frame import MAX_METRES
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
@@ -28,6 +28,8 @@ from app.syntax import yaml
 
 BUILDING, NAV_GRAPH = "openrmf", "rmf_nav_graph"
 """Format families: keys of an item's source properties from buildings and from navigation graphs."""
+
+OPEN_RMF = (BUILDING, NAV_GRAPH)
 
 CABIN_HEIGHT = 2.5
 """Height of every lift cabin in rmf_building_map_tools, in metres."""
@@ -251,25 +253,36 @@ class WriteOptions:
 class VertexNames:
     """Names of vertices. Fleet adapters refuse a name that occurs twice; nodes of other formats have ids instead."""
 
-    def __init__(self, nodes: Iterable[tuple[str, Properties]]) -> None:
-        """nodes: (id, properties) of all nodes of a building or a graph."""
-        counts = Counter(_vertex_name(i, p) for i, p in nodes)
-        self._repeated = frozenset(name for name, count in counts.items() if name and count > 1)
-        self._replaced: set[str] = set()
+    def __init__(self, nodes: Iterable[tuple[Hashable, str, Properties]]) -> None:
+        """nodes: (key, id, properties) of all nodes of a building or a graph; ids repeat on other levels, keys do not.
 
-    def choose(self, i: str, p: Properties) -> str:
-        """Return the name of a node's vertex: its own or, if another has it and it is not Open-RMF's, its id."""
-        name = _vertex_name(i, p)
-        if name == i or name not in self._repeated or p.keys() & {BUILDING, NAV_GRAPH}:
-            return name
-        self._replaced.add(name)
-        return i
+        A name of Open-RMF's stays. Another stays if no other vertex has it, or on the first node whose id it is.
+        """
+        rows = [(key, i, _vertex_name(i, p), not p.keys().isdisjoint(OPEN_RMF)) for key, i, p in nodes]
+        counts = Counter(name for _, _, name, _ in rows)
+        kept = {name for _, _, name, own in rows if own or counts[name] == 1}
+        replaced: dict[Hashable, tuple[str, str]] = {}
+        for key, i, name, own in rows:
+            if own or counts[name] == 1:
+                continue
+            if name == i and name not in kept:
+                kept.add(name)
+            else:
+                replaced[key] = i, name
+        ids = unique_ids((i for i, _ in replaced.values()), kept)
+        self._ids = dict(zip(replaced, ids, strict=True))
+        self._replaced = sorted({name for _, name in replaced.values()})
+
+    def choose(self, key: Hashable, i: str, p: Properties) -> str:
+        """Return the name of a node's vertex: its own or, if another has it, its id or one made from it."""
+        return self._ids.get(key) or _vertex_name(i, p)
 
     def report(self, context: WriteContext, file: str, location: str) -> None:
         """Report the names that were not written."""
         if self._replaced:
-            problem = f"{len(self._replaced)} names occur more than once: {shorten_list(sorted(self._replaced))}"
-            context.warn(f"{problem}; their nodes' ids are written, as names must be unique", file=file, where=location)
+            problem = f"{len(self._replaced)} names occur more than once: {shorten_list(self._replaced)}"
+            ids = "their nodes' ids are written, with a number if they are taken"
+            context.warn(f"{problem}; {ids}, as names must be unique", file=file, where=location)
 
 
 def _vertex_name(i: str, p: Properties) -> str:
@@ -277,7 +290,7 @@ def _vertex_name(i: str, p: Properties) -> str:
     name = p.get("name")
     if isinstance(name, (int, float)) and not isinstance(name, bool):
         name = str(name)
-    return name if isinstance(name, str) and name else "" if p.keys() & {BUILDING, NAV_GRAPH} else i
+    return name if isinstance(name, str) and name else i if p.keys().isdisjoint(OPEN_RMF) else ""
 
 
 CHARGER = ("is_charger", "is_parking_spot", "is_holding_point")

@@ -21,7 +21,7 @@ of these kinds. ``properties.openrmf`` holds an item's position in its list (``i
 ``vertices``. The document's ``openrmf`` is ``{building, level, order, transform}``: the file's top level without levels
 and lifts, the level without its lists, its position in the file, and [scale, rotation, x, y] from pixels (y up) to
 metres. Geometry takes precedence: an item moved by an edit gets vertices at its new position. A node of another format
-is named by its name if no other vertex has it, else by its id.
+is named by its name if no other vertex has it, else by its id, with ``#2``, ``#3`` … if that is taken.
 """
 
 from __future__ import annotations

@@ -116,7 +116,13 @@ class _Writer:
         self.layers, self.context, self.storeys, self.system = layers, context, storeys, system
         self.options = context.options if isinstance(context.options, common.WriteOptions) else common.WriteOptions()
         self.robots = common.Robots(self.options, _iterate_nodes(storeys))
-        self.names = common.VertexNames((i, p) for _, i, p in _iterate_nodes(storeys))
+        self.names = common.VertexNames(
+            ((s.name, n, i), i, p)
+            for s in storeys
+            for n, part in enumerate(s.networks)
+            for i, p in zip(part.ids, part.properties, strict=True)
+            if p.get("kind") == "node"
+        )
         self.building = dict(building)
         self.resources = resources
         self.why = why
@@ -262,7 +268,7 @@ class _Writer:
         """Convert the nodes to vertices in source order, with each node id's vertex index."""
         elevation = float(self._elevation(storey))
         nodes: list[tuple[tuple[bool, int, int, str], str]] = []
-        for part in storey.networks:
+        for n, part in enumerate(storey.networks):
             point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
             node: NDArray[np.bool_] = np.array([p.get("kind") == "node" for p in part.properties], bool)
             self.dropped["nodes without a point"] += int((node & ~point).sum())
@@ -270,14 +276,13 @@ class _Writer:
             raw, _ = self._coordinates(part, indices, storey.name)
             z = shapely.get_z(part.geometry[indices])
             for k, position, high in zip(indices.tolist(), self._texts(raw), z.tolist(), strict=True):
-                p = part.properties[k]
+                i, p = part.ids[k], part.properties[k]
                 at = get_source_properties(p, NAME).get("index")
                 has_index = isinstance(at, int)
-                key = (not has_index, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
+                key = (not has_index, at if isinstance(at, int) else 0, len(i), i)
                 height = 0.0 if math.isnan(high) else high - elevation
-                row = self._vertex(
-                    part.ids[k], p, position, height, self.robots.vertex_properties(storey.name, part.ids[k])
-                )
+                name = self.names.choose((storey.name, n, i), i, p)
+                row = self._vertex(name, p, position, height, self.robots.vertex_properties(storey.name, i))
                 nodes.append((key, row))
         nodes.sort(key=lambda item: item[0])
         ids: dict[str, int] = {}
@@ -288,7 +293,10 @@ class _Writer:
                 old.setdefault(was, k)
         return _Vertices([row for _, row in nodes], old), ids
 
-    def _vertex(self, i: str, p: Properties, position: tuple[str, str], z: float, further: Mapping[str, Any]) -> str:
+    def _vertex(
+        self, new_name: str, p: Properties, position: tuple[str, str], z: float, further: Mapping[str, Any]
+    ) -> str:
+        """Return a vertex's row. new_name: for a node of another format. z: metres above the level."""
         source_members = get_source_properties(p, NAME)
         title = p.get("name")
         parameters = source_members.get("parameters")
@@ -299,7 +307,7 @@ class _Writer:
                 else title or ""
             )
         else:
-            name = self.names.choose(i, p)
+            name = new_name
             graph = mapping(get_source_properties(p, NAV_GRAPH).get("parameters"), "parameters")
             parameters = {
                 key: common.typed_parameter(value) for key, value in graph.items() if key not in ("name", "lift")

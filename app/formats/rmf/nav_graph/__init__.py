@@ -12,7 +12,8 @@ Canonical: the graphs of a directory are one network per level. A vertex that se
 node; ``properties.rmf_nav_graph`` holds its index in each graph (``graphs``) and its ``parameters``, an edge's
 ``graph``, ``index`` and ``parameters``. Doors and lifts are objects. The document's ``rmf_nav_graph`` holds the top
 level of each graph. A node of another format is named by its name if no other vertex of the graph has it, else by its
-id: fleet adapters refuse a repeated name. A graph whose vertices name lifts that no source describes has no ``lifts``.
+id, with ``#2``, ``#3`` … if that is taken: fleet adapters refuse a repeated name. A graph whose vertices name lifts
+that no source describes has no ``lifts``.
 """
 
 from __future__ import annotations

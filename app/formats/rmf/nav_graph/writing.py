@@ -329,7 +329,7 @@ class _Writer:
         out.write(f"{yaml.mapping(before, 0)}levels:\n".encode())
         orders = [_order(storey, graph) for storey in self.storeys]
         self.names = common.VertexNames(
-            (s.ids[k], s.nodes[k]) for s, order in zip(self.storeys, orders, strict=True) for k in order
+            ((s.name, k), s.ids[k], s.nodes[k]) for s, order in zip(self.storeys, orders, strict=True) for k in order
         )
         names: Counter[str] = Counter()
         lifts_of_vertices: set[str] = set()
@@ -414,7 +414,7 @@ class _Writer:
         else:
             self.lost["nodes' orientations"] += p.get("orientation") is not None
             self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
-            options = {"name": self.names.choose(storey.ids[k], p)}
+            options = {"name": self.names.choose((storey.name, k), storey.ids[k], p)}
         if storey.lifts[k] is not None:
             options["lift"] = storey.lifts[k]
         return options
