@@ -114,6 +114,12 @@ class Table:
         """Return the key of a row's part."""
         return self.parts[bisect_right(self.parts, row, key=itemgetter(0)) - 1][1]
 
+    def _spans(self) -> Iterator[tuple[PartKey, int, int]]:
+        """Yield each part's key, first row and the row after its last; nothing for a table without rows."""
+        ends = [*(start for start, _ in self.parts[1:]), len(self)]
+        for (start, key), end in zip(self.parts, ends, strict=False):  # without rows there is no part
+            yield key, start, end
+
     def position(self, row: int) -> Position:
         """Return the position of a row in the order of the collection."""
         key = self.part_of(row)
@@ -125,8 +131,7 @@ class Table:
 
     def all_properties(self) -> Iterator[dict[str, Any]]:
         """Yield the properties of each row, with its place."""
-        ends = [*(start for start, _ in self.parts[1:]), len(self)]
-        for (start, key), end in zip(self.parts, ends, strict=True):
+        for key, start, end in self._spans():
             for packed in self.packed[start:end]:
                 yield with_place(ormsgpack.unpackb(packed), key)
 
@@ -147,8 +152,7 @@ class Table:
     def row_of(self, feature: str) -> int | None:
         """Return the row of an id, which may be qualified in any case; None if there is none."""
         row = self.rows.get(feature)
-        ends = [*(start for start, _ in self.parts[1:]), len(self)]
-        for (start, key), end in zip(self.parts, ends, strict=True):
+        for key, start, end in self._spans():
             item = unqualified(feature, key) if row is None else None
             if item is not None and item in self.source_ids[start:end]:
                 row = self.source_ids.index(item, start, end)

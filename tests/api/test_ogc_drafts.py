@@ -70,6 +70,32 @@ def test_draft_lists_empty_collections_and_takes_their_first_feature(api: Api, g
     assert api.get(f"{at}").json()["extent"]["spatial"]["bbox"]
 
 
+def test_items_of_an_empty_collection_are_not_found(api: Api, gis: Gis) -> None:
+    at = f"{gis.at}/collections/zones/items/pond"
+
+    def refuse_all() -> None:
+        body = {"type": "Feature", "geometry": None, "properties": {}}
+        api.get(at, 404)
+        for headers in ({}, {"if-match": '"a"'}):
+            api("PUT", at, 404, json=body, headers={**GEOJSON, **headers})
+            gis.patch("zones", "pond", 404, headers=headers, properties={"a": 1})
+            api("DELETE", at, 404, headers=headers)
+
+    refuse_all()
+    assert gis.drafts() == []
+    ring = [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [0.0, 0.0]]
+    gis.add("zones", {"type": "Polygon", "coordinates": [ring]}, kind="keepout", name="pond")
+    api("DELETE", at, 204)
+    refuse_all()
+
+
+def test_last_feature_that_leaves_its_collection_is_written(gis: Gis) -> None:
+    gis.add("objects-points", point(1, 1), id="oak", kind="tree")
+    assert "etag" not in gis.patch("objects-points", "oak", geometry=None).headers
+    assert gis.item("objects-other", "oak")["geometry"] is None
+    gis.api.get(f"{gis.at}/collections/objects-points/items/oak", 404)
+
+
 OLD, NEW = "Mozilla/5.0 QGIS/34015/Linux", "Mozilla/5.0 QGIS/34400/Linux"
 
 
