@@ -1,6 +1,6 @@
 /** Closures: both directions of a street as one, what they are called, where they are, which were in force. No DOM. */
 import { batch } from "@preact/signals";
-import { api, apiPath, ask, request, requestJson } from "../../api/client";
+import { api, apiPath, asApiError, ask, request, requestJson } from "../../api/client";
 import type { Feature, Geometry } from "../../map/features";
 import { nameOf } from "../../map/features";
 import type { Frame } from "../../map/frame";
@@ -176,17 +176,26 @@ export async function close(store: FleetStore, wanted: NewClosure): Promise<Over
     : (wanted.edges ?? []).map((edge) => [edge, { ...common, edge }]);
   for (const [key, body] of bodies) {
     const reported = done.get(key);
-    const overlay = reported
-      ? await patchEnd(store, reported.id, expires)
-      : await requestJson<Overlay>(apiPath(store.site.path("overlays")), {
-          method: "POST",
-          headers: { "content-type": "application/json" },
-          body: JSON.stringify(body),
-        });
+    const moved = reported ? await patchEnd(store, reported.id, expires).catch(nullIfOver) : null;
+    const overlay = moved ?? (await report(store, body));
     done.set(key, overlay);
     store.putOverlay(overlay);
   }
   return [...done.values()];
+}
+
+function report(store: FleetStore, body: object): Promise<Overlay> {
+  return requestJson<Overlay>(apiPath(store.site.path("overlays")), {
+    method: "POST",
+    headers: { "content-type": "application/json" },
+    body: JSON.stringify(body),
+  });
+}
+
+/** For a closure that has ended, or is no longer stored: its end cannot be changed. Other errors are thrown. */
+function nullIfOver(error: unknown): null {
+  if ([404, 409].includes(asApiError(error).status)) return null;
+  throw error;
 }
 
 interface LoggedEvent {
