@@ -51,6 +51,7 @@ export function Review({ desk }: { desk: Desk }) {
       if (kept === "conflict") return;
       editor.discard();
       close();
+      if (kept === "nothing left") return notify("No draft was made: you have no changes to the newest version");
       notify(`Kept as the draft ${kept.name}`, { action: { label: "Drafts", run: () => go({ view: "history" }) } });
     });
   const commit = (id: string): Promise<void> =>

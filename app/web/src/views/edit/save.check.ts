@@ -153,10 +153,25 @@ async function checkKeptAsDraft(): Promise<void> {
     return { body: { id: `d${sent.length}`, base: 2, name: "draft 1" } };
   });
   const kept = await saveAsDraft(editor, "", () => undefined);
-  require(kept !== "conflict", "different properties are no conflict");
+  require(typeof kept === "object", "different properties are no conflict");
   require(String(sent) ===
     "POST drafts,DELETE drafts/d1,POST drafts,POST drafts/d3/edits", `the draft is made again after the merge: ${String(sent)}`);
   require(edits.includes("0.3") && edits.includes("Gate"), `the properties of both are kept: ${edits}`);
+}
+
+/** Others have saved the same in the meantime: the server refuses edits without changes. */
+async function checkNothingLeft(): Promise<void> {
+  const site = siteOf([node("a", 0), node("b", 10)]);
+  const editor = await open(site);
+  editor.run(operations.setProperty(editor.draft, [node("a", 0)], "name", "Gate"));
+  site.refresh = async () => saveOfBen(site, [node("a", 0, { name: "Gate" }), node("b", 10)]);
+  const sent: string[] = [];
+  answerWith(async (request) => {
+    sent.push(`${request.method} ${new URL(request.url).pathname.split("/yard/")[1]}`);
+    return { body: { id: "d", base: 2, name: "draft 1" } };
+  });
+  require((await saveAsDraft(editor, "", () => undefined)) === "nothing left", "no draft is kept");
+  require(String(sent) === "POST drafts,DELETE drafts/d", `no edits are sent, no draft stays: ${String(sent)}`);
 }
 
 /** What I have changed and changed back is theirs. */
@@ -185,6 +200,7 @@ async function checkHistoryStays(): Promise<void> {
 await checkChangedBack();
 await checkHistoryStays();
 await checkKeptAsDraft();
+await checkNothingLeft();
 await checkRestoredElsewhere();
 await checkMergedElsewhere();
 await checkDeletedElsewhere();

@@ -86,10 +86,16 @@ export async function rebaseDraft(editor: Editor, draft: string, prefer?: Prefer
 
 /** Stores the changes as a draft on the server, to go on with on another machine. Throws ApiError.
  *
- * The server's draft begins with the newest version; the changes are merged with it first. */
-export async function saveAsDraft(editor: Editor, name: string, resume: () => void): Promise<ServerDraft | "conflict"> {
+ * The server's draft begins with the newest version; the changes are merged with it first. Nothing is left of them if
+ * others have saved the same, or theirs was chosen at all conflicts. */
+export async function saveAsDraft(
+  editor: Editor,
+  name: string,
+  resume: () => void,
+): Promise<ServerDraft | "conflict" | "nothing left"> {
   const drafts = editor.site.path("drafts");
   for (let round = 0; ; round++) {
+    if (editor.count.peek() === 0) return "nothing left";
     const made = await post<ServerDraft>(apiPath(drafts), name ? { name } : {});
     const remove = () => request(apiPath([...drafts, made.id]), { method: "DELETE" }).catch(() => undefined);
     if (made.base !== editor.base.peek()) {
