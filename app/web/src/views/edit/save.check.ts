@@ -174,6 +174,21 @@ async function checkNothingLeft(): Promise<void> {
   require(String(sent) === "POST drafts,DELETE drafts/d", `no edits are sent, no draft stays: ${String(sent)}`);
 }
 
+/** Theirs is chosen at all conflicts, and the save goes on. */
+async function checkAllTheirs(): Promise<void> {
+  const site = siteOf([node("a", 0), node("b", 10)]);
+  const editor = await open(site);
+  move(editor, A, 1);
+  saveOfBen(site, [node("a", 2), node("b", 10)]);
+  require(!(await editor.head.merge(null)), "the same node is a conflict");
+  const { pending } = editor.head;
+  for (const conflict of pending.value?.merge.conflicts ?? []) editor.head.choose(conflict, "theirs");
+  if (pending.value) editor.head.finish(pending.value);
+  answerWith(async () => ({ status: 422, body: { status: 422, detail: "no changes" } }));
+  const saved = await save(editor, () => undefined).catch(() => null);
+  require(saved !== null && saved !== "conflict" && saved.number === 2, "nothing is sent: version 2 has all");
+}
+
 /** What I have changed and changed back is theirs. */
 async function checkChangedBack(): Promise<void> {
   const site = siteOf([node("a", 0), node("b", 10)]);
@@ -201,6 +216,7 @@ await checkChangedBack();
 await checkHistoryStays();
 await checkKeptAsDraft();
 await checkNothingLeft();
+await checkAllTheirs();
 await checkRestoredElsewhere();
 await checkMergedElsewhere();
 await checkDeletedElsewhere();

@@ -17,6 +17,8 @@ const MAX_ROUNDS = 5;
  * Throws ApiError. `resume` is called when conflicts that hold it up are decided. */
 export async function save(editor: Editor, resume: () => void): Promise<Saved> {
   for (let round = 0; ; round++) {
+    // Others have saved the same, or theirs was chosen at all conflicts.
+    if (editor.count.peek() === 0) return { number: editor.target.number ?? 0, warnings: 0 };
     try {
       const saved = await (editor.target.draft === null ? send(editor) : sendToDraft(editor, editor.target.draft));
       editor.saved(saved.number);
@@ -25,7 +27,6 @@ export async function save(editor: Editor, resume: () => void): Promise<Saved> {
     } catch (error) {
       if (asApiError(error).status !== 412 || round >= MAX_ROUNDS) throw error;
       if (!(await mergeNewest(editor, resume, error))) return "conflict";
-      if (editor.count.peek() === 0) return { number: editor.target.number ?? 0, warnings: 0 }; // others saved the same
     }
   }
 }
