@@ -41,8 +41,9 @@ export function whenProblem(when: When): string | null {
   return Number(when.window) > 0 ? null : "Set the minutes to watch for failures.";
 }
 
+/** Shows a share from 0 to 1 with up to two decimals: 0.995 is not all, and 0.004 not none. */
 export function percent(value: number): string {
-  return `${Math.round(value * 100)} %`;
+  return `${Number((value * 100).toFixed(2))} %`;
 }
 
 export function exactTime(time: string): string {
