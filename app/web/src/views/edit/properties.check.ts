@@ -15,3 +15,6 @@ for (const [name, text, value] of [
   require(same(fromText(name, text), value), `${name} typed as ${text}`);
   require(toText(name, value) === text, `${name} shown as ${text}`);
 }
+
+// Names of uploaded maps may have spaces at their ends: what is shown is the name, not a text in quotes.
+require(toText("name", " Gate 2 ") === " Gate 2 ", "a name is shown as it is");

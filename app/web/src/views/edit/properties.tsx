@@ -112,8 +112,11 @@ function NewProperty({ set }: { set: (name: string, value: unknown) => void }) {
   );
 }
 
+/** The text from which `fromText` reads a value, but for spaces at the ends of names. */
 export function toText(name: string, value: unknown): string {
-  return typeof value === "string" && fromText(name, value) === value ? value : JSON.stringify(value);
+  return typeof value === "string" && (name === "name" || fromText(name, value) === value)
+    ? value
+    : JSON.stringify(value);
 }
 
 /** Reads JSON; anything else is a text, and so is what people call something. */
