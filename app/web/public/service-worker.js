@@ -3,6 +3,7 @@
 const SHELL = "shell-1";
 const MAPS = "maps-1";
 const MAX_ENTRIES = 3000;
+const LONGEST_SILENCE = 10_000; // milliseconds
 const KEPT = /^\/api\/v1\/(session$|environments(\/|$)|robots$|formats$)/;
 const NOT_KEPT = /\/versions\/[^/]+\/(maps\/[^/]+|sources\/|manifest|reports\/)/;
 
@@ -41,7 +42,7 @@ async function fromCache(request) {
 async function fromServer(request, name, key) {
   const response = await fetch(request).catch((error) => error);
   const isResponse = response instanceof Response;
-  if (isResponse && !isOfProxy(response)) {
+  if (isResponse && !(await isSilent(response))) {
     if (response.ok) void keep(name, key, response.clone());
     return response;
   }
@@ -53,9 +54,16 @@ async function fromServer(request, name, key) {
   return new Response(hit.body, { status: hit.status, headers });
 }
 
-// Whether a proxy says that the server does not answer: errors of the server itself are problem documents.
-function isOfProxy({ status, headers }) {
-  return [502, 503, 504].includes(status) && !headers.get("content-type")?.startsWith("application/problem+json");
+// As isSilent of src/api/client.ts: whether a proxy says that the server does not answer, not only that it was slow.
+async function isSilent({ status, headers }) {
+  const isOfProxy = !headers.get("content-type")?.startsWith("application/problem+json");
+  if (![502, 503, 504].includes(status) || !isOfProxy) return false;
+  if (status !== 504) return true;
+  const signal = AbortSignal.timeout(LONGEST_SILENCE);
+  return fetch("/healthz", { cache: "no-store", signal }).then(
+    ({ ok }) => !ok,
+    () => true,
+  );
 }
 
 async function keep(name, key, response) {

@@ -24,6 +24,7 @@ export const unauthenticated = signal(0);
 export const returns = signal(0);
 
 const ASK_AGAIN = 3000;
+const LONGEST_SILENCE = 10_000; // milliseconds
 
 let wasOnline = true;
 
@@ -35,15 +36,19 @@ effect(() => {
   }
   wasOnline = false;
   const timer = setInterval(() => {
-    fetch("/healthz", { cache: "no-store" }).then(
-      (response) => {
-        if (response.ok) online.value = true;
-      },
-      () => undefined,
-    );
+    void doesAnswer().then((isBack) => {
+      if (isBack) online.value = true;
+    });
   }, ASK_AGAIN);
   return () => clearInterval(timer);
 });
+
+function doesAnswer(signal?: AbortSignal): Promise<boolean> {
+  return fetch("/healthz", { cache: "no-store", signal }).then(
+    ({ ok }) => ok,
+    () => false,
+  );
+}
 
 export const api = createClient<paths>({ credentials: "same-origin", fetch: watchedFetch });
 
@@ -110,9 +115,12 @@ export function isAbort(error: unknown): boolean {
   return error instanceof DOMException && error.name === "AbortError";
 }
 
-/** Whether a proxy says that the server does not answer: errors of the server itself are problem documents. */
-export function isOfProxy(status: number, mediaType: string | null): boolean {
-  return [502, 503, 504].includes(status) && !mediaType?.startsWith("application/problem+json");
+/** Whether a proxy says that the server does not answer: errors of the server itself are problem documents.
+ *
+ * A proxy also gives up single slow requests (504) of a server that answers others. */
+export async function isSilent(status: number, mediaType: string | null): Promise<boolean> {
+  if (![502, 503, 504].includes(status) || mediaType?.startsWith("application/problem+json")) return false;
+  return status !== 504 || !(await doesAnswer(AbortSignal.timeout(LONGEST_SILENCE)));
 }
 
 /** Counts a 401 response, unless a session began after its request was sent. since: `returns` at that time. */
@@ -126,7 +134,7 @@ async function watchedFetch(input: Request): Promise<Response> {
     if (isAbort(error)) throw error;
     return null;
   });
-  if (!response || isOfProxy(response.status, response.headers.get("content-type"))) {
+  if (!response || (await isSilent(response.status, response.headers.get("content-type")))) {
     online.value = false;
     throw ApiError.offline();
   }
@@ -138,5 +146,7 @@ async function watchedFetch(input: Request): Promise<Response> {
 export function asProblem(body: unknown, response: { status: number; statusText: string }): Problem {
   if (typeof body === "object" && body !== null && "detail" in body) return body as Problem;
   const text = response.statusText || `HTTP status ${response.status}`;
-  return { type: "about:blank", title: text, status: response.status, detail: text };
+  const detail =
+    response.status === 504 ? "it took longer than the proxy waits; the server may still be at work" : text;
+  return { type: "about:blank", title: text, status: response.status, detail };
 }

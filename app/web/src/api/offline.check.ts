@@ -1,14 +1,23 @@
-/** A proxy that answers in the server's place counts as no answer (run by tests/web/test_modules.py). */
+/** A proxy that answers in the server's place counts as no answer, but not if one request was too slow for it.
+ *
+ * Run by tests/web/test_modules.py. */
 import { listeners, require } from "../in-node";
 import "../../public/service-worker.js";
-import { asApiError, online, request } from "./client";
+import { asApiError, online, request, returns } from "./client";
+import { sendForm } from "./upload";
 
 const ENVIRONMENTS = "http://page/api/v1/environments";
 
 /** What the server or the proxy before it answers; null: the connection fails. */
 let answer: (() => Response) | null = null;
 
-globalThis.fetch = async () => {
+/** Whether `/healthz` answers. */
+let isAlive = false;
+let requests = 0;
+
+globalThis.fetch = async (input) => {
+  if (input === "/healthz") return new Response("", { status: isAlive ? 200 : 504 });
+  requests += 1;
   if (!answer) throw new TypeError("no connection");
   return answer();
 };
@@ -23,6 +32,7 @@ Object.assign(globalThis, { caches: { open: async () => cache } });
 
 const ofServer = () => new Response("content");
 const ofProxy = () => new Response("", { status: 502 });
+const tooSlow = () => new Response("<html>", { status: 504, headers: { "content-type": "text/html" } });
 const overloaded = () =>
   new Response('{"status": 503, "detail": "busy"}', {
     status: 503,
@@ -44,16 +54,19 @@ async function checkWorker(): Promise<void> {
   answer = ofServer;
   await ask(url);
   while (!kept.has(url)) await new Promise((resolve) => setTimeout(resolve));
-  for (const failing of [null, ofProxy]) {
+  for (const failing of [null, ofProxy, tooSlow]) {
     answer = failing;
     const response = await ask(url);
     require(response?.headers.get("fleetmap-offline") === "1", `kept is read at ${failing?.name}`);
     require((await response.text()) === "content", "with its content");
   }
+  answer = ofProxy;
   require((await ask(`${url}2`))?.status === 502, "what is not kept is the proxy's error");
   answer = overloaded;
   require((await ask(url))?.status === 503, "the server's own error is shown");
-  answer = null;
+  [answer, isAlive] = [tooSlow, true];
+  require((await ask(url))?.status === 504, "a server that answers others is not away");
+  [answer, isAlive] = [null, false];
   const failure = await ask(`${url}2`)?.catch((error) => error);
   require(failure instanceof TypeError, "without a connection and what is kept it fails");
 }
@@ -71,7 +84,7 @@ function checkKept(): void {
 
 async function checkPage(): Promise<void> {
   const problemOf = async () => asApiError(await request("/api/v1/environments").catch((error) => error));
-  for (const failing of [null, ofProxy]) {
+  for (const failing of [null, ofProxy, tooSlow]) {
     answer = failing;
     require((await problemOf()).isOffline && !online.value, `the server does not answer at ${failing?.name}`);
     answer = overloaded;
@@ -79,6 +92,36 @@ async function checkPage(): Promise<void> {
   }
 }
 
+/** Were it taken as silence, the page would load all again when the server answers: the slow request, too, without end. */
+async function checkSlow(): Promise<void> {
+  [answer, isAlive, requests] = [tooSlow, true, 0];
+  const before = returns.value;
+  const problem = asApiError(await request("/api/v1/environments").catch((error) => error));
+  require(problem.status === 504 && online.value, `a slow request fails alone: ${problem.status}`);
+  require(requests === 1 && returns.value === before, "and is not repeated");
+  require(problem.message.includes("may still be at work"), problem.message);
+}
+
+async function checkSlowUpload(): Promise<void> {
+  class SlowCall {
+    upload = {};
+    status = 504;
+    statusText = "Gateway Time-out";
+    onload = (): void => undefined;
+    open = (): void => undefined;
+    getResponseHeader = () => "text/html";
+    send = () => this.onload();
+  }
+  Object.assign(globalThis, { XMLHttpRequest: SlowCall });
+  const problemOf = async () => asApiError(await sendForm("/api/v1/uploads", new FormData()).catch((error) => error));
+  isAlive = false;
+  require((await problemOf()).isOffline && !online.value, "the server is away");
+  isAlive = true;
+  require((await problemOf()).status === 504 && online.value, "an upload that takes long is not sent again by itself");
+}
+
 await checkWorker();
 checkKept();
 await checkPage();
+await checkSlow();
+await checkSlowUpload();

@@ -1,5 +1,5 @@
 /** Uploads with progress, which `fetch` does not report. */
-import { ApiError, asProblem, countRefusal, isOfProxy, online, returns } from "./client";
+import { ApiError, asProblem, countRefusal, isSilent, online, returns } from "./client";
 
 interface SendOptions {
   headers?: Record<string, string>;
@@ -25,8 +25,8 @@ export function sendForm<T>(path: string, form: FormData, { headers, signal, onP
       reject(ApiError.offline());
     };
     call.onerror = fail;
-    call.onload = () => {
-      if (isOfProxy(call.status, call.getResponseHeader("content-type"))) return fail();
+    call.onload = async () => {
+      if (await isSilent(call.status, call.getResponseHeader("content-type"))) return fail();
       countRefusal(call.status, since);
       online.value = true;
       if (call.status >= 200 && call.status < 300) resolve(call.response as T);
