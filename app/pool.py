@@ -8,13 +8,10 @@ memory. The server itself is never forked, since it has native threads. Workers 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib
-import io
 import logging
 import multiprocessing
 import os
-import pickle
 import queue
 import resource
 import threading
@@ -22,13 +19,12 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from enum import Enum
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from app import progress
+from app import answers, progress
 from app.errors import FleetMapError, TooLarge, Unavailable
 from app.heap import release_free_memory
 from app.progress import Progress
@@ -49,40 +45,11 @@ IDLE_SECONDS = 1.0
 CANCEL_POLL_SECONDS = 0.2
 """Seconds between two checks of a queued job for its cancellation."""
 
-_VALUE_TYPES = {
-    "builtins": frozenset({"bytearray", "complex", "frozenset", "range", "set", "slice", "bytes", "RuntimeError"}),
-    "collections": frozenset({"Counter", "OrderedDict"}),
-    "datetime": frozenset({"date", "datetime", "time", "timedelta", "timezone"}),
-    "numpy": frozenset({"dtype", "ndarray"}),
-    **dict.fromkeys(("numpy._core.multiarray", "numpy.core.multiarray"), frozenset({"_reconstruct", "scalar"})),
-    **dict.fromkeys(("numpy._core.numeric", "numpy.core.numeric"), frozenset({"_frombuffer"})),
-}
-"""Module -> names that an answer may have besides app's dataclasses, named tuples, texts, enumerations and errors."""
-
 
 def preload_in_background(warm: tuple[str, ...] = PRELOADED_MODULES) -> None:
     """Start the process that workers are forked from, without waiting for its imports."""
     _processes.set_forkserver_preload(list(warm))
     forkserver.ensure_running()
-
-
-class _AnswerReader(pickle.Unpickler):
-    """Reads what a worker sends, which a hostile file may have taken over: values, and nothing that does something."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return a type of values. Raises UnpicklingError for any other."""
-        if name in _VALUE_TYPES.get(module, ()):
-            return super().find_class(module, name)
-        if module.startswith("app.") and not module.endswith("__main__"):
-            kind = super().find_class(module, name)
-            if isinstance(kind, type) and kind.__module__ == module and _is_of_values(kind):
-                return kind
-        log.error("pool: a worker sent %s.%s, which is no type of values; its answer is refused", module, name)
-        raise pickle.UnpicklingError(f"a worker sent {module}.{name}, which is no type of values")
-
-
-def _is_of_values(kind: type) -> bool:
-    return dataclasses.is_dataclass(kind) or issubclass(kind, FleetMapError | tuple | str | Enum)
 
 
 class WorkerDied(FleetMapError):
@@ -235,9 +202,9 @@ class Pool:
                 self._idle.put(worker if healthy else None)
         finally:
             self._slots.release()
-        if not ok:
-            raise value
-        return value
+        if ok:
+            return value
+        raise value if isinstance(value, FleetMapError) else RuntimeError(value)
 
     def _turn(self, stop: CancelHandle | None) -> _Worker | None:
         """Wait for a worker; None: the caller must start one."""
@@ -332,7 +299,7 @@ def _call_worker(
         while True:
             if not worker.pipe.poll(max(0.0, end - time.monotonic())):
                 raise WorkerDied(f"the time limit of {seconds:g} seconds was exceeded")
-            ok, value = _AnswerReader(io.BytesIO(worker.pipe.recv_bytes())).load()
+            ok, value = answers.loads(worker.pipe.recv_bytes())
             if ok is not None:
                 break
             if note is not None:
@@ -362,6 +329,10 @@ def _work(
     threading.Thread(target=_die_with_parent, daemon=True).start()
     for name in warm:
         importlib.import_module(name)
+
+    def send(answer: tuple[bool | None, Any]) -> None:
+        pipe.send_bytes(answers.dumps(answer))
+
     while True:
         try:
             if not pipe.poll(IDLE_SECONDS):
@@ -373,7 +344,7 @@ def _work(
             target: Any = importlib.import_module(module)
             for part in function.split("."):
                 target = getattr(target, part)
-            with progress.sent_to(lambda one: pipe.send((None, (one.fraction, one.step)))):
+            with progress.sent_to(lambda one: send((None, (one.fraction, one.step)))):
                 answer = (True, target(*args))
         except MemoryError:
             answer = (False, _no_memory())
@@ -381,18 +352,18 @@ def _work(
             answer = (False, _as_ours(error))
         except Exception as error:  # noqa: BLE001  a bug: send the parent its traceback, for the log
             trace = "".join(traceback.format_exception(error))
-            answer = (False, RuntimeError(f"{type(error).__name__} in a worker\n{trace}"))
+            answer = (False, f"{type(error).__name__} in a worker\n{trace}")
         try:
-            pipe.send(answer)
+            send(answer)
         except (OSError, BrokenPipeError):
             return
         except MemoryError:
             answer = (False, None)  # release the result before anything else is allocated
             with contextlib.suppress(OSError):
-                pipe.send((False, _no_memory()))
+                send((False, _no_memory()))
         except Exception as error:  # noqa: BLE001  a result that cannot be pickled is a bug, too
             with contextlib.suppress(OSError):
-                pipe.send((False, RuntimeError(f"sending a worker's result failed: {error}")))
+                send((False, f"sending a worker's result failed: {error}"))
 
 
 def _as_ours(error: FleetMapError) -> FleetMapError:

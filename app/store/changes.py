@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NoReturn
 
 from app.model.features import Features
 from app.model.frame import Datum, Level
@@ -33,8 +33,8 @@ class Keep(enum.Enum):
 
     KEEP = "keep"
 
-    def __reduce_ex__(self, _: object) -> tuple[type[Keep], tuple[str]]:
-        return type(self), (self.value,)  # Python 3.11 would call getattr, which no answer of a worker may do
+    def __setstate__(self, _: object) -> NoReturn:
+        raise TypeError("a sentinel never changes")  # what app.answers requires of an enumeration
 
 
 KEEP: Final = Keep.KEEP
