@@ -102,7 +102,8 @@ MAX_SPACING = 15.0
 class Row:
     """Row at a distance v across the rows' direction, from low to high along it, in metres.
 
-    fill: share of its length that has plants, up to 1. width: of its plants, in metres.
+    fill: share of its length that has plants, up to 1. width: of its plants, in metres. pieces: number of lines in
+    which it is drawn.
     """
 
     v: float
@@ -110,6 +111,7 @@ class Row:
     high: float
     fill: float = 1.0
     width: float = 0.0
+    pieces: int = 1
 
     @property
     def length(self) -> float:

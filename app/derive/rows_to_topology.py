@@ -29,9 +29,17 @@ MAX_NODES = 200_000
 PARALLEL = 10.0
 """Maximum difference of rows of one field in direction, in degrees."""
 
+ONE_LINE = 0.5
+"""Distance across, in metres, below which pieces end to end may be one row."""
+
 Item = tuple[str, Any, dict[str, Any]]
 Drawn = tuple[NDArray[np.float64], Mapping[str, Any]]
-"""Positions [n, 2] of a drawn row, and its properties."""
+"""Positions [n, 2] of a line of a drawn row, and its properties."""
+
+DrawnRow = list[Drawn]
+"""Pieces of a row."""
+
+_ALONE = "no row of their direction lies beside them"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,16 +59,16 @@ class Parameters:
     node_spacing: float = parameter(3.0, "distance between two nodes of an aisle", minimum=1.0, maximum=100.0, unit="m")
 
 
-@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}), version=3)
+@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=4.0, also=frozenset({"occupancy"}), version=4)
 def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNotes) -> Layers:
     """Network of the aisles between rows: nodes along each aisle, at its ends and in the headlands.
 
     Rows are lines of kind ``row`` or ``tree_row``: from ``imagery_to_rows`` and ``occupancy_to_rows``, or drawn. Nodes
     are named as in Riseholme's polytunnels: ``r1.5-ca`` in the headland, ``-cb`` at the row's end, ``-c0`` … between,
     ``-cy`` and ``-cz`` at the other end. Edges along a row have the action ``row_traversal``, others ``row_change``.
-    Rows that lie end to end are fields of their own; names of several fields begin with ``f1-``, ``f2-`` … Edges that
-    meet occupied cells of a stored grid ``map`` are left out. Raises MissingLayer if there are no rows, CannotConvert
-    if the robot fits between none.
+    Rows that lie end to end are fields of their own, or pieces of one row if the same row lies beside them. Names of
+    several fields begin with ``f1-``, ``f2-`` … Edges that meet occupied cells of a stored grid ``map`` are left out.
+    Raises MissingLayer if there are no rows, CannotConvert if the robot fits between none.
     """
     parts: dict[PartKey, Part] = {}
     by_level: dict[str, list[Features]] = {}
@@ -112,29 +120,27 @@ def _fields(drawn: Features, layers: Layers, notes: DerivationNotes) -> list[Row
         near = (k for k in groups if isinstance(k, float) and abs((k - angle + 90) % 180 - 90) <= PARALLEL)
         group = name if isinstance(name, int | str) and not isinstance(name, bool) else next(near, float(angle))
         groups.setdefault(group, []).append((line, properties))
-    blocks = [block for rows in groups.values() for block in _blocks(rows)]
-    notes.drop("rows", sum(len(block) == 1 for block in blocks), "no row of their direction lies beside them")
+    blocks: list[list[DrawnRow]] = []
+    for rows in groups.values():
+        split, divided = _blocks(rows)
+        blocks.extend(split)
+        if divided:
+            notes.warn("fields with a row beside rows of another field are not connected: add edges between them")
+    notes.drop("rows", sum(len(row) for block in blocks if len(block) == 1 for row in block), _ALONE)
     return [_row_field(block) for block in blocks if len(block) > 1]
 
 
-def _blocks(rows: list[Drawn]) -> list[list[Drawn]]:
+def _blocks(drawn: list[Drawn]) -> tuple[list[list[DrawnRow]], bool]:
     """Split parallel rows that do not lie side by side, such as fields end to end.
 
     Two rows are neighbours if each is the next one that lies beside the other. What is drawn between them in order
-    across, but not beside them, is another block; a row drawn in two pieces divides none.
+    across, but not beside them, is another block. Also returns whether rows of two blocks lie beside each other.
     """
-    course = _common_course(rows)
-    turned = [course.turned(line) for line, _ in rows]
-    order = sorted(range(len(rows)), key=lambda k: float(turned[k][1].mean()))
-    low = np.array([turned[k][0].min() for k in order])
-    high = np.array([turned[k][0].max() for k in order])
-    before: list[int] = []
-    after: list[int] = []
+    course = _common_course(drawn)
+    rows = _whole_rows(course, drawn)
+    before, after = _neighbours([_row(course, row) for row in rows])
     chains: dict[int, list[int]] = {}  # by its last row
-    for k in range(len(order)):
-        beside = np.flatnonzero((low < high[k]) & (high > low[k]))
-        before.append(int(beside[beside < k].max(initial=-1)))
-        after.append(int(beside[beside > k].min(initial=len(order))))
+    for k in range(len(rows)):
         is_next = before[k] in chains and after[before[k]] == k
         chains[k] = [*chains.pop(before[k]), k] if is_next else [k]
     blocks: dict[int, list[int]] = {}
@@ -144,7 +150,51 @@ def _blocks(rows: list[Drawn]) -> list[list[Drawn]]:
             del blocks[block[-1]]
             chain = [*block, *chain]  # noqa: PLW2901
         blocks[chain[-1]] = chain
-    return [[rows[k] for k in sorted(order[n] for n in block)] for block in blocks.values()]
+    numbers = {k: number for number, block in enumerate(blocks.values()) if len(block) > 1 for k in block}
+    beside = [(k, n) for side in (before, after) for k, n in enumerate(side) if k in numbers and n in numbers]
+    divided = any(numbers[k] != numbers[n] for k, n in beside)
+    return [[rows[k] for k in sorted(block)] for block in blocks.values()], divided
+
+
+def _whole_rows(course: Course, drawn: list[Drawn]) -> list[DrawnRow]:
+    """Return rows in order across, with the pieces of each: they lie end to end, and beside the same row.
+
+    No row lies beside two fields that are end to end.
+    """
+    order = sorted(((_row(course, [one]), one) for one in drawn), key=lambda item: item[0].v)
+    pieces = [row for row, _ in order]
+    before, after = _neighbours(pieces)
+    continues = [False] * len(order)
+    """Whether a piece belongs to the same row as the one before it."""
+    for side, step in ((before, 1), (after, -1)):  # what is joined tells of the next ones that they lie beside one row
+        for k in range(1, len(order))[::step]:
+            a, b = sorted(side[k - 1 : k + 1])
+            a_row_beside = a >= 0 and b < len(order) and all(continues[a + 1 : b + 1])
+            apart = max(pieces[k - 1].low, pieces[k].low) >= min(pieces[k - 1].high, pieces[k].high)
+            if a_row_beside and apart and pieces[k].v - pieces[k - 1].v < ONE_LINE:
+                continues[k] = True
+    rows: list[DrawnRow] = []
+    for joined, (_, one) in zip(continues, order, strict=True):
+        if joined:
+            rows[-1].append(one)
+        else:
+            rows.append([one])
+    return rows
+
+
+def _neighbours(rows: list[Row]) -> tuple[list[int], list[int]]:
+    """Return of each row the last one before and the first one after it beside it; -1 and the number of rows if none.
+
+    The rows are in order across.
+    """
+    low, high = np.array([row.low for row in rows]), np.array([row.high for row in rows])
+    before: list[int] = []
+    after: list[int] = []
+    for k in range(len(rows)):
+        beside = np.flatnonzero((low < high[k]) & (high > low[k]))
+        before.append(int(beside[beside < k].max(initial=-1)))
+        after.append(int(beside[beside > k].min(initial=len(rows))))
+    return before, after
 
 
 def _common_course(rows: list[Drawn]) -> Course:
@@ -155,17 +205,24 @@ def _common_course(rows: list[Drawn]) -> Course:
     return _course(yaw, [line for line, _ in rows])
 
 
-def _row_field(rows: list[Drawn]) -> RowField:
+def _row_field(rows: list[DrawnRow]) -> RowField:
     """Return drawn rows as a field, with the bend that they have in common."""
-    course = _common_course(rows)
-    out = []
-    for line, properties in rows:
-        along, across = course.turned(line)
-        width = properties.get("row_width", properties.get("width"))
-        thick = float(width) if isinstance(width, int | float) and not isinstance(width, bool) else 0.0
-        out.append(Row(float(across.mean()), float(along.min()), float(along.max()), width=thick))
-    rows_in_order = tuple(sorted(out, key=lambda row: row.v))
+    course = _common_course([piece for row in rows for piece in row])
+    rows_in_order = tuple(sorted((_row(course, row) for row in rows), key=lambda row: row.v))
     return RowField(course.yaw, rows_in_order, bend=course.bend, middle=course.middle)
+
+
+def _row(course: Course, pieces: DrawnRow) -> Row:
+    """Return a drawn row along a course, as wide and as long as all its pieces."""
+    along, across, thick = [], [], 0.0
+    for line, properties in pieces:
+        u, v = course.turned(line)
+        along += [float(u.min()), float(u.max())]
+        across.append(float(v.mean()))
+        width = properties.get("row_width", properties.get("width"))
+        thick = max(thick, float(width) if isinstance(width, int | float) and not isinstance(width, bool) else 0.0)
+    low, high = min(across), max(across)
+    return Row((low + high) / 2, min(along), max(along), width=thick + high - low, pieces=len(pieces))
 
 
 def _course(yaw: float, lines: list[NDArray[np.float64]]) -> Course:
@@ -216,7 +273,9 @@ class _Network:
         """Add the aisles of a field, and the changes between them."""
         parameters = self.parameters
         before: tuple[Item, Item] | None = None
-        for number, (a, b) in enumerate(itertools.pairwise(one.rows), 1):
+        number = 0  # counts the lines as drawn
+        for a, b in itertools.pairwise(one.rows):
+            number += a.pieces
             free = b.v - a.v - (a.width + b.width) / 2
             fits = free >= 2 * parameters.robot_radius
             beside = min(a.high, b.high) > max(a.low, b.low)

@@ -310,6 +310,38 @@ def test_row_in_two_pieces_divides_no_field() -> None:
         assert not notes.dropped
 
 
+@pytest.mark.parametrize("gaps", [(1, 2), (2, 3), (0, 1), (1, 2, 3), (4, 5)])
+def test_neighbouring_rows_with_a_gap_at_the_same_place_divide_no_field(gaps: tuple[int, ...]) -> None:
+    """Six rows 3 m apart: all five aisles are connected, and no edge crosses a row."""
+    spans = {v: ((0, 14), (16, 30)) if v in gaps else ((0, 30),) for v in range(6)}
+    drawings = [shapely.LineString([(a, 3 * v), (b, 3 * v)]) for v, pieces in spans.items() for a, b in pieces]
+    rows = [(f"r{k}", line, {"kind": "row"}) for k, line in enumerate(drawings)]
+    notes = DerivationNotes()
+    site = Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")})
+    network = run([all_derivations()["rows_to_topology"].step()], site, notes)
+    edges = of(network, "topology", "edge")
+    reached = {edges[0][1]["source"]}
+    for _ in edges:
+        reached |= {p["target"] for _, p in edges if p["source"] in reached}
+    assert reached == {p["name"] for _, p in of(network, "topology", "node")}
+    assert {g.y for g, _ in of(network, "topology", "node")} == {1.5, 4.5, 7.5, 10.5, 13.5}
+    assert not any(g.intersects(shapely.union_all(drawings)) for g, _ in edges)
+    assert not notes.dropped
+    assert not notes.warnings
+
+
+def test_fields_with_a_row_beside_both_that_are_not_connected_are_reported() -> None:
+    """A hedge lies beside two fields end to end, whose rows are not on the same lines."""
+    ends = [(0, 0, 70), *((v, 0, 30) for v in (3, 6, 9)), *((v, 40, 70) for v in (4.5, 7.5, 10.5))]
+    rows = [(f"r{k}", shapely.LineString([(a, v), (b, v)]), {"kind": "row"}) for k, (v, a, b) in enumerate(ends)]
+    notes = DerivationNotes()
+    site = Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")})
+    network = run([all_derivations()["rows_to_topology"].step()], site, notes)
+    assert {g.y for g, _ in of(network, "topology", "node")} == {1.5, 4.5, 7.5, 6.0, 9.0}
+    assert len(notes.warnings) == 1
+    assert "not connected" in str(notes.warnings[0])
+
+
 def test_rows_and_aisles_without_a_way_are_reported() -> None:
     spans = {"a": (0, 0, 30), "b": (0.5, 0, 30), "c": (3, 40, 70), "d": (6, 0, 30)}
     rows = [(name, shapely.LineString([(a, v), (b, v)]), {"kind": "row"}) for name, (v, a, b) in spans.items()]
