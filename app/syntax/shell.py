@@ -213,7 +213,8 @@ def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], str]:
     touched: dict[str, None] = {}
     heres: list[str] = []
     begins, leaves, first = True, False, ""
-    parentheses = arithmetic = 0  # open ones, and those of them up to the inner one of "((", where "<<" is a shift
+    parentheses = arithmetic = 0  # open ones, and those of them up to the inner one of "((", where "<<" is a shift,
+    shifts: list[str] = []  # but a here-document if the two are closed apart: subshells
     while at < len(text):
         piece = _PIECE.match(text, at)
         if piece is None:  # every character matches the last alternative
@@ -225,9 +226,11 @@ def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], str]:
             arithmetic = arithmetic or (parentheses if text.startswith("((", at - 2) else 0)
         elif sign == ")":
             parentheses = max(parentheses - 1, 0)
-            arithmetic = arithmetic if parentheses >= arithmetic else 0
-        if piece["here"] and not arithmetic:
-            heres.append(piece["here"])
+            if parentheses < arithmetic:
+                heres += [] if text.startswith(")", at) else shifts
+                arithmetic, shifts = 0, []
+        if piece["here"]:
+            (shifts if arithmetic else heres).append(piece["here"])
         if sign in ("{", "}") and begins:
             token = sign
         if token:

@@ -103,6 +103,8 @@ def test_only_unconditional_literals_are_read() -> None:
         ("(( FLAGS = 1<<4 ))\nB=2", {"B": "2"}),
         ("N=$(( (1 << 3) + 2 ))\nB=2", {"B": "2"}),
         ("N=$((1<<3)); cat <<EOF\nA=1\nEOF\nB=2", {"B": "2"}),
+        ("((cat <<EOF) )\nA=1\nEOF\nB=2", {"B": "2"}),
+        ("(( ((1<<2)) + 1 ))\nB=2", {"B": "2"}),
         ("(cat <<EOF)\nA=1\nEOF\nB=2", {"B": "2"}),
         ("echo \\\nA=1\nB=2", {"B": "2"}),
         ("f() {\nA=1\n}\nB=2", {"B": "2"}),
