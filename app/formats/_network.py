@@ -19,7 +19,7 @@ from app.errors import Problem, UnreadableFile
 from app.formats import WriteContext
 from app.model.features import Features, Properties, unique_ids
 from app.model.frame import is_writable
-from app.model.layers import Layers
+from app.model.layers import Layers, PartKey
 
 Array = NDArray[np.float64]
 
@@ -139,14 +139,14 @@ def yaw_or_source(source_yaw: Any, orientation: Any) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Directed edge: id, indexes of its nodes in ``MergedNetwork.nodes``, and shape in metres."""
+    """Directed edge: id, indexes of its nodes in ``MergedNetwork.nodes``, shape in metres, and its network's key."""
 
     id: str
     source: int
     target: int
     properties: Properties
     geometry: Any
-    level: str
+    part: PartKey
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +231,7 @@ def _join_edges(
         ids = unique_ids((part.ids[k] for k, _, _ in rows), taken)
         taken.update(ids)
         for (k, source, target), i in zip(rows, ids, strict=True):
-            net.edges.append(Edge(i, source, target, part.properties[k], shapes[key][k], key.level))
+            net.edges.append(Edge(i, source, target, part.properties[k], shapes[key][k], key))
     return dropped_count
 
 

@@ -8,8 +8,8 @@ Pixels need their image to become positions: we write ``picture`` ({resolution, 
 the two lists. Without it the map's YAML and image are looked up in the upload (``metric/map/`` of an
 environment_template, else beside the roadmap, else the only map.yaml), or options give all three. A node is at the
 centre of its pixel, metres in the local frame. On writing, pixels are those of the stored grid ``map``, else of the
-image that the roadmap came with, else of an assumed image that just contains the network. Weights of the source are
-scaled to these pixels.
+image that the roadmap came with, else of an assumed image that just contains the network. Weights of each source
+are scaled from its own pixels to these.
 
 Canonical: a node's id is its ``id`` as a text, an edge's ``<from>-<to>``; see ``_undirected`` for edges of both
 directions. ``properties.prm`` contains ``more`` (further keys) and ``id`` if it is not an integer; the document's
@@ -24,7 +24,7 @@ import math
 import posixpath
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,7 @@ from app.formats import (
 from app.formats._fields import NOT_NEGATIVE, Number, record
 from app.formats._network import (
     Array,
+    Edge,
     MergedNetwork,
     check_name,
     duplicates,
@@ -347,9 +348,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     top = {key: v for key, v in top.items() if key not in OWN_KEYS} if isinstance(top, dict) else {}
     out = [yaml.mapping(top, 0)] if top else []
     out += ["nodes:\n", *_node_texts(net, ids, pixels, context)] if net.nodes else ["nodes: []\n"]
-    source = _source_picture(document)
-    scale = 1.0 if source is None else source.resolution / picture.resolution
-    line_texts = _line_texts(net, ids, pixels, scale, document, context)
+    net.edges = _scale_weights(net.edges, layers, picture.resolution)
+    dangling = _dangling(document, picture.resolution)
+    line_texts = [*_line_texts(net, ids, pixels, context), *(_edge(e.pop("from"), e.pop("to"), e) for e in dangling)]
     out += ["edges:\n", *line_texts] if line_texts else ["edges: []\n"]
     out.append(yaml.mapping({PICTURE: picture.as_dict()}, 0))
     return {FILE: "".join(out).encode()}
@@ -391,15 +392,46 @@ def _node_texts(net: MergedNetwork, ids: Sequence[Any], pixels: Array, context: 
     return out
 
 
-def _line_texts(
-    net: MergedNetwork,
-    ids: Sequence[Any],
-    pixels: Array,
-    scale: float,
-    document: Mapping[str, Any],
-    context: WriteContext,
-) -> list[str]:
-    """Return the texts of the edges, and of the source's dangling edges. scale: pixels per pixel of the source."""
+def _scale_weights(network: Sequence[Edge], layers: Layers, resolution: float) -> list[Edge]:
+    """Convert the weights of edges from the pixels of their own network's image to those of this size in metres."""
+    parts = layers.vector("topology")
+    scales = {key: _scale(get_source_properties(part.document, NAME), resolution) for key, part in parts.items()}
+    out = []
+    for edge in network:
+        members = get_source_properties(edge.properties, NAME)
+        more = members.get("more")
+        if isinstance(more, dict) and "weight" in more:
+            more = {**more, "weight": _scaled(more["weight"], scales[edge.part])}
+            out.append(replace(edge, properties={**edge.properties, NAME: {**members, "more": more}}))
+        else:
+            out.append(edge)
+    return out
+
+
+def _dangling(document: Mapping[str, Any], resolution: float) -> list[dict[str, Any]]:
+    """Return the source's edges to unknown nodes, with weights in pixels of this size in metres."""
+    scale = _scale(document, resolution)
+    listed = document.get("dangling")
+    listed = listed if isinstance(listed, list) else []
+    edges_ = [dict(e) for e in listed if isinstance(e, dict) and {"from", "to"} <= e.keys()]
+    return [{**e, "weight": _scaled(e["weight"], scale)} if "weight" in e else e for e in edges_]
+
+
+def _scale(document: Mapping[str, Any], resolution: float) -> float:
+    """Return the pixels of this size in metres per pixel of the document's image; 1 if they are equal or unknown."""
+    source = _source_picture(document)
+    scale = 1.0 if source is None else source.resolution / resolution
+    return 1.0 if math.isclose(scale, 1.0, rel_tol=SAME_SCALE) else scale
+
+
+def _scaled(weight: Any, scale: float) -> Any:
+    """Scale a weight; what is no number, and a weight at scale 1, stays as it is."""
+    is_weight = isinstance(weight, (int, float)) and not isinstance(weight, bool) and scale != 1.0
+    return round(weight * scale, 9) if is_weight else weight
+
+
+def _line_texts(net: MergedNetwork, ids: Sequence[Any], pixels: Array, context: WriteContext) -> list[str]:
+    """Return the texts of the edges between nodes."""
     weighed = other = 0
     out = []
     for line in lines(net, context, NAME):
@@ -410,17 +442,8 @@ def _line_texts(
             members["weight"] = length
             weighed += 1
         else:
-            if not math.isclose(scale, 1.0, rel_tol=SAME_SCALE):
-                members["weight"] = weight = round(weight * scale, 9)
             other += abs(weight - length) > max(1.0, SAME_LENGTH * length)
         out.append(_edge(ids[line.a], ids[line.b], members))
-    dangling = document.get("dangling")
-    dangling = (
-        [e for e in dangling if isinstance(e, dict) and {"from", "to"} <= e.keys()]
-        if isinstance(dangling, list)
-        else []
-    )
-    out += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in dangling]
     if other:
         context.warn(f"{other} edges have a weight that is not their length in pixels; it is kept", where="edges")
     if weighed:
@@ -444,7 +467,7 @@ def _sort_nodes(net: MergedNetwork) -> MergedNetwork:
     order = sorted(range(len(net.nodes)), key=lambda k: natural_sort_key(net.nodes[k].id))
     new_index = {old: new for new, old in enumerate(order)}
     moved = [
-        type(e)(e.id, new_index[e.source], new_index[e.target], e.properties, e.geometry, e.level) for e in net.edges
+        type(e)(e.id, new_index[e.source], new_index[e.target], e.properties, e.geometry, e.part) for e in net.edges
     ]
     return MergedNetwork([net.nodes[k] for k in order], moved, net.levels)
 
@@ -540,7 +563,7 @@ register(
         read_options=ReadOptions,
         write_options=WriteOptions,
         extensions=(".yaml", ".yml"),
-        version=3,
+        version=4,
         selection=Selection(choose),
         claims=Claims(priority=3, related_files=related_files, gives_way=True),
         traits=Traits(outlines=True, keeps_bends="nodes"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,29 @@ def test_weights_follow_the_pixels_of_another_map(weight: int) -> None:
     assert [w.problem for w in context.warnings] == (
         [] if weight == 30 else ["1 edges have a weight that is not their length in pixels; it is kept"]
     )
+
+
+@pytest.mark.parametrize("has_grid", [False, True])
+def test_weights_of_each_network_follow_its_own_pixels(has_grid: bool) -> None:
+    """Without a grid, the pixels are those of the first network's image, 0.05 m."""
+    fine, _ = read({"prm.yaml": WEIGHED % 30})
+    coarse = (WEIGHED % 30).replace(b"0.05", b"0.1")
+    for node in b"012":
+        coarse = re.sub(rb"(id|from|to): %c," % node, rb"\g<1>: 1%c," % node, coarse)
+    parts: dict[PartKey, Any] = {PartKey("topology", "L1", "network"): fine}
+    parts[PartKey("topology", "L2", "network")] = read({"prm.yaml": coarse})[0]
+    if has_grid:
+        parts[PartKey("occupancy", "L1", "map")] = OccupancyGrid(np.zeros((500, 500), np.uint8), 0.1, (0.0, 0.0, 0.0))
+    roadmap, context = write(Layers(parts))
+    assert [e["weight"] for e in roadmap["edges"]] == ([20.0, 15.0, 40.0, 30] if has_grid else [40.0, 30, 80.0, 60.0])
+    assert not [w for w in context.warnings if "weight" in w.problem]
+
+
+def test_weights_of_edges_to_unknown_nodes_are_scaled() -> None:
+    part, _ = read({"prm.yaml": (WEIGHED % 30).replace(b"from: 1, to: 2", b"from: 1, to: 9")})
+    grid = OccupancyGrid(np.zeros((500, 500), np.uint8), 0.01, (0.0, 0.0, 0.0))
+    roadmap, _ = write(Layers({NETWORK: part, PartKey("occupancy", "ground", "map"): grid}))
+    assert roadmap["edges"][1] == {"from": 1, "to": 9, "weight": 150.0}
 
 
 def test_weight_of_moved_node_is_reported() -> None:

@@ -308,7 +308,7 @@ class NewLanelets:
 def _is_same_road(a: Edge, b: Edge) -> bool:
     """Whether two edges, one the reverse of the other, can be one lanelet."""
     keys = ("speed_limit", "width", "name")
-    return all(a.properties.get(w) == b.properties.get(w) for w in keys) and a.level == b.level
+    return all(a.properties.get(w) == b.properties.get(w) for w in keys) and a.part.level == b.part.level
 
 
 def _middle_line(edge: Edge, net: MergedNetwork) -> Array | None:

@@ -123,7 +123,7 @@ class _Writer:
         for node, name in zip(self.net.nodes, names, strict=True):
             self._add_to_layout("nodes", node.properties, node.level, name, self._node(node, name))
         for edge, name in zip(self.net.edges, self._names(self.net.edges), strict=True):
-            self._add_to_layout("edges", edge.properties, edge.level, name, self._edge(edge, name, names))
+            self._add_to_layout("edges", edge.properties, edge.part.level, name, self._edge(edge, name, names))
         self._stations()
         self._dangling()
         out = self._top()
