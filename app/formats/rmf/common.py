@@ -260,10 +260,10 @@ class VertexNames:
         """
         rows = [(key, i, _vertex_name(i, p), not p.keys().isdisjoint(OPEN_RMF)) for key, i, p in nodes]
         counts = Counter(name for _, _, name, _ in rows)
-        kept = {name for _, _, name, own in rows if own or counts[name] == 1}
+        kept = {name for _, _, name, is_open_rmf in rows if is_open_rmf or counts[name] == 1}
         replaced: dict[Hashable, tuple[str, str]] = {}
-        for key, i, name, own in rows:
-            if own or counts[name] == 1:
+        for key, i, name, is_open_rmf in rows:
+            if is_open_rmf or counts[name] == 1:
                 continue
             if name == i and name not in kept:
                 kept.add(name)
