@@ -288,10 +288,14 @@ class _Session:
         stored, _, anchored = before
         if stored.is_empty:
             return geometry, local
-        if anchored != local and self._frame is None:
+        if anchored == local:
+            shown = stored
+        elif self._frame is None:
             return geometry, local
-        shown = stored if anchored == local else self._other(stored, anchored)
-        if _is_nearly_equal(shown, geometry, SAME_METRES if local else SAME_DEGREES):
+        else:  # a stored place that is too far away for local metres becomes empty: the feature is moved back
+            convert = self._frame.geometries_to_wgs84 if anchored else self._frame.near_geometries_to_local
+            shown = convert(np.array([stored], object))[0]
+        if not shown.is_empty and _is_nearly_equal(shown, geometry, SAME_METRES if local else SAME_DEGREES):
             return stored, anchored
         return (geometry if anchored == local else self._other(geometry, local)), anchored
 

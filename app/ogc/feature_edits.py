@@ -115,12 +115,11 @@ class FeatureEditor:
         )
         if not is_moved and not is_tied:
             return self._put(stored.item, stored.geometry, merged, _place_of(stored.key), local=stored.local)
-        before = self._local(stored.geometry, stored.local)
-        geometry = self._geometry(sent.get("geometry")) if is_moved else before
+        geometry = self._geometry(sent.get("geometry")) if is_moved else self._local(stored.geometry, stored.local)
         if self._collection == "edges":
             _, geometry = self._tie(geometry, merged, stored, {})
         elif geometry is not None:
-            merged |= moved_pose(before, geometry, stored.properties, merged)
+            merged |= moved_pose(self._former(stored), geometry, stored.properties, merged)
         return self._put(stored.item, geometry, merged, _place_of(stored.key))
 
     def delete(self, feature: str) -> Mapping[str, Any]:
@@ -238,6 +237,11 @@ class FeatureEditor:
             raise Invalid(f"the geometry is outside the area of {self._crs.uri}: check Content-Crs", problems)
         return local
 
+    def _former(self, stored: Stored) -> Any:
+        """Return the former place in local metres, empty if it was too far away: then it can be moved back."""
+        one = np.array([stored.geometry], object)
+        return stored.geometry if stored.local else self._frame.near_geometries_to_local(one)[0]
+
     def _local(self, geometry: Any, local: bool) -> Any:
         return geometry if local else self._frame.geometries_to_local(np.array([geometry], object))[0]
 
@@ -254,9 +258,8 @@ class FeatureEditor:
         if line is None or line.geom_type != "LineString" or line.is_empty:
             problem = Problem("must be a LineString", where="geometry")
             raise Invalid("an edge needs a LineString from node to node", [problem])
-        old = None
-        if stored is not None and not stored.geometry.is_empty:
-            old = shapely.get_coordinates(self._local(stored.geometry, stored.local))
+        former = None if stored is None else self._former(stored)
+        old = None if former is None or former.is_empty else shapely.get_coordinates(former)
         vertices = shapely.get_coordinates(line, include_z=line.has_z)
         keys = [stored.key] if stored is not None else self._networks(place)
         for end, k in (("source", 0), ("target", -1)):

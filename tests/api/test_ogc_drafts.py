@@ -403,6 +403,28 @@ def test_given_ids_are_kept_once(gis: Gis) -> None:
     assert len(made) == 2, "a name that is taken is no id"
 
 
+@pytest.mark.parametrize("in_degrees", [False, True])
+def test_feature_far_from_the_datum_can_be_moved_back(gis: Gis, *, in_degrees: bool) -> None:
+    tree = {"type": "Feature", "id": "oak", "properties": {"kind": "tree"}, "geometry": point(-170.0, -50.0)}
+    data = json.dumps({"type": "FeatureCollection", "features": [tree]}).encode()
+    gis.api.upload(gis.env, {"o.geojson": data}, layer="objects")
+    headers = {"content-crs": f"<{CRS84}>"} if in_degrees else {}
+    near = (-0.5245, 53.2686) if in_degrees else (3.0, 4.0)
+    gis.patch("objects-points", "oak", headers=headers, geometry=point(*near))
+    shown = gis.item("objects-points", "oak", local=not in_degrees)["geometry"]["coordinates"]
+    assert shown == pytest.approx(near, abs=1e-6)
+
+
+def test_edge_far_from_the_datum_can_be_moved_back(gis: Gis) -> None:
+    features = [gis.item("nodes", name, local=False) for name in ("gate", "barn")]
+    edge = {"type": "Feature", "id": "far", "properties": {"kind": "edge", "source": "gate", "target": "barn"}}
+    features.append({**edge, "geometry": line((-170.0, -50.0), (-170.1, -50.0))})
+    network = json.dumps({"type": "FeatureCollection", "features": features}).encode()
+    gis.api.upload(gis.env, {"n.geojson": network}, layer="topology")
+    gis.patch("edges", "far", geometry=line((0, 0), (5, 3), (10, 0)))
+    assert path(gis.item("edges", "far")) == [[0, 0], [5, 3], [10, 0]]
+
+
 CRATE = b"""<?xml version="1.0"?><sdf version="1.7"><world name="w"><model name="crate"><static>true</static>
 <pose>2 3 0.5 0 0 0</pose><link name="l"><collision name="c"><geometry><box><size>1 1 1</size></box></geometry>
 </collision></link></model></world></sdf>"""
