@@ -11,7 +11,7 @@ import threading
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
 from typing import Any, Final, Literal, NamedTuple, get_args
@@ -28,7 +28,7 @@ from app.model.antimeridian import cut_at_antimeridian
 from app.model.features import Properties
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, local_frame
-from app.model.layers import PartKey
+from app.model.layers import Layer, PartKey
 from app.ogc.crs import ReferenceSystem
 from app.store.content import ContentReader
 from app.store.extent import join
@@ -285,7 +285,7 @@ def unqualified(feature: str, key: PartKey) -> str | None:
 # --- from parts to tables ---
 
 
-def collection_of(layer: VectorLayer, kind: object, geometry_type: int) -> str:
+def collection_of(layer: Layer, kind: object, geometry_type: int) -> str:
     """Return the id of the collection for an item: one geometry type each."""
     if layer == "topology":
         return "edges" if kind == "edge" else "nodes"
@@ -386,19 +386,37 @@ def empty_table(declared: Declared, datum: Datum) -> Table:
 
 
 def build_item_table(
-    content: ContentReader, version: Version, layer: VectorLayer, collection: str, item: str
+    content: ContentReader, version: Version, layer: VectorLayer, collection: str, feature: str
 ) -> Table | None:
-    """Build the table of one feature, by an id that is not qualified; None if there is none. Reads little."""
+    """Build the table of one feature, by its id; None if there is none, or if only the whole table tells. Reads little.
+
+    It has the id that it has in the whole table.
+    """
+    keys = [entry.key for entry in version.parts if entry.key.layer == layer and entry.count]
+    qualified = [(key, item) for key in keys if (item := unqualified(feature, key)) is not None]
+    if not qualified:
+        tables = (_item_table(content, version, key, collection, feature) for key in keys)
+        return next((table for table in tables if table is not None), None)
+    own, item = qualified[0]
+    is_plain = feature == item + qualifier(own) and "@" not in item
+    if len(qualified) > 1 or not is_plain or any(content.has_ids(version, key, [feature]) for key in keys):
+        return None
+    earlier = keys[: keys.index(own)]
+    is_taken = any(_item_table(content, version, key, collection, item) is not None for key in earlier)
+    table = _item_table(content, version, own, collection, item)
+    return replace(table, ids=[feature]) if table is not None and is_taken else table
+
+
+def _item_table(content: ContentReader, version: Version, key: PartKey, collection: str, item: str) -> Table | None:
+    """Build the table of one feature of a part, by its id there; None if there is none."""
     assert version.datum is not None
-    for entry in version.parts:
-        if entry.key.layer != layer or not entry.count:
-            continue
-        part = content.features(version, entry.key, ids=[item])
-        kinds = zip(part.properties, shapely.get_type_id(part.geometry).tolist(), strict=True)
-        if any(collection_of(layer, properties.get("kind"), shape) == collection for properties, shape in kinds):
-            local = bool(part.local[0])
-            return table_of(entry.key, item, part.geometry[0], part.properties[0], local=local, datum=version.datum)
-    return None
+    part = content.features(version, key, ids=[item])
+    if not len(part):
+        return None
+    geometry, properties, local = part.geometry[0], part.properties[0], bool(part.local[0])
+    if collection_of(key.layer, properties.get("kind"), shapely.get_type_id(geometry)) != collection:
+        return None
+    return table_of(key, item, geometry, properties, local=local, datum=version.datum)
 
 
 def build_box_table(content: ContentReader, version: Version, layer: VectorLayer, name: str, box: Box) -> Table | None:

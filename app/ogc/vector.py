@@ -97,7 +97,7 @@ async def find_item_table(service: Service, name: str, item: str) -> Table | Non
     """
     entry = TITLES.get(name)
     key = None if entry is None else table_key(service.version, entry[0])
-    if entry is None or key is None or service.version.pending is None or "@" in item or CACHE.get(key) is not None:
+    if entry is None or key is None or service.version.pending is None or CACHE.get(key) is not None:
         return await find_table(service, name)
     content = service.services.store.content
     table = await run_in_threadpool(build_item_table, content, service.version, entry[0], name, item)

@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 import pytest
 
+from app.ogc import tables, vector
 from tests.api.conftest import Api
 
 Json = dict[str, Any]
@@ -380,6 +381,38 @@ def test_qualified_ids_are_those_of_their_part_whatever_its_name(gis: Gis) -> No
     gis.api("DELETE", f"{at}/{qualified}", 404)
     gis.api.get(f"{at}/{qualified}", 404)
     assert [one["properties"]["level"] for one in gis.api.get(at).json()["features"]] == ["Floor #2", "c@d"]
+
+
+def test_qualified_id_is_written_and_read_without_the_table(gis: Gis, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = {"type": "Feature", "id": "n1", "properties": {"kind": "tree"}, "geometry": point(-0.5245, 53.2686)}
+    shelf = {**tree, "id": "n2", "geometry": line((-0.5245, 53.2686), (-0.5246, 53.2686))}
+    literal = {**tree, "id": "n1@B/literal"}
+    for level, features in {"A": [tree, shelf], "B": [tree, {**tree, "id": "n2"}], "C": [tree, literal]}.items():
+        data = json.dumps({"type": "FeatureCollection", "features": features}).encode()
+        gis.api.upload(gis.env, {"o.geojson": data}, layer="objects", level=level)
+    at = f"{gis.at}/collections/objects-points/items"
+    part = gis.api.get(at).json()["features"][0]["properties"]["part"]
+    built: list[str] = []
+
+    def record(content: Any, version: Any, layer: Any) -> Any:
+        built.append(layer)
+        return tables.build_tables(content, version, layer)
+
+    monkeypatch.setattr(vector, "build_tables", record)
+    monkeypatch.setattr(vector, "CACHE", tables.TableCache())
+    shown = {f"n1@A/{part}": "n1", f"n1@B/{part}": None, f"n2@B/{part}": "n2", f"n1@C/{part}": None}
+    shown["n1@B/literal"] = None
+    items = {feature: f"{at}/{quote(feature, safe='')}" for feature in shown}
+    for k, feature in enumerate(items):
+        gis.patch("objects-points", quote(feature, safe=""), properties={"rank": k})
+    alone = {feature: gis.api.get(url) for feature, url in items.items()}
+    assert built == []
+    gis.api.get(at)
+    assert built == ["objects"], "now the table is cached"
+    for feature, url in items.items():
+        now = gis.api.get(url)
+        assert now.json()["id"] == (shown[feature] or feature)
+        assert (alone[feature].headers["etag"], alone[feature].content) == (now.headers["etag"], now.content)
 
 
 def test_drafts_of_others_are_read_and_not_written(api: Api, farm: str) -> None:
