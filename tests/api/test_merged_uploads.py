@@ -90,7 +90,7 @@ def derive_voxels(api: Api, env: str) -> tuple[list[str], list[Any]]:
 
 
 def test_grid_merged_onto_a_placeholder_is_used_by_derivations(api: Api, bare: str) -> None:
-    """The placeholder, derived from the fence, shows no obstacles; what a robot saw does, whatever the fence becomes."""
+    """The placeholder, derived from the fence, shows no obstacles, but what a robot saw does; the fence may change."""
     x, y, _ = make_placeholder(api, bare)["origin"]
     seen = np.full((30, 30), CLEAR)
     seen[:, 7] = WALL
