@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,7 @@ class _Session:
         self._store, self._base, self._named = store, base, named
         self._frame: LocalFrame | None = None if base.datum is None else local_frame(base.datum)
         self._drafts: dict[PartKey, EditedPart] = {}
+        self._known_networks: list[EditedPart] | None = None
         self._grids: dict[PartKey, OccupancyGrid] = {}
         self._keys = {e.key for e in base.parts}
         self._datum = base.datum
@@ -143,8 +145,11 @@ class _Session:
         return out
 
     def _networks(self) -> list[EditedPart]:
-        """Return the networks of all levels."""
-        return [self._draft(key) for key in sorted({*self._keys, *self._drafts}) if key.layer == "topology"]
+        """Return the networks of all levels, in the order of their keys."""
+        if self._known_networks is None:
+            keys = sorted(key for key in {*self._keys, *self._drafts} if key.layer == "topology")
+            self._known_networks = [self._draft(key) for key in keys]
+        return self._known_networks
 
     def _network_of(self, draft: EditedPart, item: Any, *, stored: bool = False) -> EditedPart | None:
         """Return the network with the node that an edge of ``draft`` names; None if it is not a node.
@@ -153,7 +158,7 @@ class _Session:
         """
         if not isinstance(item, str):
             return None
-        for network in (draft, *self._networks()):
+        for network in chain((draft,), self._networks()):
             if network.is_stored(item) if stored else network.has_item(item):
                 row = network.before(item) if stored else network.row(item)
                 if row[1].get("kind") == "node":
@@ -223,6 +228,8 @@ class _Session:
     def _draft(self, key: PartKey) -> EditedPart:
         if key not in self._drafts:
             self._drafts[key] = EditedPart(self._store.content, self._base, key, self._named)
+            if key.layer == "topology":
+                self._known_networks = None
         return self._drafts[key]
 
     def _layer(self, change: Mapping[str, Any]) -> Layer:

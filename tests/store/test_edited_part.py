@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import random
+import sys
 import time
 from typing import Any
 
@@ -14,6 +15,7 @@ import shapely
 from app.ingest import edited_part
 from app.ingest.edits import edit_changes
 from app.model.features import Features
+from app.model.frame import Level
 from app.model.layers import PartKey
 from app.store.changes import Changes, Provenance, Put
 from app.store.store import Store
@@ -113,3 +115,44 @@ def test_an_edit_costs_by_what_it_changes(store: Store) -> None:
             rounds.append(time.thread_time() - start)
         costs.append(min(rounds))
     assert costs[1] < 10 * costs[0], f"44 times the features cost {costs[1] / costs[0]:.1f} times as much"
+
+
+def make_levels(store: Store, name: str, levels: int) -> Version:
+    """Commit a row of 200 nodes on one level, and a node on each of the others."""
+    operations = []
+    for level in range(levels):
+        nodes = 200 if level == 0 else 1
+        rows = [(f"n{level}_{k}", shapely.Point(2 * k, 0), {"kind": "node"}) for k in range(nodes)]
+        operations.append(Put(PartKey("topology", f"l{level}", "network"), as_features(rows), Provenance("raw")))
+    store.environments.create(name)
+    site = tuple(Level(f"l{level}", 3.0 * level) for level in range(levels))
+    prepared = store.versions.prepare(store.versions.get(name), Changes(tuple(operations), levels=site))
+    return store.versions.commit(name, prepared, author="test", message="")
+
+
+def count_calls(store: Store, base: Version, changes: list[dict[str, Any]]) -> int:
+    """Count the calls of Python functions that edits take."""
+    calls = 0
+
+    def count(frame: Any, event: str, argument: Any) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    before = sys.getprofile()
+    sys.setprofile(count)
+    try:
+        edit_changes(store, base, changes)
+    finally:
+        sys.setprofile(before)
+    return calls
+
+
+def test_edits_of_one_level_cost_the_same_whatever_others_there_are(store: Store) -> None:
+    costs = []
+    for levels in (2, 40):
+        base = make_levels(store, f"site{levels}", levels)
+        changes = [{**put_edge(f"n0_{k}", f"n0_{k + 1}"), "level": "l0"} for k in range(150)]
+        edit_changes(store, base, changes)  # fills caches
+        few, many = (count_calls(store, base, changes[:number]) for number in (50, 150))
+        costs.append(many - few)
+    assert costs[1] < 2 * costs[0], f"20 times the levels cost {costs[1] / costs[0]:.1f} times as much"
