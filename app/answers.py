@@ -230,14 +230,14 @@ def _find_class(module: str, name: str) -> type:
     if not module.startswith("app.") or module.endswith("__main__"):
         raise _no_value(module, name)
     try:
-        found: Any = importlib.import_module(module)
+        target: Any = importlib.import_module(module)
         for part in name.split("."):
-            found = vars(found)[part]
+            target = vars(target)[part]
     except (ImportError, KeyError, TypeError) as error:
         raise _no_value(module, name) from error
-    if not isinstance(found, type) or (found.__module__, found.__qualname__) != (module, name):
+    if not isinstance(target, type) or (target.__module__, target.__qualname__) != (module, name):
         raise _no_value(module, name)
-    return found
+    return target
 
 
 def _reader_of(fields: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:

@@ -267,8 +267,8 @@ def test_booleans_are_0_or_1_whatever_is_sent() -> None:
     later = pickle.BINGET + b"\x00" + pickle.BININT1 + b"\x00" + pickle.BININT1 + b"\x07" + pickle.SETITEM
     for instructions in (array, array + later + pickle.TUPLE2):
         result = load(instructions)
-        found = result[0] if isinstance(result, tuple) else result
-        assert found.view(np.uint8).tolist() == [0, 1, 1]
+        selection = result[0] if isinstance(result, tuple) else result
+        assert selection.view(np.uint8).tolist() == [0, 1, 1]
 
 
 class _Call:

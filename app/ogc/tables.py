@@ -397,13 +397,13 @@ def build_item_table(
     if not qualified:
         tables = (_item_table(content, version, key, collection, feature) for key in keys)
         return next((table for table in tables if table is not None), None)
-    own, item = qualified[0]
-    is_plain = feature == item + qualifier(own) and "@" not in item
+    holder, item = qualified[0]
+    is_plain = feature == item + qualifier(holder) and "@" not in item
     if len(qualified) > 1 or not is_plain or any(content.has_ids(version, key, [feature]) for key in keys):
         return None
-    earlier = keys[: keys.index(own)]
+    earlier = keys[: keys.index(holder)]
     is_taken = any(_item_table(content, version, key, collection, item) is not None for key in earlier)
-    table = _item_table(content, version, own, collection, item)
+    table = _item_table(content, version, holder, collection, item)
     return replace(table, ids=[feature]) if table is not None and is_taken else table
 
 
