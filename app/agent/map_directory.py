@@ -205,12 +205,23 @@ class MapDirectory:
         self._describe(self.versions / name, manifest)
 
     def refresh(self) -> None:
-        """Rewrite the descriptive files of all versions if the directory was moved or an older agent wrote them."""
+        """Rewrite the descriptive files of all versions if the directory was moved or an older agent wrote them.
+
+        Raises OSError if those of the current version cannot be read or written; other versions are left then.
+        """
         for name in self._names():
-            manifest = self.manifest(name)
-            for path, data in self._descriptions(self.versions / name, manifest) if manifest else ():
-                if not path.exists() or path.read_bytes() != data:
-                    write_atomically(path, data)
+            try:
+                self._refresh(self.versions / name, self.manifest(name))
+            except OSError:
+                if name == self.current_version:
+                    raise
+
+    def _refresh(self, folder: Path, manifest: Manifest | None) -> None:
+        used = folder.stat()
+        for path, data in self._descriptions(folder, manifest) if manifest else ():
+            if not path.exists() or path.read_bytes() != data:
+                write_atomically(path, data)
+        os.utime(folder, ns=(used.st_atime_ns, used.st_mtime_ns))  # versions stay in the order of their last use
 
     def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
         """Build a complete version folder, synced to disk, and return its name. ``current`` does not change.

@@ -356,6 +356,27 @@ def test_dangerous_variable_of_an_earlier_map_is_left_out_after_rollback(
     assert "ROS_DOMAIN_ID" not in (version / "environment.sh").read_text()
 
 
+def test_rewritten_descriptions_leave_the_order_of_versions(fake: Fake, robot: Robot) -> None:
+    """Which versions are kept depends on when each was last used. An old one that cannot be read does not matter."""
+    for content in (A, B, C):
+        fake.put(content)
+        assert robot("true").once()
+    folder = robot().agent._folder
+    names = [name.split("-")[0] for name in folder._names()]
+    for path in folder.versions.glob("*/environment.sh"):
+        path.write_text("old\n")
+    for k, name in enumerate(folder._names()):
+        os.utime(folder.versions / name, (1000 - k, 1000 - k))
+    folder.refresh()
+    assert [name.split("-")[0] for name in folder._names()] == names
+    assert len(names) > 1
+    assert {path.read_text() for path in folder.versions.glob("*/environment.sh")}.isdisjoint({"old\n"})
+    unreadable = folder.versions / folder._names()[-1] / "environment.sh"
+    unreadable.unlink()
+    unreadable.mkdir()
+    assert robot("true").once()
+
+
 def test_kill_at_random_moments_of_hooks_ends_consistently(fake: Fake, tmp_path: Path) -> None:
     into, taken, dice = tmp_path / "robot", tmp_path / "taken", random.Random(3)
     hook = f"sleep 0.1; {loads(taken)}; sleep 0.1"
