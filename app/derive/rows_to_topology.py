@@ -83,7 +83,7 @@ def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNo
         )
     for level, drawn in by_level.items():
         grid = layers.grids().get(PartKey("occupancy", level, MAP))
-        fields = _fields(concatenate(drawn), layers, notes)
+        fields = _fields(concatenate(drawn), layers, parameters.turn, notes)
         if not fields:
             raise CannotConvert(
                 "no two rows are parallel and side by side: draw or derive at least two rows of a field"
@@ -102,7 +102,7 @@ def rows_to_topology(layers: Layers, parameters: Parameters, notes: DerivationNo
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _fields(drawn: Features, layers: Layers, notes: DerivationNotes) -> list[RowField]:
+def _fields(drawn: Features, layers: Layers, turn: float, notes: DerivationNotes) -> list[RowField]:
     """Group rows by their field, or by direction if they state none, and where they lie side by side."""
     try:
         metres = drawn.in_local(layers.frame)
@@ -122,7 +122,7 @@ def _fields(drawn: Features, layers: Layers, notes: DerivationNotes) -> list[Row
         groups.setdefault(group, []).append((line, properties))
     blocks: list[list[DrawnRow]] = []
     for rows in groups.values():
-        split, divided = _blocks(rows)
+        split, divided = _blocks(rows, turn)
         blocks.extend(split)
         if divided:
             notes.warn("fields with a row beside rows of another field are not connected: add edges between them")
@@ -130,14 +130,14 @@ def _fields(drawn: Features, layers: Layers, notes: DerivationNotes) -> list[Row
     return [_row_field(block) for block in blocks if len(block) > 1]
 
 
-def _blocks(drawn: list[Drawn]) -> tuple[list[list[DrawnRow]], bool]:
+def _blocks(drawn: list[Drawn], turn: float) -> tuple[list[list[DrawnRow]], bool]:
     """Split parallel rows that do not lie side by side, such as fields end to end.
 
     Two rows are neighbours if each is the next one that lies beside the other. What is drawn between them in order
     across, but not beside them, is another block. Also returns whether rows of two blocks lie beside each other.
     """
     course = _common_course(drawn)
-    rows = _whole_rows(course, drawn)
+    rows = _whole_rows(course, drawn, turn)
     before, after = _neighbours([_row(course, row) for row in rows])
     chains: dict[int, list[int]] = {}  # by its last row
     for k in range(len(rows)):
@@ -156,10 +156,11 @@ def _blocks(drawn: list[Drawn]) -> tuple[list[list[DrawnRow]], bool]:
     return [[rows[k] for k in sorted(block)] for block in blocks.values()], divided
 
 
-def _whole_rows(course: Course, drawn: list[Drawn]) -> list[DrawnRow]:
+def _whole_rows(course: Course, drawn: list[Drawn], turn: float) -> list[DrawnRow]:
     """Return rows in order across, with the pieces of each: they lie end to end, and beside the same row.
 
-    No row lies beside two fields that are end to end.
+    A gap is no longer than the pieces on its sides: what lies farther apart are fields of their own. Where a robot has
+    no room to turn, pieces are one row, whatever lies beside them.
     """
     order = sorted(((_row(course, [one]), one) for one in drawn), key=lambda item: item[0].v)
     pieces = [row for row, _ in order]
@@ -170,8 +171,10 @@ def _whole_rows(course: Course, drawn: list[Drawn]) -> list[DrawnRow]:
         for k in range(1, len(order))[::step]:
             a, b = sorted(side[k - 1 : k + 1])
             a_row_beside = a >= 0 and b < len(order) and all(continues[a + 1 : b + 1])
-            apart = max(pieces[k - 1].low, pieces[k].low) >= min(pieces[k - 1].high, pieces[k].high)
-            if a_row_beside and apart and pieces[k].v - pieces[k - 1].v < ONE_LINE:
+            left, right = pieces[k - 1 : k + 1]
+            gap = max(left.low, right.low) - min(left.high, right.high)
+            is_short = gap <= min(left.high - left.low, right.high - right.low)
+            if gap >= 0.0 and (gap < turn or (a_row_beside and is_short)) and right.v - left.v < ONE_LINE:
                 continues[k] = True
     rows: list[DrawnRow] = []
     for joined, (_, one) in zip(continues, order, strict=True):

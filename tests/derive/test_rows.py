@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -310,8 +311,8 @@ def test_row_in_two_pieces_divides_no_field() -> None:
         assert not notes.dropped
 
 
-@pytest.mark.parametrize("gaps", [(1, 2), (2, 3), (0, 1), (1, 2, 3), (4, 5)])
-def test_neighbouring_rows_with_a_gap_at_the_same_place_divide_no_field(gaps: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("gaps", [(1, 2), (2, 3), (0, 1), (1, 2, 3), (4, 5), range(6)])
+def test_neighbouring_rows_with_a_gap_at_the_same_place_divide_no_field(gaps: Sequence[int]) -> None:
     """Six rows 3 m apart: all five aisles are connected, and no edge crosses a row."""
     spans = {v: ((0, 14), (16, 30)) if v in gaps else ((0, 30),) for v in range(6)}
     drawings = [shapely.LineString([(a, 3 * v), (b, 3 * v)]) for v, pieces in spans.items() for a, b in pieces]
@@ -340,6 +341,18 @@ def test_fields_with_a_row_beside_both_that_are_not_connected_are_reported() -> 
     assert {g.y for g, _ in of(network, "topology", "node")} == {1.5, 4.5, 7.5, 6.0, 9.0}
     assert len(notes.warnings) == 1
     assert "not connected" in str(notes.warnings[0])
+
+
+def test_fields_beside_one_hedge_that_are_far_apart_stay_fields() -> None:
+    """The rows of both are on the same lines, but what lies between them is no gap in a row."""
+    ends = [(0, 0, 560), *((v, a, a + 80) for v in (4, 8, 12) for a in (0, 480))]
+    rows = [(f"r{k}", shapely.LineString([(a, v), (b, v)]), {"kind": "row"}) for k, (v, a, b) in enumerate(ends)]
+    network = derived("rows_to_topology", Layers({PartKey("objects", "ground", "drawn"): features(rows, "local")}))
+    aisles = [g for g, p in of(network, "topology", "edge") if p["action"] == "row_traversal" and g.bounds[1] > 3]
+    between = shapely.box(90, 3, 470, 20)
+    assert aisles
+    assert not any(g.intersects(between) for g in aisles)
+    assert {name.split("-")[0] for name in (p["name"] for _, p in of(network, "topology", "node"))} == {"f1", "f2"}
 
 
 def test_rows_and_aisles_without_a_way_are_reported() -> None:
