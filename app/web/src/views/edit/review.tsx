@@ -42,6 +42,7 @@ export function Review({ desk }: { desk: Desk }) {
       const result = await save(editor, () => void submit());
       if (result === "conflict") return;
       close();
+      if (result === "nothing left") return notify("Nothing was saved: you have no changes to the newest version");
       const warnings = result.warnings ? `, with ${count(result.warnings, "warning")}` : "";
       notify(draft === null ? `Saved as v${result.number}${warnings}` : `Saved in ${words}`);
     });

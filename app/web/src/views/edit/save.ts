@@ -7,8 +7,8 @@ import { summary } from "./words";
 
 type ServerDraft = Schemas["DraftOut"];
 
-/** number: of the new version, or revision of the draft. */
-export type Saved = { number: number; warnings: number } | "conflict";
+/** number: of the new version, or revision of the draft. Nothing is left if others have saved the same, or theirs was chosen. */
+export type Saved = { number: number; warnings: number } | "conflict" | "nothing left";
 
 const MAX_ROUNDS = 5;
 
@@ -17,8 +17,7 @@ const MAX_ROUNDS = 5;
  * Throws ApiError. `resume` is called when conflicts that hold it up are decided. */
 export async function save(editor: Editor, resume: () => void): Promise<Saved> {
   for (let round = 0; ; round++) {
-    // Others have saved the same, or theirs was chosen at all conflicts.
-    if (editor.count.peek() === 0) return { number: editor.target.number ?? 0, warnings: 0 };
+    if (editor.count.peek() === 0) return "nothing left";
     try {
       const saved = await (editor.target.draft === null ? send(editor) : sendToDraft(editor, editor.target.draft));
       editor.saved(saved.number);

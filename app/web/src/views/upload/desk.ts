@@ -132,8 +132,11 @@ export class Desk {
     }
   }
 
-  /** Tells of a version that somebody else has saved since the dry run, before a commit is refused. */
+  /** Tells of a version that somebody else has saved since the dry run, before a commit is refused.
+   *
+   * After a proxy has given up on a commit, it may be the version of that: the next try tells. */
   async watchHead(head: number | undefined): Promise<void> {
+    if (this.problem.peek()?.status === 504) return;
     const step = this.step.peek();
     if (step.name !== "tried" || head === undefined || head <= step.dry.parent) return;
     const version = await this.headOf().catch(() => null);
