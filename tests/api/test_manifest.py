@@ -136,6 +136,7 @@ def test_optional_formats_that_fail_slowly_are_missing(api: Api, farm: str, monk
 
     monkeypatch.setattr(Maps, "_run_conversion", fail_slowly)
     monkeypatch.setattr(map_service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    api.upload(farm, {"n.tmap2.yaml": samples.tmap2({"slow": (3.5, 0.25), **samples.NODES})})  # in no test's cache
     place = f"environments/{farm}/versions/latest/manifest?formats=tmap2&optional=kml,geojson,lanelet2"
     missing = {"geojson", "kml", "lanelet2"}
     assert {line["format"] for line in api.get(place).json()["missing"]} == missing
