@@ -61,6 +61,7 @@ def loads(data: bytes) -> Any:
     except MemoryError:
         raise
     except Exception as error:
+        # A forged answer has no place in our code: its traceback would tell nothing.
         log.error("pool: the answer of a worker is refused (reason=%s)", error)  # noqa: TRY400
         if isinstance(error, pickle.UnpicklingError):
             raise
@@ -182,8 +183,8 @@ def _scalar(text: str, data: str | bytes) -> np.generic:
         return np.bytes_(data)
     if type(data) is not bytes:
         raise pickle.UnpicklingError("a worker sent a number without content")
-    scalar: Any = _array(text, (), "C", data)[()]
-    return scalar  # type: ignore[no-any-return]
+    scalar: np.generic = _array(text, (1,), "C", data)[0]
+    return scalar
 
 
 def _make(name: ClassName, *values: Any) -> Any:

@@ -148,8 +148,9 @@ def _blocks(drawn: list[Drawn], turn: float) -> tuple[list[list[DrawnRow]], bool
         block = blocks.get(chain[0] - 1, [])
         if before[chain[0]] in block or (block and after[block[-1]] in chain):
             del blocks[block[-1]]
-            chain = [*block, *chain]  # noqa: PLW2901
-        blocks[chain[-1]] = chain
+            blocks[chain[-1]] = [*block, *chain]
+        else:
+            blocks[chain[-1]] = chain
     numbers = {k: number for number, block in enumerate(blocks.values()) if len(block) > 1 for k in block}
     beside = [(k, n) for side in (before, after) for k, n in enumerate(side) if k in numbers and n in numbers]
     divided = any(numbers[k] != numbers[n] for k, n in beside)

@@ -7,6 +7,7 @@ import itertools
 import json
 import tracemalloc
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -275,12 +276,13 @@ def test_packed_answer_is_read_whole() -> None:
     pieces = [data[k : k + 7] for k in range(0, len(data), 7)]
     headers = {"content-encoding": "gzip"}
     assert centre_of(lambda _: httpx.Response(200, headers=headers, content=iter(pieces))).keys() == lines
+
+    def answer(body: bytes, _: httpx.Request) -> httpx.Response:
+        return httpx.Response(200, headers=headers, stream=httpx.ByteStream(body))
+
     for damaged in (data[:-9], b"x" + data, data[:50] + b"\0\0\0\0" + data[54:]):
-        broken = centre_of(
-            lambda _, damaged=damaged: httpx.Response(200, headers=headers, stream=httpx.ByteStream(damaged))
-        )  # type: ignore[misc]
         with pytest.raises(Unavailable):
-            broken.keys()
+            centre_of(partial(answer, damaged)).keys()
 
 
 def test_large_head_of_a_file_is_not_read(farm: str, alone: Make) -> None:

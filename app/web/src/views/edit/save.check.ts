@@ -82,12 +82,18 @@ async function checkWhileSaving(): Promise<void> {
   require(move(editor, B, 77) && editor.count.value === 1, "after the save edits go on");
 }
 
-async function checkWhileDeciding(): Promise<void> {
+/** Opens an editor in which conflicts wait: Ben and I have moved the same node. */
+async function openInConflict(): Promise<Editor> {
   const site = siteOf([node("a", 0), node("b", 10)]);
   const editor = await open(site);
   move(editor, A, 1);
   saveOfBen(site, [node("a", 2), node("b", 10)]);
   require(!(await editor.head.merge(null)), "the same node is a conflict");
+  return editor;
+}
+
+async function checkWhileDeciding(): Promise<void> {
+  const editor = await openInConflict();
   require(!move(editor, B, 77), "an edit while conflicts are listed is refused");
   editor.undo();
   const [conflict] = editor.head.pending.value?.merge.conflicts ?? [];
@@ -176,11 +182,7 @@ async function checkNothingLeft(): Promise<void> {
 
 /** Theirs is chosen at all conflicts, and the save goes on. */
 async function checkAllTheirs(): Promise<void> {
-  const site = siteOf([node("a", 0), node("b", 10)]);
-  const editor = await open(site);
-  move(editor, A, 1);
-  saveOfBen(site, [node("a", 2), node("b", 10)]);
-  require(!(await editor.head.merge(null)), "the same node is a conflict");
+  const editor = await openInConflict();
   const { pending } = editor.head;
   for (const conflict of pending.value?.merge.conflicts ?? []) editor.head.choose(conflict, "theirs");
   if (pending.value) editor.head.finish(pending.value);
