@@ -27,6 +27,9 @@ MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
 KEEPOUT_MASKS = frozenset({"keepout", "nogo"})
 """Those of them that mark where robots must not drive."""
 
+KEEPOUT_NAME = re.compile(r"keep_?out|no_?go", re.IGNORECASE)
+"""Part of the name of such a mask without parameters of its own, such as ``depot_keepout``."""
+
 INFO_SUFFIX = "_filter_info"
 """End of a mask's name in the name of its parameter file; no grid may have such a name itself."""
 
@@ -52,8 +55,8 @@ def is_keepout(name: str, properties: Mapping[str, Any]) -> bool:
     if name in MASKS:
         return name in KEEPOUT_MASKS
     stored = properties.get(NAME)
-    document = stored.get("params") if isinstance(stored, Mapping) else None
-    return any(server.get("type") == KEEPOUT for server in servers(document))
+    kinds = [server.get("type") for server in servers(stored.get("params") if isinstance(stored, Mapping) else None)]
+    return KEEPOUT in kinds if kinds else KEEPOUT_NAME.search(name) is not None
 
 
 def params(name: str, info: FilterInfo) -> dict[str, Any]:

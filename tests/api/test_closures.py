@@ -146,7 +146,7 @@ def test_area_closes_masks_and_the_edges_that_cross_it(api: Api, farm: str) -> N
     api.problem("GET", mask, 404)
 
 
-@pytest.mark.parametrize("name", ["keepout", "nogo", "wet_floor"])
+@pytest.mark.parametrize("name", ["keepout", "nogo", "depot_keepout", "wet_floor"])
 def test_stored_mask_gets_closed_areas_and_grows_where_they_reach_beyond_it(api: Api, farm: str, name: str) -> None:
     """Robots are told to use the mask nogo if there is one; the filter of another mask says what it is."""
     filter_info = {} if name != "wet_floor" else {f"{name}_filter_info.yaml": KEEPOUT_FILTER}
