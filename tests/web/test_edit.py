@@ -33,6 +33,8 @@ class Editing:
         )
 
     def click(self, x: float, y: float, **more: Any) -> None:
+        # Behind the timer of 250 ms by which the map tells two clicks, wherever they are, from a double click.
+        self.page.evaluate("new Promise(resolve => setTimeout(resolve, 300))")
         self.page.mouse.move(*self.pixel(x, y))
         self.page.mouse.click(*self.pixel(x, y), **more)
 
@@ -376,8 +378,6 @@ def test_ruler_and_views_take_clicks_in_any_order(server: WebServer, edit: Edit)
     show("Layers")  # it goes on measuring there
     for x in (25, 27):
         editing.click(x, 18)
-        # Behind the timer of 250 ms by which the map tells two clicks from a double click.
-        page.evaluate("new Promise(resolve => setTimeout(resolve, 300))")
     expect(measure).to_contain_text("2.0")
     ruler.click()
     editing.click(20, 10)
