@@ -19,7 +19,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from app.backends.lead import Lead, Term
+from app.backends.lead import Lead, LeadLostError, Term
 from app.errors import FleetMapError, Invalid, Unavailable
 from app.events.messages import ROBOT_NAME, RobotStatus
 from app.store.base import ENVIRONMENT_NAME
@@ -234,16 +234,23 @@ class ReportQueue:
         return out
 
     def _write(self, batch: list[_QueuedReport]) -> None:
-        """Store reports, and take them out of the list.
+        """Store reports, and take them out of the list: those of a robot in order.
 
-        Raises LeadLostError for those from Zenoh if another server has taken over.
+        Others from HTTP come first, for which somebody waits. Raises LeadLostError for those from Zenoh if another
+        server has taken over.
         """
-        self._write_batch([queued for queued in batch if queued.result is not None])
-        batch[:] = [queued for queued in batch if queued.result is None]
-        while batch and self._term is not None:  # after a takeover there are up to MAX_STAND_BY
-            with self._term.fenced():
-                self._write_batch(batch[:BATCH])
-            del batch[:BATCH]
+        on_bus = {_robot(queued) for queued in batch if queued.result is None} if self._term is not None else set()
+        self._write_batch([q for q in batch if q.result is not None and _robot(q) not in on_bus])
+        batch[:] = [q for q in batch if q.result is None or _robot(q) in on_bus]
+        try:
+            while batch and self._term is not None:  # after a takeover there are up to MAX_STAND_BY
+                with self._term.fenced():
+                    self._write_batch(batch[:BATCH])
+                del batch[:BATCH]
+        except LeadLostError:
+            self._write_batch([queued for queued in batch if queued.result is not None])
+            batch[:] = [queued for queued in batch if queued.result is None]
+            raise
 
     def _write_batch(self, batch: list[_QueuedReport]) -> None:
         if not batch:
@@ -308,6 +315,10 @@ def wait_until_stored(result: Future[FleetMapError | None], seconds: float = 0.0
         raise Unavailable("the report could not be stored in time: try again in a few seconds") from None
     if refused is not None:
         raise refused
+
+
+def _robot(queued: _QueuedReport) -> tuple[str, str]:
+    return queued.report.environment, queued.report.robot
 
 
 def _resolve_futures(queued: _QueuedReport, refused: FleetMapError | None) -> None:

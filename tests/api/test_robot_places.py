@@ -91,7 +91,7 @@ def test_place_over_zenoh(api: Api, farm: str) -> None:
     members = {k: v for k, v in status(farm, root_of(api, farm, 2), pose=POSE, route=[]).items() if k != "environment"}
     fleet.enqueue_status(farm, "bus", json.dumps(members).encode())
     fleet.enqueue_status(farm, "bus", json.dumps({**members, "pose": {"x": "1"}}).encode())  # dropped with a warning
-    report(api, farm, "after")  # stored in order: the one before it is stored, too
+    report(api, farm, "bus")  # a robot's reports are stored in order: those before it are stored, too
     robot = api.get(f"robots/bus?environment={farm}").json()
     assert robot["place"]["pose"] == {**POSE, "level": None}
     assert robot["place"]["route"] == []

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,10 @@ import zenoh
 
 from app.backends.lead import LocalLead
 from app.errors import Unavailable
+from app.events.messages import RobotStatus
 from app.fleet import ReportQueue
+from app.fleet.report_queue import report_from_status
+from app.store.fleet_values import ReceivedReport
 from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api
@@ -278,6 +281,32 @@ def test_successor_stores_what_waits_in_short_transactions(
     assert stored[0] == [0, 1, 2, 3]
     assert all(len(batch) <= 4 and not set(batch) & set(stored[0]) for batch in stored[1:]), "none is stored twice"
     assert [report.version for _, report in store.robots.history("farm", "r1")] == list(range(10, -1, -1))
+
+
+def test_reports_of_a_robot_over_zenoh_and_http_are_stored_in_order(
+    api: Api, lead: LocalLead, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store: Store = api.app.state.services.store
+    store.environments.create("farm")
+    note, tried = store.robots.note_reports, threading.Event()
+
+    def away_at_first(batch: list[Any]) -> Any:
+        if not tried.is_set():
+            tried.set()
+            raise Unavailable("the database is away")
+        return note(batch)
+
+    monkeypatch.setattr(store.robots, "note_reports", away_at_first)
+    intake = ReportQueue(store, lead)
+    intake.start()
+    try:
+        intake.enqueue_status("farm", "r1", status_payload(1))
+        assert tried.wait(60)  # it waits to be stored while the next one comes
+        newer = report_from_status(RobotStatus.from_json(status_payload(2)))
+        intake.submit_report(ReceivedReport("farm", "r1", newer, datetime.now(UTC), False)).result(60)
+    finally:
+        intake.close()
+    assert [report.version for _, report in store.robots.history("farm", "r1")] == [2, 1]
 
 
 def test_presence_is_written_when_it_changes_and_by_the_leader(
