@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from app import formats, upload_reader
 from app.errors import Damaged, Invalid, Problem
 from app.ingest.match import match_ids
+from app.ingest.moved import follow_outlines
 from app.limits import Limits
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
@@ -80,6 +81,7 @@ def prepare_upload(
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = upload_reader.unpack(uploaded, limits)
     upload_bundle = upload_reader.read(files, hints, EnvironmentContext(base.datum, read_fence(store, base)), limits)
+    upload_bundle, moved = follow_outlines(store, base, upload_bundle)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted: objects come before the topology that was read from the same drawing.
     operations: list[Operation] = [
@@ -87,7 +89,7 @@ def prepare_upload(
         for key in sorted(upload_bundle.parts)
     ]
     operations += _stale_clouds(base, upload_bundle)
-    warnings = [*upload_bundle.warnings, *_unused_hints(hints, upload_bundle)]
+    warnings = [*upload_bundle.warnings, *moved, *_unused_hints(hints, upload_bundle)]
     warnings += distance_warnings(upload_bundle, upload_bundle.datum or base.datum)
     datum: Any = KEEP
     if upload_bundle.datum is not None and upload_bundle.datum != base.datum:

@@ -12,11 +12,13 @@ import io
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Protocol
 
 from app import upload_reader
 from app.errors import Damaged, FleetMapError, NotFound
-from app.ingest.prepare import operation_for, read_fence
+from app.ingest.moved import follow_outlines
+from app.ingest.prepare import Mode, operation_for, read_fence
 from app.limits import Limits
 from app.model.layers import PartKey
 from app.store.changes import Put
@@ -197,11 +199,14 @@ def _compose_parts(
         files, hints, EnvironmentContext(start.datum or version.datum, read_fence(store, start)), limits
     )
     entries: Mapping[PartKey, PartEntry] = {} if base is None else {e.key: e for e in base.parts}
-    for mode in ("replace", "merge"):
+    moved, _ = follow_outlines(store, start, upload_bundle)  # once, poses were stored as they were uploaded
+    bundles = [upload_bundle] if moved is upload_bundle else [moved, upload_bundle]
+    modes: tuple[Mode, ...] = ("replace", "merge")
+    for bundle, mode in product(bundles, modes):
         renamed: dict[str, dict[str, str]] = {}
-        for key in sorted(upload_bundle.parts):
+        for key in sorted(bundle.parts):
             with contextlib.suppress(FleetMapError):
-                operation = operation_for(store, start, upload_bundle, key, mode, files, renamed, limits)
+                operation = operation_for(store, start, bundle, key, mode, files, renamed, limits)
                 draft = store.chunks.stage()
                 stored_entries = {key: entries[key]} if isinstance(operation, Put) and key in entries else {}
                 encoded_part = compose_operation(draft, dict(stored_entries), operation)

@@ -17,8 +17,8 @@ from app.errors import Conflict, Invalid, NotFound, Problem
 from app.model.antimeridian import join_at_antimeridian
 from app.model.geodesy import local_frame
 from app.model.layers import PartKey
+from app.model.poses import SAME, moved_pose
 from app.ogc.crs import ReferenceSystem
-from app.ogc.poses import SAME, moved_pose
 from app.ogc.tables import collection_of, unqualified
 from app.ogc.vector import TITLES
 from app.store.content import ContentReader
