@@ -248,6 +248,14 @@ def test_area_that_cannot_be_placed_is_refused(api: Api, unchanged_farm: str, ri
     api.get(f"/maps/{unchanged_farm}/tmap2")
 
 
+def test_wrong_json_types_are_named_in_terms_of_json(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/overlays"
+    points = {"kind": "blocked", "crs": "local", "polygon": [[0, 0], [2, 0], [2, 2]]}
+    for body, where in ((points, "body.polygon"), ([points], "body")):
+        detail = api.problem("POST", url, 422, json=body)["detail"]
+        assert detail == f"{where}: must be a JSON object"
+
+
 def test_polygon_is_stored_without_foreign_members(api: Api, farm: str, bare: str) -> None:
     url = f"environments/{farm}/overlays"
     report = {"kind": "blocked", "crs": "local", "polygon": {**SQUARE, "properties": {"x": "y" * 5000}, "crs": {}}}

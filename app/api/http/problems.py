@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from pathlib import PurePath
-from typing import Any
+from typing import Any, Final
 
 import orjson
 from fastapi.exceptions import RequestValidationError
@@ -211,6 +211,13 @@ def http_error_response(error: HTTPException) -> Response:
     return problem(error.status_code, detail, headers=error.headers)
 
 
+JSON_TYPES: Final = {
+    **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "must be a JSON object"),
+    "list_type": "must be a JSON array",
+}
+"""Reasons in JSON's terms, for the errors for which pydantic uses Python's."""
+
+
 def validation_error_response(error: RequestValidationError) -> Response:
     """Build the response for a request that does not match its schema; 400 if the body is not JSON."""
     problems = []
@@ -226,7 +233,8 @@ def validation_error_response(error: RequestValidationError) -> Response:
                 type_="urn:fleetmap:problem:malformed-body",
                 problems=[parse_problem],
             )
-        problems.append(errors.Problem(str(item["msg"]).removeprefix("Value error, "), where=location))
+        reason = JSON_TYPES.get(item["type"]) or str(item["msg"]).removeprefix("Value error, ")
+        problems.append(errors.Problem(reason, where=location))
     detail = "; ".join(f"{p.where}: {p.problem}" for p in problems[:5])
     return problem(422, detail, title="Invalid request", type_="urn:fleetmap:problem:invalid", problems=problems)
 
