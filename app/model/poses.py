@@ -14,16 +14,22 @@ from app.errors import Invalid, Problem
 SAME: Final = 1e-3
 """Distance in metres below which a point is where it was: more than the rounding of GIS programs."""
 
+DIGITS: Final = 6
+"""Decimals of a pose that was moved, in metres: the last bits of a projection depend on the library."""
+
 DISTORTION: Final = 1e-6
 """Change in size of a shape that is moved in degrees, per metre of its way: that of a move north at 80 degrees."""
 
 
-def moved_pose(before: Any, after: Any, stored: Mapping[str, Any], properties: Mapping[str, Any]) -> Mapping[str, Any]:
+def moved_pose(
+    before: Any, after: Any, stored: Mapping[str, Any], properties: Mapping[str, Any], tolerance: float = SAME
+) -> Mapping[str, Any]:
     """Return the ``pose`` that follows a moved outline; nothing where none has to.
 
     Args:
         before, after: outlines in local metres.
         stored, properties: the object's former and new properties.
+        tolerance: distance in metres below which a point is where it was.
 
     Raises Invalid if solids would stay at the old place of an outline that was reshaped or turned.
     """
@@ -35,10 +41,12 @@ def moved_pose(before: Any, after: Any, stored: Mapping[str, Any], properties: M
         pose = [0.0] * 6
     if not _is_position(pose) or before.is_empty or after.is_empty:
         return {}
-    shift = _translation(before, after)
+    shift = _translation(before, after, tolerance)
     if shift is not None:
         x, y = shift
-        return {"pose": [pose[0] + x, pose[1] + y, *pose[2:]]} if math.hypot(x, y) > SAME else {}
+        if math.hypot(x, y) <= tolerance:
+            return {}
+        return {"pose": [round(pose[0] + x, DIGITS), round(pose[1] + y, DIGITS), *pose[2:]]}
     if has_solids:
         detail = "the outline of an object with solids can be moved, but not reshaped or turned: change its 'pose'"
         raise Invalid(detail, [Problem("is not the former outline, moved", where="geometry")])
@@ -51,16 +59,17 @@ def _is_position(pose: Any) -> bool:
     return all(isinstance(value, int | float) and not isinstance(value, bool) for value in pose[:2])
 
 
-def _translation(before: Any, after: Any) -> tuple[float, float] | None:
+def _translation(before: Any, after: Any, tolerance: float) -> tuple[float, float] | None:
     """Return by how many metres east and north a shape was moved; None if it was also changed."""
-    for one, other in ((before, after), tuple(shapely.orient_polygons([before, after]))):
+    both = np.array([before, after], object)
+    for one, other in (both, shapely.orient_polygons(both), shapely.normalize(both)):
         old, new = shapely.get_coordinates(one), shapely.get_coordinates(other)
         if old.shape != new.shape:
             return None
         shifts = new - old
         shift = shifts.mean(axis=0)
         size = float(np.hypot(*np.ptp(old, axis=0)))
-        tolerance = SAME + DISTORTION * size * float(np.hypot(*shift))
-        if np.hypot(*(shifts - shift).T).max() <= tolerance:
+        distortion = DISTORTION * size * float(np.hypot(*shift))
+        if np.hypot(*(shifts - shift).T).max() <= tolerance + distortion:
             return float(shift[0]), float(shift[1])
     return None

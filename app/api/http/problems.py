@@ -213,7 +213,7 @@ def http_error_response(error: HTTPException) -> Response:
 
 JSON_TYPES: Final = {
     **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "must be a JSON object"),
-    "list_type": "must be a JSON array",
+    **dict.fromkeys(("list_type", "tuple_type"), "must be a JSON array"),
 }
 """Reasons in JSON's terms, for the errors for which pydantic uses Python's."""
 

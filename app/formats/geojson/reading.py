@@ -14,12 +14,17 @@ from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, ReadContext
 from app.formats.geojson.geometry import parse_geometries
 from app.formats.geojson.words import FAMILY, GEOMETRIES, LOCAL_2D, OWN_FRAME, OWN_MEMBER
+from app.model.antimeridian import cut_at_antimeridian
 from app.model.features import MAX_ID, Features, Properties, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
+from app.model.geodesy import local_frame
 from app.model.layers import NETWORK, VECTOR_LAYERS, Layer, Layers, Part, PartKey
 from app.syntax import json
 
 _EARTH = re.compile(r"(?i)(?:.*\b(?:CRS84h?|WGS ?84)|.*EPSG(?::|/)[^/]*(?::|/)?(?:4326|4979)\b)")
+ROUNDED = 2e-7
+"""Distance in degrees (2 cm) beyond which ``geometry`` differs from ``place`` by more than rounding to 7 decimals."""
+
 _METRES = {"Engineering2D", "Engineering3D"}
 
 
@@ -181,7 +186,10 @@ class _Reader:
         shapes, odd = parse_geometries(
             [g for _, g in raw], lambda k, reason: _raise_unreadable(reason, self.line(k), self.name(k))
         )
+        datum = extension.get("datum")
+        datum = Datum(**datum) if isinstance(datum, dict) else self._datum_member() if self.in_own_frame else None
         self._check_places(shapes, local)
+        self._compare_geometry(shapes, local, datum)
         groups: dict[PartKey, list[int]] = {}
         for k, key in enumerate(keys):
             groups.setdefault(key, []).append(k)
@@ -211,11 +219,10 @@ class _Reader:
             parts[key] = Features(tuple(ids), shapes[places], tuple(rows), local[places], document)
         if home not in parts and not parts:
             parts[home] = Features((), np.empty(0, object), (), np.empty(0, bool), self._document())
-        datum = extension.get("datum")
         levels = extension.get("levels")
         return Layers(
             parts,
-            Datum(**datum) if isinstance(datum, dict) else self._datum_member() if self.in_own_frame else None,
+            datum,
             tuple(Level(**v) for v in levels) if isinstance(levels, list) else (Level(),),
         )
 
@@ -279,6 +286,32 @@ class _Reader:
         if geometry is not None and not isinstance(geometry, dict):
             _raise_unreadable("a geometry must be an object or null", self.line(k), self.name(k))
         return False, geometry
+
+    def _compare_geometry(self, shapes: NDArray[np.object_], local: NDArray[np.bool_], datum: Datum | None) -> None:
+        """Warn about features whose ``geometry`` is not where ``place`` is: programs edit one of the two.
+
+        Only in files that state the datum of their metres, as ours do.
+        """
+        both = [k for k in np.flatnonzero(local).tolist() if isinstance(self.rows[k].get("geometry"), dict)]
+        if datum is None or not both:
+            return
+
+        def refuse(k: int, reason: str) -> NoReturn:
+            _raise_unreadable(f"geometry: {reason}", self.line(both[k]), self.name(both[k]))
+
+        drawn, _ = parse_geometries([self.rows[k]["geometry"] for k in both], refuse)
+        placed = local_frame(datum).geometries_to_wgs84(shapes[both])
+        same = shapely.is_empty(drawn) | shapely.equals_exact(placed, drawn, tolerance=ROUNDED)
+        for change in (shapely.orient_polygons, shapely.normalize, cut_at_antimeridian):
+            left = np.flatnonzero(~same)
+            same[left] = shapely.equals_exact(change(placed[left]), change(drawn[left]), tolerance=ROUNDED)
+        moved = np.flatnonzero(~same).tolist()
+        if moved:
+            k = both[moved[0]]
+            reason = (
+                "`geometry` is elsewhere than `place`, which is used; delete `place` of what was moved in `geometry`"
+            )
+            self.context.warn(f"{reason} ({len(moved)} features)", line=self.line(k), where=self.name(k))
 
     def _check_places(self, shapes: NDArray[np.object_], local: NDArray[np.bool_]) -> None:
         coordinates, owner = shapely.get_coordinates(shapes, return_index=True)
